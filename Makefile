@@ -11,7 +11,6 @@ PYTHON := $(PYTHON)
 
 SCENARIO ?= seven_joint_wall
 SEED ?= 0
-RUNS ?= 1000
 VERSION := $(shell "$(PYTHON)" -c '$(PROBE)' 2>/dev/null)
 VENV := .venv-$(VERSION)
 BIN := $(VENV)/bin
@@ -30,7 +29,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots unknowns estimated friction peers house equations pictures docs gallery sheet benches referee clean lint
+.PHONY: help demo check test processor benchmark campaign robots friction peers house equations pictures docs gallery sheet benches referee clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -43,10 +42,8 @@ help:
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: hours'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
 	@echo 'make benches     each scenario as page and as live bench, into runs/benches/; minutes'
-	@echo 'make unknowns    $(RUNS) plants of four arms beside the bound of their errors, into runs/unknowns/'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make referee     constraint forces of five engines and the right ones, into examples/referee/table.md'
-	@echo 'make estimated   $(RUNS) runs whose payload, tilt and joint friction the observer estimates'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make equations   from each equation of the paper to its line and its test'
@@ -95,38 +92,6 @@ robots: $(VENV)/installed-dev
 # To be looked at; needs Chromium.
 benches: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/benches.py --out runs/benches $(ARGS)
-
-# Plants of four vendors' arms: the bound of their errors for the declared ranges, then the runs.
-unknowns: $(VENV)/installed-dev
-	$(BIN)/python examples/bounded_arms --runs $(RUNS) --seed $(SEED) --out runs/unknowns $(ARGS)
-
-# Payload, tilt and friction of joints, which the observer estimates; what is left of
-# errors after the push is in the columns "late error" of runs.csv.
-JOINTS = joint1 joint2 joint3 joint4 joint5 joint6 joint7
-COMMA := ,
-NOTHING :=
-SPACE := $(NOTHING) $(NOTHING)
-estimated: $(VENV)/installed
-	$(BIN)/drake-dae sweep wall_point_contact --rollout --random $(RUNS) --seed $(SEED) --out runs/estimated \
-		--set duration=5 --set 'constraints.0.rpy=[0, 0, 0]' \
-		--set 'force_feedback=!MeasuredForce {sample_period: 0.001}' \
-		--set 'robot.payloads=[{frame: tool, mass: 0.001}]' \
-		--set 'known_forces=[!JointFriction {joints: [$(subst $(SPACE),$(COMMA) ,$(JOINTS))]}]' \
-		--set 'identified=[payload.mass, wall.rpy, wall.position, $(subst $(SPACE),$(COMMA) ,$(JOINTS:=.coulomb))]' \
-		--set 'bounds.payload.mass=[0.0005, 2]' --set 'bounds.wall.rpy=[-0.15, 0.15]' \
-		--set 'bounds.wall.position=[[0.68, -0.01, -0.01], [0.72, 0.01, 0.01]]' \
-		$(foreach joint,$(JOINTS),--set 'bounds.$(joint).coulomb=[0, 10]') \
-		--vary plant.friction=0.05..0.8 --vary 'plant.stiffness=[1.0e+4, 3.0e+4, 1.0e+5, 3.0e+5, 1.0e+6]' \
-		--vary 'plant_parameters.wall.position=[[0.698..0.702, 0, 0]]' \
-		--vary 'plant_parameters.wall.rpy=[[0, -0.087..0.087, -0.087..0.087]]' \
-		--vary plant_parameters.link3.mass=5.6..6.9 --vary plant_parameters.payload.mass=0.01..1 \
-		--vary 'plant_disturbances=[[{frame: tool, force: [-20..20, -20..20, -20..20], start_time: 1.2, end_time: 1.3}]]' \
-		--vary 'encoders=[{resolution: 1.0e-5, velocity_bandwidth: 500}, {position_noise: 5.0e-6, velocity_bandwidth: 500}]' \
-		--vary force_feedback.bias=-0.3..0.3 --vary force_feedback.noise_deviation=0..0.3 --vary force_feedback.seed=1..1000 \
-		--vary plant_parameters.joint1.coulomb=0..3 --vary plant_parameters.joint2.coulomb=0..3 \
-		--vary plant_parameters.joint3.coulomb=0..2 --vary plant_parameters.joint4.coulomb=0..2 \
-		--vary plant_parameters.joint5.coulomb=0..1 --vary plant_parameters.joint6.coulomb=0..1 \
-		--vary plant_parameters.joint7.coulomb=0..0.5
 
 friction: $(VENV)/installed
 	$(BIN)/python examples/unknown_friction

@@ -40,8 +40,6 @@ _MODULES = {
     "live": "play",
     "render": "plot",
     "diagram": "plot",
-    "bound": "sweep",
-    "excite": "identify",
     "analyze": "new",
 }
 """Command -> its module, if the module has another name."""

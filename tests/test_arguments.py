@@ -57,15 +57,10 @@ from drake_dae.robots.surfaces.surface import Surface
 from drake_dae.running.rollout.rollout import Rollout
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
-from drake_dae.scenario.scenario import Scenario, scenario_data
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.bounding.bounded import FailedRun
-from drake_dae.studies.identification.identified import Identified, Noise
-from drake_dae.studies.identification.unknowns import Unknown
-from drake_dae.studies.optimization.variables import Variable as Variable_
 from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Runner
 from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
 from drake_dae.systems.task.phases import Phase
@@ -201,30 +196,7 @@ def scenario() -> Scenario:
 SAMPLES: dict[Any, Callable[[], Any]] = {
     SimulationError: lambda: SimulationError("ended", 0.0, np.zeros(4)),
     TracedFunction: lambda: TracedFunction("one", {"x": ca.SX.sym("x")}, {"y": ca.SX(1)}),
-    Unknown: lambda: Unknown("link1.mass", "link1.mass", 0, "kg"),
-    Noise: lambda: Noise("rad", 1e-4, None, 0.1, True),
-    Identified: lambda: Identified(
-        (Unknown("link1.mass", "link1.mass", 0, "kg"),),
-        *np.ones((2, 1)),
-        np.eye(1),
-        np.ones(1),
-        (),
-        {},
-        [],
-    ),
-    dd.Promised: lambda: dd.Promised(
-        (Unknown("link1.mass", "link1.mass", 0, "kg"),), np.ones(1), np.eye(1), (), np.ones(1)
-    ),
-    dd.Excitation: lambda: dd.Excitation(
-        scenario(), {}, SAMPLES[dd.Promised](), SAMPLES[dd.Promised](), "D", 1, {}
-    ),
     Rollout: rolled,
-    Variable_: lambda: Variable_("link1.mass"),
-    dd.LimitState: lambda: dd.LimitState("torque", 0.0, 1, 2),
-    dd.Optimum: lambda: dd.Optimum(
-        context_of(None), rolled(), (), np.zeros(0), {}, 1.0, 0.5, (), 1, 2, True, "Solve_Succeeded"
-    ),
-    dd.RunSymbols: lambda: dd.RunSymbols([0.0, 0.1], {"x": [dd.Signal("x")]}, ["link1.mass"]),
     Any: lambda: 1.0,
     ArrayLike: lambda: 1.0,
     bool: lambda: False,
@@ -263,13 +235,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     ),
     dd.Commands: lambda: dd.Commands([(0, "two_link_arm.link1.mass", 9.0)], 2),
     dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
-    dd.ErrorBound: lambda: dd.ErrorBound({"tool.z": 0.1}),
-    Runner: lambda: Runner(scenario_data(scenario())),
-    FailedRun: lambda: FailedRun({"link1.mass": 1.0}, "no start"),
-    dd.BoundedErrors: lambda: dd.BoundedErrors(
-        *((dd.Signal("tool.z", "m"),), 0.0, np.ones(1), {}, np.ones(1), 9, 8, (), {}, None),
-        *(scenario(), Runner(scenario_data(scenario()))),
-    ),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),
     dd.DisturbanceObserver: observer,

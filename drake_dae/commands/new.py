@@ -6,7 +6,6 @@ import logging
 import re
 import warnings
 from pathlib import Path
-from textwrap import fill
 
 from drake_dae.arrays import number_in
 from drake_dae.errors import GeometryWarning, ScenarioError
@@ -15,7 +14,6 @@ from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.new.new_scenario import new_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation.summary import WIDTH
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -25,20 +23,12 @@ def run_command(options: argparse.Namespace) -> int:
 
 def _analyze(options: argparse.Namespace) -> int:
     """Prints the report on the scenario that the options name."""
-    # Rollouts load SciPy's integrators, which `new` does not need.
-    from drake_dae.studies.bounding.noise import noise_outlook
-
     path = find_scenario(options.scenario)
-    scenario = load_scenario(path, options.settings)
-    report = find_feasibility(scenario)
-    noise = None if report.problems else noise_outlook(scenario)
+    report = find_feasibility(load_scenario(path, options.settings))
     if options.json:
-        spread = {} if noise is None else {"noise": noise.to_dict()}
-        print(json.dumps({"scenario": path.stem, **report.to_dict(), **spread}, indent=2))
+        print(json.dumps({"scenario": path.stem, **report.to_dict()}, indent=2))
     else:
         print(f"{path.stem}\n\n{report}")
-        if noise is not None:
-            print(f"\n{fill(str(noise), WIDTH)}")
     return 2 if report.problems else 0
 
 

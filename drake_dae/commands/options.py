@@ -8,9 +8,6 @@ from typing import Any
 import drake_dae
 from drake_dae.commands.options_of_studies import (
     CommandParser,
-    add_bound,
-    add_excite,
-    add_identify,
     add_sweep,
     whole_option,
 )
@@ -50,9 +47,6 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_play(commands)
     _add_analyze(commands, scenario)
     add_sweep(commands, scenario)
-    add_bound(commands, scenario)
-    add_identify(commands)
-    add_excite(commands, scenario)
     _add_new(commands)
     _add_export(commands, scenario)
     _add_page(commands, scenario)

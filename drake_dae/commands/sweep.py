@@ -1,4 +1,4 @@
-"""`drake-dae sweep` and `bound`: run a scenario many times with other values."""
+"""`drake-dae sweep`: run a scenario many times with other values."""
 
 import argparse
 import json
@@ -9,21 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from drake_dae.analysis.tables import count_of
-from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.files import load_scenario, save_scenario
+from drake_dae.errors import ModelError
+from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.studies.bounding.bound import bound_errors
 from drake_dae.studies.results import Outcome
 from drake_dae.studies.run_names import rerun_commands
 from drake_dae.studies.study import FILES
 from drake_dae.studies.sweep import sweep
-from drake_dae.studies.variations import parse_choices, parse_variations
+from drake_dae.studies.variations import parse_variations
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Runs the study that the options describe; returns the exit code."""
-    if options.command == "bound":
-        return _bound(options)
     if not options.json:
         return _sweep(options)[0]
     with redirect_stdout(sys.stderr):
@@ -87,31 +84,3 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         print(f"error: {text}: {', '.join(repeated[:10])}", file=sys.stderr)
         return 1, report
     return 2 if unfinished and options.check else 0, report
-
-
-def _bound(options: argparse.Namespace) -> int:
-    """Prints the bound for the ranges in the options; returns the exit code."""
-    if options.out is not None and options.out.exists():
-        text = f"'{options.out}' exists, and is not overwritten; choose another name"
-        raise ScenarioError(("--out", text))
-    path = find_scenario(options.scenario)
-    scenario = load_scenario(path, options.settings)
-    found = bound_errors(
-        scenario,
-        parse_choices(options.vary, scenario),
-        after=options.after,
-        corners=options.corners,
-        seed=options.seed,
-        rollout=options.rollout,
-    )
-    if options.json:
-        print(json.dumps({"scenario": path.stem, **found.to_dict()}, indent=2))
-    else:
-        print(f"{path.stem}\n\n{found}")
-    if found.failed:
-        return 2
-    if options.out is not None:
-        save_scenario(found.bounded_scenario, options.out)
-        if not options.json:
-            print(f"written: {options.out}")
-    return 0

@@ -7,7 +7,6 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.signals import outputs_named
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.robots.model import RobotModel
@@ -16,7 +15,8 @@ from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
-from drake_dae.scenario.forms.keys import at, violated
+    in_time, motion = timed(chosen.scenario, model, structure)
+    notes = (*completed.notes, *chosen.notes, *in_time.notes)
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
@@ -93,8 +93,4 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
     chosen = advised(completed.scenario, model, structure)
     in_time, motion = timed(chosen.scenario, model, structure)
     notes = (*completed.notes, *chosen.notes, *in_time.notes)
-    if (bound := in_time.scenario.error_bound) is not None:
-        with at("error_bound"):
-            outputs_named(bound.outputs, model.dae.output_signals)
-        notes = (*notes, str(bound))
     return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)

@@ -28,7 +28,6 @@ from drake_dae.scenario.parts.families import (
     Damping,
     DisturbanceForce,
     Encoders,
-    ErrorBound,
     Force,
     ForceOutput,
     Gains,
@@ -101,8 +100,7 @@ class Scenario:
         actuation: Stages from the joints toward the motor; none for rigid joints.
         force_feedback: Whether the law uses its model's force or a measured one.
         parameters: Parameter name -> its value for law and plant, in place of that of the robot's
-            file, a constraint or a stage; one number for all entries, or a list. `drake-dae
-            identify` writes it.
+            file, a constraint or a stage; one number for all entries, or a list.
         plant_parameters: Parameter name -> the plant's value, unknown to the law's model; one
             number for all entries, or a list. A surface can be tilted if it has the key `rpy`.
         plant_payloads: Additional masses on the plant, unknown to the law's model.
@@ -148,8 +146,6 @@ class Scenario:
             left out.
         saturation: Whether controls are limited to the effort limits of the robot's file.
         tolerances: The tolerated errors; a run that exceeds them ends with the reason.
-        error_bound: A bound of the errors, as the command `drake-dae bound` writes it; the summary
-            of a run reports whether it held.
         may_diverge: Whether a run continues when its errors or states diverge; otherwise it ends
             with the reason.
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
@@ -196,7 +192,6 @@ class Scenario:
     encoders: Encoders | None = None
     saturation: bool = False
     tolerances: Tolerances | None = None
-    error_bound: ErrorBound | None = None
     may_diverge: bool = False
     references: dict[str, Reference] = field(default_factory=dict)
     time_optimal: Timing | None = None

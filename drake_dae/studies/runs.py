@@ -4,7 +4,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -81,27 +80,10 @@ class Runner:
             raise self._built
         return cast(ClosedLoop, self._built)
 
-    def of(self, base: Mapping[str, Any]) -> "Runner":
-        """Returns the runner of another scenario, with the loop of this one.
-
-        Args:
-            base: Its plain data, which differ in keys that the loop does not depend on, such as
-                `error_bound`.
-        """
-        other = copy(self)
-        other._base, other._read = base, {}
-        return other
-
     @property
     def is_rollout(self) -> bool:
         """Whether the runs are rollouts."""
         return self._lasting is not None
-
-    @property
-    def limits(self) -> Limits:
-        """The limits of the robot whose loop was built last."""
-        assert isinstance(self._built, ClosedLoop)
-        return _limits(self._built)
 
     def why_not(self, variation: Variation) -> ScenarioError | None:
         """Returns the error in the keys and values of a variation; None if there is none.
@@ -132,26 +114,6 @@ class Runner:
                 yield run
             else:
                 yield run.result or self._timed(run.number, run.seconds, self._finish, run)
-
-    def records(self, batch: Batch) -> Iterator[tuple[Record | None, str]]:
-        """Simulates runs; yields the record of each, and the reason if it ended early.
-
-        The record is None if a run has no start.
-        """
-        for run in self._started(batch):
-            if isinstance(run, RunResult):
-                yield None, run.reason
-                continue
-            try:
-                if run.rolled is None:
-                    record, _, failure = self._alone(run)
-                else:
-                    together, index = run.rolled
-                    record, failure = indexed_record(together.record, index), together.failure
-            except DrakeDaeError as error:
-                yield None, str(error)
-            else:
-                yield record, "" if failure is None else str(failure)
 
     def _started(self, batch: Batch) -> Iterator["_StartedRun | RunResult"]:
         """Starts runs, with their rollouts where these can be computed together."""
@@ -298,9 +260,7 @@ def _results(together: RunsTogether, runs: Sequence[_StartedRun]) -> list[RunRes
     for run in runs:
         assert run.rolled is not None
         index = run.rolled[1]
-        own, bound = figures[index], run.scenario.error_bound
-        if bound is not None and record.time.size:
-            own |= bound.figures(indexed_record(record, index))
+        own = figures[index]
         outcome, reason = Outcome.FAILED, str(failure)
         if failure is None:
             outcome, reason = Outcome.FINISHED, ""

@@ -18,13 +18,13 @@ from drake_dae.studies.variations import Variation
 TOGETHER = 32
 """The largest number of rollouts that are computed together."""
 
-_OF_A_RUN = ("description", "duration", "integrator", "write", "error_bound")
+_OF_A_RUN = ("description", "duration", "integrator", "write")
 """The keys of a scenario that the closed loop does not depend on."""
 
 _OF_A_PLANT = ("plant", "plant_parameters", "constraints")
 """The keys that the plant of a rollout depends on, and that it changes."""
 
-_OF_A_START = ("start", "description", "duration", "write", "error_bound")
+_OF_A_START = ("start", "description", "duration", "write")
 """The keys of a scenario that the numbers of a context besides its start do not depend on."""
 
 _text = json.JSONEncoder(sort_keys=True).encode
@@ -110,7 +110,6 @@ def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
         "duration",
         "integrator",
         "write",
-        "error_bound",
     ):
         own[key] = base[key]
     kind, plant = plant_kind(own["plant"]), base["plant"]

@@ -17,7 +17,6 @@ from drake_dae.errors import ModelError
 from drake_dae.pictures.inline import InlinePage
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.error_bound import USED
 from drake_dae.studies.results import Outcome, RunResult
 from drake_dae.studies.run_names import rerun_commands, run_name
 from drake_dae.studies.variations import Variation
@@ -191,14 +190,6 @@ class Study:
         if beyond:
             counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
             parts.append([f"beyond their limits: {', '.join(counted)}"])
-        if USED in self.figures:
-            used = self.values(USED)
-            used = used[np.isfinite(used)]
-            lines = [
-                f"the error bound held in {np.sum(used <= 1.0)} of {len(self.results)} runs; "
-                f"bound / largest error: median {1.0 / np.median(used):.3g}"
-            ]
-            parts.append(lines)
         if self.figures:
             head = ["figure", "least", "at run", "median", "largest", "at run"]
             parts.append(Table(head, [self._row(name) for name in self.figures]))

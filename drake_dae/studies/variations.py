@@ -111,19 +111,6 @@ def parse_variations(
     return listed_variations(columns) if together else grid_variations(columns)
 
 
-def parse_ranges(texts: Sequence[str], scenario: Scenario) -> dict[str, tuple[float, float]]:
-    """Returns the ranges of the options "KEY=LOW..HIGH" of the command line: key -> (low, high).
-
-    Raises:
-        ScenarioError: An option cannot be read, or is no range of numbers.
-    """
-    columns = parse_choices(texts, scenario)
-    for key, ends in columns.items():
-        if not isinstance(ends, tuple):
-            raise _wrong(key, "expected LOW..HIGH, of a key that takes any number in between")
-    return columns
-
-
 def parse_choices(
     texts: Sequence[str], scenario: Scenario, is_random: bool = True
 ) -> dict[str, Any]:

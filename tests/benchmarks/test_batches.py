@@ -1,4 +1,4 @@
-"""Many rollouts: side by side against one after the other, their fixed cost, and gradients.
+"""Many rollouts: side by side against one after the other, and their fixed cost.
 
 By what they take of all cores together, in turn, since how fast a core is changes.
 """
@@ -19,7 +19,6 @@ from drake_dae import (
     build_scenario,
     grid_variations,
     rollout,
-    rollout_gradient,
     start_values,
 )
 from drake_dae.running.rollout import rollout as module
@@ -161,20 +160,3 @@ def test_a_run_of_a_sweep(report):
     report(
         "two_link_wall: a run of a sweep by rollouts", {"processor [ms]": f"{1e3 * took:.2f} (<1)"}
     )
-
-
-def test_gradient(report):
-    """By the start and all parameters, of 1 s in steps of 1 ms, beside the interpreted run."""
-    (loop, start, parameters), config = problem("seven_joint_wall", *FIXED, "compiled=false")
-    times = np.array([0.0, 1.0])
-    weights = {"state": np.ones((2, 14))}
-    given = loop, start, parameters, times
-    calls = {
-        "gradient": lambda: rollout_gradient(*given, weights, config=config),
-        "run": lambda: rollout(*given, config=config, compiled=False),
-    }
-    for call in calls.values():
-        call()
-    seconds = in_turn(calls, 4)
-    ratio = f"{1e3 * seconds['gradient']:.0f} ms, x {seconds['run'] / seconds['gradient']:.2f}"
-    report("seven_joint_wall: gradient of 1,000 steps by 50 numbers", {"interpreted": ratio})

@@ -19,7 +19,6 @@ SLOW = {
     "explanations/force.md",
     "explanations/not_robots.md",
     "how_to/bouncing_on_contact.md",
-    "how_to/bound_errors.md",
     "how_to/follow_an_edge.md",
     "how_to/identify_while_it_runs.md",
     "how_to/press_flat.md",

@@ -73,7 +73,6 @@ LONG = {
 
 # Distributions whose modules bear another name.
 IMPORT_NAMES = {
-    "cupy-cuda12x": "cupy",
     "drake": "pydrake",
     "mcap-ros2-support": "mcap_ros2",
     "pycollada": "collada",

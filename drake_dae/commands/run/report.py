@@ -10,7 +10,6 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.error_bound import bound_words, exceeds
 from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.remarks import (
@@ -90,14 +89,11 @@ def report_run(
         notes=limit_remarks(record, limits),
     )
     verdict = judge(record, predicted, accuracy)
-    bounded = None if scenario.error_bound is None else scenario.error_bound.check(record)
     added = None
     if loop.generator is not None:
         goal, state = loop.generator.reference, record["state"][0]
         added = loop.controller.error_bound(goal, record.time, state)
     lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons, added)]
-    if bounded is not None:
-        lines += ["", *bound_words(bounded), ""]
     lines += _contact_remarks(scenario, loop, record)
     lines += map(str, (*near.distances, *near.speeds))
     lines += departure_remarks(record, loop.feasible)
@@ -106,8 +102,7 @@ def report_run(
     lines += _task_remarks(scenario, changes, statistics)
     is_unexplained = verdict.tracking is TrackingResult.OFF and not reasons
     data = {
-        "missed": job.outcome is JobOutcome.BAD or is_unexplained or exceeds(bounded),
-        "error_bound": None if bounded is None else list(map(asdict, bounded)),
+        "missed": job.outcome is JobOutcome.BAD or is_unexplained,
         "job": job.to_dict(),
         "phases": [asdict(change) for change in changes],
         **asdict(near),

@@ -131,8 +131,8 @@ class ExpressionReference(FormulaReference):
     """A reference that is any CasADi expression of time, and of parameters by their names.
 
     ExpressionReference(lambda t, height: height * casadi.sin(2 * t), {"height": 0.1}) has a
-    parameter, which stands in the context of the `ReferenceGenerator`: `optimize` and studies
-    change it without tracing again. References with a parameter of the same name share it.
+    parameter, which stands in the context of the `ReferenceGenerator`: studies change it
+    without tracing again. References with a parameter of the same name share it.
 
     Attributes:
         function: Takes the time in s, a CasADi scalar, and each parameter by its name, a CasADi

@@ -12,13 +12,6 @@ from pydrake.systems.primitives import RandomSource
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
 
-_MOMENTS = {
-    RandomDistribution.kUniform: (0.5, 12.0**-0.5),
-    RandomDistribution.kGaussian: (0.0, 1.0),
-    RandomDistribution.kExponential: (1.0, 1.0),
-}
-"""Mean and deviation of the numbers of a RandomSource."""
-
 Seed = int | Mapping[str, int]
 """The seed of the noise of a run: one number, or name of a RandomSource -> number."""
 
@@ -91,23 +84,6 @@ def noise_of(
             chosen = seed.get(source.get_name())
         noise[[0, *(rows + 1)], part] = _drawn(source, start, events.times[rows], key[0], chosen)
     return noise
-
-
-def moments_of(compiled: CompiledDiagram) -> tuple[FloatArray, FloatArray]:
-    """Returns the means and the deviations of all random numbers of a diagram."""
-    means, deviations = np.zeros((2, compiled.sizes["noise"]))
-    for source, part in compiled.noise:
-        means[part], deviations[part] = _MOMENTS[_distribution_of(source)]
-    return means, deviations
-
-
-def _distribution_of(source: System) -> RandomDistribution:
-    """Returns the distribution of a RandomSource, which Drake does not tell, by its numbers."""
-    context, seed = source.CreateDefaultContext(), 0
-    source.SetRandomContext(context, RandomGenerator(seed))
-    value = source.get_output_port().Eval(context)
-    every = RandomDistribution.__members__.values()
-    return next(each for each in every if (_first(each, value.size, seed) == value).all())
 
 
 def _drawn(

@@ -15,7 +15,7 @@ from drake_dae.arrays import FloatArray, brief, numbers
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.running.rollout.events import Events, Seed, events_of, moments_of, noise_of
+from drake_dae.running.rollout.events import Events, Seed, events_of, noise_of
 from drake_dae.running.rollout.program import RolloutProgram, program_of
 from drake_dae.running.rollout.run import RunProblem
 from drake_dae.systems.blocks.traced import Block
@@ -151,15 +151,12 @@ def problems_of(
     parameters: ArrayLike | None,
     times: FloatArray,
     seeds: Sequence[Seed] | None,
-    scales: ArrayLike = 1.0,
 ) -> Problems:
     """Makes the runs of `rollout` from its arguments.
 
     Args:
         program: The diagram.
         starts, parameters, times, seeds: The arguments of `rollout`.
-        scales: A factor of the distances of random numbers from their means, one number, or one for
-            each run.
 
     Raises:
         ModelError: The arguments have wrong shapes.
@@ -189,9 +186,6 @@ def problems_of(
     # Without noise, or without seeds, it is the same in all runs.
     different: Sequence[Seed | None] = seeds if seeds and compiled.noise else [None]
     noise = np.array([noise_of(compiled, events, times[0], seed) for seed in different])
-    if np.any(np.asarray(scales) != 1.0):
-        means = moments_of(compiled)[0]
-        noise = means + np.reshape(scales, (-1, 1, 1)) * (noise - means)
     held = np.zeros((count, compiled.sizes["held"]))
     held[:, program.kept_places] = states[:, size:]
     drawn = dict(compiled.noise)

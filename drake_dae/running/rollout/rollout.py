@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, Literal, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,6 @@ from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
 from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
-from drake_dae.running.rollout.lanes.device import find_device, run_on_device
 from drake_dae.running.rollout.lanes.library import Lanes
 from drake_dae.running.rollout.problems import Problems, problems_of
 from drake_dae.running.rollout.program import RolloutProgram
@@ -78,7 +77,6 @@ def rollout(
     config: SimulatorConfig | None = None,
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
-    device: Literal["cpu", "cuda"] = "cpu",
 ) -> list[Rollout]:
     """Runs a diagram from one start or from thousands, without Drake, on all cores.
 
@@ -106,8 +104,6 @@ def rollout(
             saves. The default is the choice of the plant's system, and "auto" for a diagram.
         seeds: The seed of the noise in each run, or name of a RandomSource -> seed; if None, all
             runs have the same noise.
-        device: "cuda" runs them on an NVIDIA GPU by CuPy, one in each thread. Runs that fail, or
-            that need more Newton steps than usual, continue on the processor.
 
     Returns:
         k runs: one for each start, row of parameters or seed. A run that fails has its failure, and
@@ -115,14 +111,13 @@ def rollout(
 
     Raises:
         ModelError: Arguments have wrong shapes; or a block cannot be traced, with its name and the
-            reason; or there is no GPU, or the diagram does not run on it.
+            reason.
         InconsistentStateError: A start is not on N*.
 
     Warns:
         MachineCodeWarning: Machine code was requested, or would pay, and cannot be made.
     """
-    settings: dict[str, Any] = {"config": config, "compiled": compiled, "seeds": seeds}
-    return run_loop(loop, starts, parameters, times, **settings, on_device=device == "cuda")
+    return run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
 
 
 def run_loop(
@@ -134,38 +129,28 @@ def run_loop(
     config: SimulatorConfig | None = None,
     compiled: Compiled | None = None,
     seeds: Sequence[Seed] | None = None,
-    scales: ArrayLike = 1.0,
     lasting: float | None = None,
     look: Callable[[RecordAfter], bool] | None = None,
-    on_device: bool = False,
 ) -> list[Rollout]:
     """Runs as `rollout`; the runs may be some of many, and may be stopped.
 
     Args:
-        scales: As for `problems_of`.
         lasting: The total duration of all runs in s, if these are some of many. It alone then
             decides on machine code, whatever the cache contains: so the numbers do not depend on
             when they are computed. None if these are all.
         look: Called from time to time with a function: time in s, or None -> the record after it.
             Returns whether to stop the run; its record then ends there.
-        on_device: Whether they run on a GPU.
     """
-    if on_device:
-        find_device()
     request = RolloutRequest.of(loop, times, config, compiled, lasting, look)
-    problems = problems_of(request.program, starts, parameters, request.times, seeds, scales)
+    problems = problems_of(request.program, starts, parameters, request.times, seeds)
     rollouts: dict[int, Rollout] = {}
     for program, indices in _kinds(request.program, problems):
         some = problems.chosen(indices)
         code = request.machine_code(program, len(problems))
-        if on_device:
-            batch = run_on_device(program, some, request.settings)
-            runs = batch.ended(_continued(program, code), 1)
-        else:
-            lanes = None
-            if code is not None and look is None and len(some) >= SEVERAL:
-                lanes = request.lanes(program, len(problems))
-            runs = _runs(program, some, request.settings, code, lanes)
+        lanes = None
+        if code is not None and look is None and len(some) >= SEVERAL:
+            lanes = request.lanes(program, len(problems))
+        runs = _runs(program, some, request.settings, code, lanes)
         for index, run in zip(indices.tolist(), runs, strict=True):
             rollouts[index] = _rollout(request.program, problems, index, run)
     return [rollouts[index] for index in range(len(problems))]
@@ -215,13 +200,6 @@ def _kinds(program: RolloutProgram, problems: Problems) -> list[tuple[RolloutPro
     if not has_twins.all():
         kinds.append((program, np.flatnonzero(~has_twins)))
     return kinds
-
-
-def _continued(program: RolloutProgram, code: machine.Library | None) -> Callable[..., Run]:
-    """Returns a function that continues a run; without machine code, from its start."""
-    if code is not None:
-        return partial(machine.go_on, code)
-    return lambda problem, settings, *_: interpreted.run(functions_of(program), settings, problem)
 
 
 def _runs(

@@ -20,7 +20,6 @@ from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts import time_optimal, written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
-from drake_dae.simulation import error_bound
 from drake_dae.systems.control import sampling
 from drake_dae.systems.plants.contact import contact_material, disturbance_forces
 from drake_dae.systems.sensing import encoders, tolerances
@@ -116,7 +115,6 @@ _PACKETS: dict[Any, Any] = {sampling.Packets: Annotated[sampling.Packets, Form()
 Sampling = Annotated[sampling.Sampling, Form(_PACKETS)]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
-ErrorBound = Annotated[error_bound.ErrorBound, Form()]
 Observer = Annotated[parts.Observer, Form()]
 LargestErrors = Annotated[parts.LargestErrors, Form()]
 Timing = Annotated[time_optimal.TimeOptimal, Form()]

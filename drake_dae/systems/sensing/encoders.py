@@ -11,7 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number, numbers, positive
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Block, Computation, Update
+from drake_dae.systems.blocks.traced import HELD, TIME, Block, Computation, Update
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""
@@ -136,9 +136,6 @@ class StateSensor(LeafSystem):
     Output port:
         estimated_state: x as it is measured, shape (n,); direct feedthrough.
 
-    Where encoders of an unknown zero round is by chance. `set_zeros` sets a numeric parameter z, in
-    rad or m, 0 by default, with qm_k = delta round((q(t_k) + b + sigma_q n_k + z) / delta) - z.
-
     Args:
         size: n.
         num_positions: k, the number of positions and of velocities at the start of x.
@@ -178,8 +175,6 @@ class StateSensor(LeafSystem):
         )
         self._count, self._rounds = num_positions, bool(self._resolution.any())
         self._bristles, self._bent = bristles, 0 if bristles is None else bristles.numel_out()
-        if self._rounds:
-            self.DeclareNumericParameter(BasicVector(np.zeros(num_positions)))
         self._port = self.DeclareVectorInputPort("state", size)
         self._noise = None
         if encoders.has_noise:
@@ -189,17 +184,6 @@ class StateSensor(LeafSystem):
         self._held = self.DeclareDiscreteState(held)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, weakly(self._sample))
         self.DeclareVectorOutputPort("estimated_state", size, weakly(self._calc))
-
-    def set_zeros(self, context: Context, zeros: ArrayLike) -> None:
-        """Sets z in a context of encoders that round, one number or shape (k,).
-
-        Raises:
-            ModelError: The encoders do not round, or there are not as many numbers as positions.
-        """
-        if not self._rounds:
-            raise ModelError("encoders without a resolution do not round, and have no zeros")
-        values = _each("zeros", zeros, self._count)
-        context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         state = np.array(self._port.Eval(context))
@@ -228,8 +212,7 @@ class StateSensor(LeafSystem):
         if self._rounds:
             rounded = self._resolution > 0.0
             steps = self._resolution[rounded]
-            zeros = context.get_numeric_parameter(0).value()[rounded]
-            q[rounded] = steps * np.round((q[rounded] + zeros) / steps) - zeros
+            q[rounded] = steps * np.round(q[rounded] / steps)
         if self.encoders.velocity_bandwidth is not None and np.isfinite(held[0]):
             a = np.exp(-self.encoders.velocity_bandwidth * self.period)
             before = held[1 + count : 1 + 2 * count]
@@ -252,11 +235,9 @@ class StateSensor(LeafSystem):
             v = v + self._velocity_noise * noise[count:]
         q = ca.SX(q)
         if self._rounds:
-            zeros = ca.SX.sym("zeros", count)
-            sources, inputs = [*sources, PARAMETERS], [*inputs, zeros]
             for i in np.flatnonzero(self._resolution > 0.0).tolist():
                 step = self._resolution[i]
-                q[i] = step * _rounded((q[i] + zeros[i]) / step) - zeros[i]
+                q[i] = step * _rounded(q[i] / step)
         has_sample = ca.fabs(held[0]) < np.inf
         if self.encoders.velocity_bandwidth is not None:
             a = np.exp(-self.encoders.velocity_bandwidth * self.period)

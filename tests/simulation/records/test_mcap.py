@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from drake_dae import Record
-from drake_dae.cli import main
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.simulation.records.record import Recorded
@@ -112,16 +111,3 @@ def test_no_mcap_and_a_time_before_zero_are_refused(mcap, tmp_path):
             Record.from_mcap(tmp_path / name)
     with pytest.raises(ModelError, match="no times before 0 s"):
         Record(TIME - 1.0, SIGNALS).to_mcap(tmp_path / "run.mcap")
-
-
-@pytest.mark.slow
-def test_the_command_identifies_from_mcap(mcap, tmp_path, capsys):
-    bare = ("--set=write.plots=false", "--set=write.animation=false", "--set=duration=0.3")
-    heavy = ("--set=plant_parameters={link2.mass: 6.6}", "--rollout", "--out", str(tmp_path))
-    assert main(["simulate", "two_link_wall", *bare, *heavy]) == 0
-    Record.load(tmp_path / "record.npz").to_mcap(tmp_path / "run.mcap")
-    capsys.readouterr()
-    arguments = ["--scenario", "two_link_wall", "--free", "link2.mass", "--json"]
-    assert main(["identify", str(tmp_path / "run.mcap"), *arguments]) == 0
-    value = json.loads(capsys.readouterr().out)["parameters"]["link2.mass"]["value"]
-    assert value == pytest.approx(6.6, rel=1e-5)

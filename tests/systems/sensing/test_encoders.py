@@ -61,30 +61,6 @@ def test_it_is_the_map_by_hand():
     assert_allclose(found[1], by_hand, atol=1e-12)
 
 
-def test_zeros_move_its_steps_and_not_its_mean():
-    """With zeros over one step a place is measured, on average, where it is."""
-    delta = 1e-3
-    sensor = StateSensor(2, 1, Encoders(delta), T)
-    context = sensor.CreateDefaultContext()
-    zeros = delta * np.linspace(-0.5, 0.5, 40, endpoint=False)
-    for place in (-0.35 * delta, 0.05 * delta, 0.7):
-        sensor.GetInputPort("state").FixValue(context, [place, 0.0])
-        found = []
-        for zero in zeros:
-            sensor.set_zeros(context, zero)
-            found.append(sensor.GetOutputPort("estimated_state").Eval(context)[0])
-            assert_allclose(found[-1], delta * np.round((place + zero) / delta) - zero, rtol=1e-12)
-        # To half of the distance of the zeros.
-        assert_allclose(np.mean(found), place, atol=0.5 * delta / 40)
-    with pytest.raises(ModelError, match="zeros must be finite real numbers, got nan"):
-        sensor.set_zeros(context, np.nan)
-    with pytest.raises(ModelError, match="zeros of encoders has 2 entries, the robot has 1"):
-        sensor.set_zeros(context, [0.0, 0.0])
-    exact = StateSensor(2, 1, Encoders(), T)
-    with pytest.raises(ModelError, match="do not round, and have no zeros"):
-        exact.set_zeros(exact.CreateDefaultContext(), 0.0)
-
-
 def test_velocity_is_late_by_its_lag():
     """At a constant acceleration of 2 it is 2 lag behind, when exp(-W t) has died."""
     encoders = Encoders(velocity_bandwidth=W)

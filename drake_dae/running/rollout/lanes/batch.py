@@ -1,7 +1,7 @@
 """Many runs side by side: the arguments and results of lanes.c."""
 
 import ctypes
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -20,9 +20,6 @@ STOPPED = 1 << 62
 
 ENDLESS = 1 << 62
 """More steps than a run takes."""
-
-NO_CONSTANTS = np.zeros(0)
-"""Those of code whose constants stand in its text."""
 
 
 class _Batch(ctypes.Structure):
@@ -53,7 +50,7 @@ def run_many(
         settings: How to step; its `look` is not called.
     """
     batch = RunBatch(program, problems, settings, ENDLESS, lanes.constants)
-    structure, count = batch.on_processor(), len(problems)
+    structure, count = batch.structure(), len(problems)
     threads = max(1, min(num_cores(), count // 8))
     with ThreadPoolExecutor(threads) as pool:
         try:  # Machine code releases Python's lock; Ctrl-C ends it.
@@ -80,7 +77,7 @@ def run_briefly(
         The indices of the runs that end side by side, and their steps and rows.
     """
     batch = RunBatch(program, problems, settings, most, lanes.constants)
-    lanes.code.run_lanes(ctypes.byref(batch.on_processor()))
+    lanes.code.run_lanes(ctypes.byref(batch.structure()))
     done, rows = np.flatnonzero(batch.arrays["endings"] == 0), batch.arrays["rows"]
     steps = [RunState.from_buffer(batch.arrays["runs"][index]).steps for index in done]
     return done, steps, rows if done.size == len(rows) else rows[done]
@@ -94,7 +91,7 @@ class RunBatch:
         problems: The runs.
         settings: How to step.
         most: The number of steps after which a run has to continue elsewhere.
-        constants: The constants of the functions that do not stand in the text of the code.
+        constants: The constants of the functions.
 
     Attributes:
         arrays: The arrays that C reads and writes, by their names in lanes.c. Of each run: "runs",
@@ -108,7 +105,7 @@ class RunBatch:
         problems: Problems,
         settings: Settings,
         most: int,
-        constants: FloatArray = NO_CONSTANTS,
+        constants: FloatArray,
     ) -> None:
         self._problems, self._settings, self._most = problems, settings, most
         count = len(problems)
@@ -132,7 +129,7 @@ class RunBatch:
             "next": np.zeros(1, dtype=np.longlong),
         }
 
-    def structure(self, addresses: Mapping[str, int]) -> ctypes.Structure:
+    def structure(self) -> ctypes.Structure:
         """Returns the Batch of lanes.c, with the addresses of all arrays."""
         problems, settings = self._problems, self._settings
         return _Batch(
@@ -145,12 +142,8 @@ class RunBatch:
             stages=self.arrays["b"].size,
             longest=settings.longest,
             relative=settings.relative,
-            **addresses,
+            **{name: array.ctypes.data for name, array in self.arrays.items()},
         )
-
-    def on_processor(self) -> ctypes.Structure:
-        """Returns the Batch of lanes.c with the arrays of this processor."""
-        return self.structure({name: array.ctypes.data for name, array in self.arrays.items()})
 
     def done(self, index: int) -> Run:
         """Returns a run that has reached its end."""

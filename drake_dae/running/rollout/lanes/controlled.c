@@ -1,6 +1,6 @@
 /* Error control by DOP853, each run with its own step; in the order of stepper.c. */
 
-ON_DEVICE static real weighted(const real *vector, const real *unit) {
+static real weighted(const real *vector, const real *unit) {
   real sum = K(0.0);
   int i;
   for (i = 0; i < SIZE; i++) sum += vector[i] / unit[i] * (vector[i] / unit[i]);
@@ -10,7 +10,7 @@ ON_DEVICE static real weighted(const real *vector, const real *unit) {
 IN_LINE real eighth_root(real x) { return square_root(square_root(square_root(x))); }
 
 /* A first step, as SciPy finds it. */
-ON_DEVICE static real first_step(const Batch *b, real time, const real *rate, Lanes *l) {
+static real first_step(const Batch *b, real time, const real *rate, Lanes *l) {
   real unit[SIZE], other[SIZE], change[SIZE], d0, d1, d2, h0, h1, longest = K(b->longest);
   mask small, valid;
   int i;
@@ -27,7 +27,7 @@ ON_DEVICE static real first_step(const Batch *b, real time, const real *rate, La
   return least(CHOOSE(valid, least(K(100.0) * h0, h1), h0), longest);
 }
 
-ON_DEVICE static real error_of(const Batch *b, real step, const real *x, const real *reached,
+static real error_of(const Batch *b, real step, const real *x, const real *reached,
                                real (*k)[SIZE]) {
   real fifth = K(0.0), third = K(0.0), both;
   int i, j;
@@ -47,7 +47,7 @@ ON_DEVICE static real error_of(const Batch *b, real step, const real *x, const r
 }
 
 /* The interpolant within a step, as SciPy has it. */
-ON_DEVICE static void interpolant(real size, const real *x, const real *reached, real (*k)[SIZE],
+static void interpolant(real size, const real *x, const real *reached, real (*k)[SIZE],
                                   real (*f)[SIZE]) {
   int i, j, s;
   for (i = 0; i < SIZE; i++) {
@@ -63,17 +63,17 @@ ON_DEVICE static void interpolant(real size, const real *x, const real *reached,
 }
 
 /* Returns which runs have a row before given times. */
-ON_DEVICE static mask with_row(const Batch *b, mask wanted, const Run *run, real end) {
+static mask with_row(const Batch *b, mask wanted, const Run *run, real end) {
   int lane;
   for (lane = 0; lane < LANES; lane++) {
     long long row = run[lane].row;
-    if (row >= b->num_rows || b->times[row] >= LANE(end, lane)) LANE(wanted, lane) = 0;
+    if (row >= b->num_rows || b->times[row] >= end[lane]) wanted[lane] = 0;
   }
   return wanted;
 }
 
 /* Writes the rows within steps; returns for which runs this succeeds. */
-ON_DEVICE static mask write_between(const Batch *b, Lanes *l, mask wanted, real time, real size,
+static mask write_between(const Batch *b, Lanes *l, mask wanted, real time, real size,
                                     real end, const real *reached, real (*k)[SIZE], Run *run) {
   real f[7][SIZE], at[SIZE];
   long long rows[LANES];
@@ -89,7 +89,7 @@ ON_DEVICE static mask write_between(const Batch *b, Lanes *l, mask wanted, real 
     real moment = time, part;
     for (lane = 0; lane < LANES; lane++) {
       rows[lane] = run[lane].row;
-      if (LANE(wanted, lane)) LANE(moment, lane) = b->times[run[lane].row++];
+      if (wanted[lane]) moment[lane] = b->times[run[lane].row++];
     }
     part = (moment - time) / size;
     for (i = 0; i < SIZE; i++) {
@@ -114,7 +114,7 @@ typedef struct {
 } Stepping;
 
 /* Begins a step of some runs; returns for which runs this succeeds. */
-ON_DEVICE static mask begin(const Batch *b, Stepping *p, mask begins) {
+static mask begin(const Batch *b, Stepping *p, mask begins) {
   real rate[SIZE], first;
   long long rows[LANES];
   mask good = begins, changed, wanted = p->fresh & begins;
@@ -123,13 +123,13 @@ ON_DEVICE static mask begin(const Batch *b, Stepping *p, mask begins) {
   for (i = 0; i < HELD; i++) p->held[i] = CHOOSE(begins, p->l.held[i], p->held[i]);
   for (lane = 0; lane < LANES; lane++) {
     rows[lane] = p->run[lane].row;
-    if (!LANE(begins, lane)) continue;
+    if (!begins[lane]) continue;
     p->before[lane] = p->run[lane];
-    LANE(p->time, lane) = p->run[lane].time;
+    p->time[lane] = p->run[lane].time;
   }
   if (any(wanted)) {
     good &= write(b, &p->l, wanted, p->time, p->l.x, rows) | ~wanted;
-    for (lane = 0; lane < LANES; lane++) p->run[lane].row += LANE(wanted, lane) != 0;
+    for (lane = 0; lane < LANES; lane++) p->run[lane].row += wanted[lane] != 0;
   }
   good &= updates(b, p->time, &p->l, good, good & ~p->known, p->run, &changed);
   p->known &= ~changed;
@@ -141,16 +141,16 @@ ON_DEVICE static mask begin(const Batch *b, Stepping *p, mask begins) {
   if (any(wanted)) {
     first = first_step(b, p->time, p->k[0], &p->l);
     for (lane = 0; lane < LANES; lane++) {
-      if (LANE(wanted, lane)) p->run[lane].step = LANE(first, lane);
+      if (wanted[lane]) p->run[lane].step = first[lane];
     }
   }
   for (lane = 0; lane < LANES; lane++) {
     const Run *run = &p->run[lane];
     double limit = b->times[b->num_rows - 1];
-    if (!LANE(begins, lane)) continue;
+    if (!begins[lane]) continue;
     if (run->event < b->num_events && b->events[run->event] < limit) limit = b->events[run->event];
-    LANE(p->limit, lane) = limit;
-    LANE(p->size, lane) = fmin(run->step, b->longest);
+    p->limit[lane] = limit;
+    p->size[lane] = fmin(run->step, b->longest);
     p->trials[lane] = p->rejected[lane] = 0;
   }
   p->fresh &= ~begins;
@@ -158,27 +158,27 @@ ON_DEVICE static mask begin(const Batch *b, Stepping *p, mask begins) {
 }
 
 /* Computes the end of a trial step; returns which steps are long enough. */
-ON_DEVICE static mask bounded(Stepping *p, mask alive, real *end) {
+static mask bounded(Stepping *p, mask alive, real *end) {
   int lane;
   for (lane = 0; lane < LANES; lane++) {
-    double time = LANE(p->time, lane), limit = LANE(p->limit, lane);
-    double stop = time + LANE(p->size, lane);
+    double time = p->time[lane], limit = p->limit[lane];
+    double stop = time + p->size[lane];
     if (stop >= limit - 1e-12 * fabs(limit)) stop = limit;
-    LANE(*end, lane) = stop;
-    LANE(p->size, lane) = stop - time;
-    if (!(stop - time > 1e-12 * fabs(time)) || p->trials[lane]++ >= TRIALS) LANE(alive, lane) = 0;
+    (*end)[lane] = stop;
+    p->size[lane] = stop - time;
+    if (!(stop - time > 1e-12 * fabs(time)) || p->trials[lane]++ >= TRIALS) alive[lane] = 0;
   }
   return alive;
 }
 
 /* Accepts a step of a run, or shortens it; returns 0 if the run adds hardly any time. */
-ON_DEVICE static int decide(const Batch *b, Stepping *p, int lane, int accepted, double end,
+static int decide(const Batch *b, Stepping *p, int lane, int accepted, double end,
                             double factor) {
   Run *run = &p->run[lane];
-  double size = LANE(p->size, lane);
+  double size = p->size[lane];
   if (!accepted) {
     p->rejected[lane] = 1;
-    LANE(p->size, lane) = size * factor;
+    p->size[lane] = size * factor;
     return 1;
   }
   /* A step that only ended early, at a sample, says nothing against longer ones. */
@@ -195,27 +195,27 @@ ON_DEVICE static int decide(const Batch *b, Stepping *p, int lane, int accepted,
 }
 
 /* Writes the rows at the ends of steps; returns for which runs this succeeds. */
-ON_DEVICE static mask write_ends(const Batch *b, Stepping *p, mask wanted, real end) {
+static mask write_ends(const Batch *b, Stepping *p, mask wanted, real end) {
   long long rows[LANES];
   mask at_row = wanted, at_last, changed;
   int lane;
   for (lane = 0; lane < LANES; lane++) {
     rows[lane] = p->run[lane].row;
-    if (rows[lane] >= b->num_rows || b->times[rows[lane]] != LANE(end, lane)) LANE(at_row, lane) = 0;
+    if (rows[lane] >= b->num_rows || b->times[rows[lane]] != end[lane]) at_row[lane] = 0;
   }
   if (!any(at_row)) return wanted;
   at_last = at_row;
   for (lane = 0; lane < LANES; lane++) {
-    if (rows[lane] < b->num_rows - 1) LANE(at_last, lane) = 0;
+    if (rows[lane] < b->num_rows - 1) at_last[lane] = 0;
   }
   if (any(at_last)) wanted &= updates(b, end, &p->l, at_last, none(), p->run, &changed) | ~at_last;
   wanted &= write(b, &p->l, at_row & wanted, end, p->l.x, rows) | ~at_row;
-  for (lane = 0; lane < LANES; lane++) p->run[lane].row += LANE(at_row, lane) != 0;
+  for (lane = 0; lane < LANES; lane++) p->run[lane].row += at_row[lane] != 0;
   return wanted;
 }
 
 /* Runs until there are no more to take. */
-ON_DEVICE static void run_apart(const Batch *b) {
+static void run_apart(const Batch *b) {
   Stepping p;
   real reached[SIZE], end = K(0.0);
   mask alive = ~none(), begins = none(), finished = ~none();
@@ -226,14 +226,14 @@ ON_DEVICE static void run_apart(const Batch *b) {
     real error, factor;
     for (lane = 0; lane < LANES; lane++) {
       long long own;
-      if (!LANE(finished, lane) || !LANE(alive, lane)) continue;
+      if (!finished[lane] || !alive[lane]) continue;
       own = take(b, 1);
-      LANE(alive, lane) = -(own < b->num_runs);
+      alive[lane] = -(own < b->num_runs);
       load(b, &p.l, lane, own < b->num_runs ? own : b->num_runs - 1);
       p.run[lane] = begun(b);
-      LANE(p.fresh, lane) = -1;
-      LANE(p.known, lane) = 0;
-      LANE(begins, lane) = -1;
+      p.fresh[lane] = -1;
+      p.known[lane] = 0;
+      begins[lane] = -1;
     }
     begins &= alive;
     if (!any(alive)) return;
@@ -261,20 +261,20 @@ ON_DEVICE static void run_apart(const Batch *b) {
     for (i = 0; i < SIZE; i++) p.l.x[i] = CHOOSE(accepted, reached[i], p.l.x[i]);
     p.known |= accepted;
     for (lane = 0; lane < LANES; lane++) {
-      if (!LANE(good, lane)) continue;
-      if (!decide(b, &p, lane, LANE(accepted, lane) != 0, LANE(end, lane), LANE(factor, lane))) {
-        LANE(good, lane) = 0;
+      if (!good[lane]) continue;
+      if (!decide(b, &p, lane, accepted[lane] != 0, end[lane], factor[lane])) {
+        good[lane] = 0;
       }
     }
     good &= write_ends(b, &p, accepted & good, end) | ~accepted;
     if (IS_STOPPED(b)) return;
     finished = alive & ~good;
     for (lane = 0; lane < LANES; lane++) {
-      if (LANE(finished, lane)) {
+      if (finished[lane]) {
         save(b, &p.l, lane, p.x, p.held, p.before[lane], HANDED_OVER);
-      } else if (LANE(alive, lane) && p.run[lane].row == b->num_rows) {
+      } else if (alive[lane] && p.run[lane].row == b->num_rows) {
         save(b, &p.l, lane, p.l.x, p.l.held, p.run[lane], DONE);
-        LANE(finished, lane) = -1;
+        finished[lane] = -1;
       }
     }
     begins = accepted & ~finished;

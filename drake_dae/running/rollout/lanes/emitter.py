@@ -58,18 +58,18 @@ def can_be_emitted(function: ca.Function) -> bool:
     return supported.issuperset(codes)
 
 
-def emitted(function: ca.Function, name: str, constants: list[float] | None = None) -> str:
+def emitted(function: ca.Function, name: str, constants: list[float]) -> str:
     """Returns a function as C, with its values in the order in which CasADi computes them.
 
-    With a list of constants, the text does not depend on their values: functions that differ in
-    them alone share their machine code.
+    The text does not depend on the values of constants: functions that differ in them alone share
+    their machine code.
 
     Args:
         function: A function of expressions (SX), whose inputs and outputs are dense columns.
         name: The name of the C function, `mask name(const double *c, const real *a0, ..., real *r0,
             ...)`. It returns for which runs an angle is too large for `turn`.
         constants: The constants are appended to it, one for each use, and the C function reads them
-            from `c`; None for constants within the text, which does not read `c`.
+            from `c`.
 
     Raises:
         ModelError: An operation is not supported, see `can_be_emitted`.
@@ -84,8 +84,6 @@ def emitted(function: ca.Function, name: str, constants: list[float] | None = No
             return value
         if inverse:
             value = 1.0 / value if value else copysign(inf, value)
-        if constants is None:
-            return f"K({_number(value)})"
         constants.append(value)
         return f"K(c[{len(constants) - 1}])"
 
@@ -136,7 +134,7 @@ def emitted(function: ca.Function, name: str, constants: list[float] | None = No
         f"(void){each};" for each in ("c", *(f"a{i}" for i in range(function.n_in())))
     )
     body = "\n  ".join(["mask far = none();", unused, *lines, "return far;"])
-    return f"ON_DEVICE static APART mask {name}({', '.join(arguments)}) {{\n  {body}\n}}\n"
+    return f"static APART mask {name}({', '.join(arguments)}) {{\n  {body}\n}}\n"
 
 
 def _divisors(function: ca.Function) -> tuple[set[int], set[int]]:
@@ -158,10 +156,3 @@ def _divisors(function: ca.Function) -> tuple[set[int], set[int]]:
     roots &= divisions.keys()
     often = {i for by, same in divisions.items() if len(same) > 1 or by in roots for i in same}
     return often, roots
-
-
-def _number(value: float) -> str:
-    """A constant of C; infinities and nan by division, since C99 has no literals of them."""
-    if value != value:
-        return "0.0 / 0.0"
-    return repr(float(value)) if abs(value) < float("inf") else f"{'-' * (value < 0)}1.0 / 0.0"

@@ -1,12 +1,12 @@
 /* The first of some runs. */
-ON_DEVICE static int first_of(mask some) {
+static int first_of(mask some) {
   int lane = 0;
-  while (lane < LANES - 1 && !LANE(some, lane)) lane++;
+  while (lane < LANES - 1 && !some[lane]) lane++;
   return lane;
 }
 
 /* Fixed steps of LANES runs, all at the same times. */
-ON_DEVICE static void run_together(const Batch *b, long long first) {
+static void run_together(const Batch *b, long long first) {
   Lanes l;
   Run run[LANES], before; /* equal for all active runs: that of the first */
   real k[16][SIZE], reached[SIZE], x[SIZE], held[HELD + 1];
@@ -15,7 +15,7 @@ ON_DEVICE static void run_together(const Batch *b, long long first) {
   int i, s, lane;
   for (lane = 0; lane < LANES; lane++) {
     long long own = first + lane;
-    if (own < b->num_runs) LANE(alive, lane) = -1;
+    if (own < b->num_runs) alive[lane] = -1;
     load(b, &l, lane, own < b->num_runs ? own : b->num_runs - 1);
     run[lane] = begun(b);
   }
@@ -71,7 +71,7 @@ ON_DEVICE static void run_together(const Batch *b, long long first) {
     if (IS_STOPPED(b)) return;
     if (any(alive & ~good)) {
       for (lane = 0; lane < LANES; lane++) {
-        if (LANE(alive, lane) && !LANE(good, lane)) save(b, &l, lane, x, held, before, HANDED_OVER);
+        if (alive[lane] && !good[lane]) save(b, &l, lane, x, held, before, HANDED_OVER);
       }
       alive &= good;
       if (!any(alive)) return;
@@ -81,6 +81,6 @@ ON_DEVICE static void run_together(const Batch *b, long long first) {
     for (lane = 1; RATES && lane < LANES; lane++) run[lane] = run[0];
   }
   for (lane = 0; lane < LANES; lane++) {
-    if (LANE(alive, lane)) save(b, &l, lane, l.x, l.held, run[0], DONE);
+    if (alive[lane]) save(b, &l, lane, l.x, l.held, run[0], DONE);
   }
 }

@@ -17,11 +17,7 @@ enum { TRIALS = 30 };
 
 /* A value of `next` after Python was interrupted. */
 #define STOPPED (1LL << 62)
-#ifdef __CUDACC__
-#define IS_STOPPED(b) 0
-#else
 #define IS_STOPPED(b) (*(b)->next >= STOPPED)
-#endif
 
 /* The arguments from Python. Arrays of runs have a row for each run; with a step of 0, one for all. */
 typedef struct {
@@ -36,7 +32,7 @@ typedef struct {
   double longest, relative;
   const double *a, *b, *c;  /* of fixed steps */
   const double *absolute;   /* of error control */
-  const double *constants;  /* of the functions, where they do not stand in the text */
+  const double *constants;  /* of the functions */
   Run *runs;
   int *endings;
   volatile long long *next; /* the first run that is not started yet */
@@ -51,30 +47,30 @@ typedef struct {
   long long run[LANES], event[LANES];
 } Lanes;
 
-ON_DEVICE static void load(const Batch *b, Lanes *l, int lane, long long run) {
+static void load(const Batch *b, Lanes *l, int lane, long long run) {
   int i;
   l->run[lane] = run;
   l->constants = b->constants;
-  for (i = 0; i < SIZE; i++) LANE(l->x[i], lane) = b->states[run * SIZE + i];
-  for (i = 0; i < HELD; i++) LANE(l->held[i], lane) = b->held[run * HELD + i];
+  for (i = 0; i < SIZE; i++) l->x[i][lane] = b->states[run * SIZE + i];
+  for (i = 0; i < HELD; i++) l->held[i][lane] = b->held[run * HELD + i];
   for (i = 0; i < PARAMETERS; i++) {
-    LANE(l->parameters[i], lane) = b->parameters[run * b->parameter_step + i];
+    l->parameters[i][lane] = b->parameters[run * b->parameter_step + i];
   }
-  LANE(l->time, lane) = NAN;
-  LANE(l->far, lane) = 0;
+  l->time[lane] = NAN;
+  l->far[lane] = 0;
 }
 
-ON_DEVICE static void save(const Batch *b, const Lanes *l, int lane, const real *x, const real *held,
+static void save(const Batch *b, const Lanes *l, int lane, const real *x, const real *held,
                            Run state, int ending) {
   long long run = l->run[lane];
   int i;
-  for (i = 0; i < SIZE; i++) b->states[run * SIZE + i] = LANE(x[i], lane);
-  for (i = 0; i < HELD; i++) b->held[run * HELD + i] = LANE(held[i], lane);
+  for (i = 0; i < SIZE; i++) b->states[run * SIZE + i] = x[i][lane];
+  for (i = 0; i < HELD; i++) b->held[run * HELD + i] = held[i][lane];
   b->runs[run] = state;
   b->endings[run] = ending;
 }
 
-ON_DEVICE static Run begun(const Batch *b) {
+static Run begun(const Batch *b) {
   Run run;
   memset(&run, 0, sizeof(run));
   run.time = run.start = run.mark = b->times[0];
@@ -83,22 +79,18 @@ ON_DEVICE static Run begun(const Batch *b) {
 }
 
 /* Returns the number of the next run, or of the first of several. */
-ON_DEVICE static long long take(const Batch *b, long long count) {
-#ifdef __CUDACC__
-  return (long long)atomicAdd((unsigned long long *)b->next, (unsigned long long)count);
-#else
+static long long take(const Batch *b, long long count) {
   return __atomic_fetch_add(b->next, count, __ATOMIC_RELAXED);
-#endif
 }
 
-ON_DEVICE static void set_time(real time, Lanes *l) {
+static void set_time(real time, Lanes *l) {
   if (!GIVEN || !any(~SAME(time, l->time))) return;
   l->far = dae_given(l->constants, &time, l->parameters, l->given);
   l->time = time;
 }
 
 /* Computes the derivative of the state; returns for which runs it has a value. */
-ON_DEVICE static mask rates(real time, const real *x, Lanes *l, real *rate) {
+static mask rates(real time, const real *x, Lanes *l, real *rate) {
   real valid;
   mask far;
   set_time(time, l);
@@ -107,7 +99,7 @@ ON_DEVICE static mask rates(real time, const real *x, Lanes *l, real *rate) {
 }
 
 /* Projects some states onto N*; returns which are on it. */
-ON_DEVICE static mask project(real time, real *x, Lanes *l, mask wanted) {
+static mask project(real time, real *x, Lanes *l, mask wanted) {
   real found[SIZE], at[SIZE], left;
   const real *from = x;
   mask open = wanted, near, far;
@@ -129,7 +121,7 @@ ON_DEVICE static mask project(real time, real *x, Lanes *l, mask wanted) {
 }
 
 /* Writes a row of the record for some runs; returns for which it has values. */
-ON_DEVICE static mask write(const Batch *b, Lanes *l, mask wanted, real time, const real *x,
+static mask write(const Batch *b, Lanes *l, mask wanted, real time, const real *x,
                             const long long *row) {
   real values[WIDTH + 1], valid;
   mask far;
@@ -139,23 +131,23 @@ ON_DEVICE static mask write(const Batch *b, Lanes *l, mask wanted, real time, co
   wanted &= is_number(valid) & ~(far | l->far);
   for (lane = 0; lane < LANES; lane++) {
     double *into = b->rows + (l->run[lane] * b->num_rows + row[lane]) * WIDTH;
-    if (!LANE(wanted, lane)) continue;
-    for (i = 0; i < WIDTH; i++) into[i] = LANE(values[i], lane);
+    if (!wanted[lane]) continue;
+    for (i = 0; i < WIDTH; i++) into[i] = values[i][lane];
   }
   return wanted;
 }
 
 /* Returns which runs have an update of a rate now. */
-ON_DEVICE static mask due(const Batch *b, const Lanes *l, mask now, int number) {
+static mask due(const Batch *b, const Lanes *l, mask now, int number) {
   int lane;
   for (lane = 0; lane < LANES; lane++) {
-    if (LANE(now, lane)) LANE(now, lane) = -(b->due[l->event[lane]] >> number & 1);
+    if (now[lane]) now[lane] = -(b->due[l->event[lane]] >> number & 1);
   }
   return now;
 }
 
 /* Makes the updates of one kind that are due; returns for which runs they have values. */
-ON_DEVICE static mask apply(const Batch *b, real time, Lanes *l, mask now, int unrestricted) {
+static mask apply(const Batch *b, real time, Lanes *l, mask now, int unrestricted) {
   real fresh[HELD + 1], noise[NOISE + 1];
   mask good = now;
   int i, lane;
@@ -165,8 +157,8 @@ ON_DEVICE static mask apply(const Batch *b, real time, Lanes *l, mask now, int u
   for (i = 0; i < NOISE; i++) {
     noise[i] = K(0.0);
     for (lane = 0; lane < LANES; lane++) {
-      if (!LANE(now, lane)) continue;
-      LANE(noise[i], lane) = b->noise[l->run[lane] * b->noise_step + l->event[lane] * NOISE + i];
+      if (!now[lane]) continue;
+      noise[i][lane] = b->noise[l->run[lane] * b->noise_step + l->event[lane] * NOISE + i];
     }
   }
   memcpy(fresh, l->held, HELD * sizeof(real));
@@ -176,25 +168,25 @@ $updates
 }
 
 /* Makes one instant of updates and the projection; returns for which runs this succeeds. */
-ON_DEVICE static mask update(const Batch *b, real time, Lanes *l, mask to_project, mask now) {
+static mask update(const Batch *b, real time, Lanes *l, mask to_project, mask now) {
   mask good = apply(b, time, l, now, 1) | ~now;
   good &= project(time, l->x, l, to_project) | ~to_project;
   return good & (apply(b, time, l, now, 0) | ~now);
 }
 
 /* Returns which runs have samples at their time. */
-ON_DEVICE static mask sampled(const Batch *b, const Lanes *l, mask wanted, const Run *run) {
+static mask sampled(const Batch *b, const Lanes *l, mask wanted, const Run *run) {
   int lane;
   (void)l;
   for (lane = 0; lane < LANES; lane++) {
     long long event = run[lane].event;
-    if (event >= b->num_events || b->events[event] > run[lane].time) LANE(wanted, lane) = 0;
+    if (event >= b->num_events || b->events[event] > run[lane].time) wanted[lane] = 0;
   }
   return wanted;
 }
 
 /* Makes all updates and the projection at the start of a step; returns for which runs this succeeds. */
-ON_DEVICE static mask updates(const Batch *b, real time, Lanes *l, mask wanted, mask to_project,
+static mask updates(const Batch *b, real time, Lanes *l, mask wanted, mask to_project,
                               Run *run, mask *changed) {
   mask good = wanted, now = none();
   int lane;
@@ -205,14 +197,14 @@ ON_DEVICE static mask updates(const Batch *b, real time, Lanes *l, mask wanted, 
     for (lane = 0; lane < LANES; lane++) l->event[lane] = run[lane].event;
     good &= update(b, time, l, to_project & good, now & good);
     if (!any(now)) return good;
-    for (lane = 0; lane < LANES; lane++) run[lane].event += LANE(now, lane) != 0;
+    for (lane = 0; lane < LANES; lane++) run[lane].event += now[lane] != 0;
     now = sampled(b, l, now & good, run);
     to_project = none();
   }
 }
 
 /* reached = x + step * weighted sum of rates; most weights of a high order are zero. */
-ON_DEVICE static void weigh(real step, int count, const double *b, const real *x, real (*k)[SIZE],
+static void weigh(real step, int count, const double *b, const real *x, real (*k)[SIZE],
                             real *reached) {
   real weights[16];
   const real *used[16];
@@ -231,20 +223,6 @@ ON_DEVICE static void weigh(real step, int count, const double *b, const real *x
 
 $fixed
 $controlled
-#ifdef __CUDACC__
-/* One run, or under error control one after the other, in each thread of a device. */
-#ifdef __cplusplus
-extern "C"
-#endif
-__global__ void run_on_device(const Batch *b) {
-  const long long first = (long long)blockIdx.x * blockDim.x + threadIdx.x;
-  if (!b->stages) {
-    run_apart(b);
-  } else if (first < b->num_runs) {
-    run_together(b, first);
-  }
-}
-#else
 /* Called by Python, from any number of threads at once. */
 __attribute__((visibility("default"))) void run_lanes(const Batch *b) {
   long long first;
@@ -254,4 +232,3 @@ __attribute__((visibility("default"))) void run_lanes(const Batch *b) {
   }
   while ((first = take(b, LANES)) < b->num_runs) run_together(b, first);
 }
-#endif

@@ -1,9 +1,7 @@
-/* real: the numbers of several runs side by side in a vector register, or that of one run.
+/* real: the numbers of several runs side by side in a vector register.
    mask: for each of them, all bits if something holds, else none. */
 
-#if defined(ONE_LANE) || defined(__CUDACC__)
-#define LANES 1
-#elif defined(__AVX512F__)
+#if defined(__AVX512F__)
 #define LANES 8
 #elif defined(__AVX__)
 #define LANES 4
@@ -11,60 +9,18 @@
 #define LANES 2
 #endif
 
-#if defined(__GNUC__) && !defined(__clang__) && !defined(__CUDACC__)
+#if defined(__GNUC__) && !defined(__clang__)
 /* The order in which GCC then puts operations takes 7 per cent less time. */
 #pragma GCC optimize("schedule-insns", "sched-pressure")
 #endif
 
-#ifdef __CUDACC__
-#define ON_DEVICE __device__
-#define APART __noinline__
-#define CONSTANT static __device__ const
-#ifndef NAN
-#define NAN (0.0 / 0.0)
-#endif
-#else
 #include <math.h>
 #include <string.h>
-#define ON_DEVICE
-#define CONSTANT static const
 #define APART __attribute__((noinline))
-#endif
-#define IN_LINE ON_DEVICE static inline
+#define IN_LINE static inline
 
-#if LANES == 1
-typedef double real;
-typedef long long mask;
-#define LANE(values, lane) (values)
-#define K(number) (number)
-#define LESS(a, b) (-(mask)((a) < (b)))
-#define NOT_MORE(a, b) (-(mask)((a) <= (b)))
-#define SAME(a, b) (-(mask)((a) == (b)))
-#define CHOOSE(condition, a, b) ((condition) ? (a) : (b))
-#define ONE_IF(condition) ((condition) ? 1.0 : 0.0)
-IN_LINE mask none(void) { return 0; }
-IN_LINE int any(mask condition) { return condition != 0; }
-IN_LINE real square_root(real x) { return sqrt(x); }
-IN_LINE real magnitude(real x) { return fabs(x); }
-IN_LINE real least(real a, real b) { return fmin(a, b); }
-IN_LINE real most(real a, real b) { return fmax(a, b); }
-IN_LINE void root(real x, real *value, real *over) {
-  *value = sqrt(x);
-  *over = 1.0 / *value;
-}
-IN_LINE mask turn(real angle, real *sine, real *cosine) {
-  *sine = sin(angle);
-  *cosine = cos(angle);
-  return 0;
-}
-#define EACH(name) \
-  IN_LINE real each_##name(real x) { return name(x); }
-#define EACH_OF_TWO(name) \
-  IN_LINE real each_##name(real x, real y) { return name(x, y); }
-#else
 typedef double real __attribute__((vector_size(8 * LANES)));
 typedef long long mask __attribute__((vector_size(8 * LANES)));
-#define LANE(values, lane) ((values)[lane])
 #if LANES == 8
 #define K(number) ((real){number, number, number, number, number, number, number, number})
 #elif LANES == 4
@@ -173,7 +129,6 @@ static inline __attribute__((always_inline)) mask turn(real angle, real *sine, r
   *cosine = (real)((mask)CHOOSE(odd, s, t) ^ ((quarter + 1) >> 1 << 63));
   return LESS(K(5e8), magnitude(angle));
 }
-#endif
 
 EACH(exp)
 EACH(log)

@@ -65,13 +65,12 @@ def load(program: RolloutProgram, compiled: Compiled, make: bool) -> Lanes | Non
     return None if path is None else Lanes(ctypes.CDLL(str(path)), np.array(constants))
 
 
-def source(program: RolloutProgram, constants: list[float] | None = None) -> str:
+def source(program: RolloutProgram, constants: list[float]) -> str:
     """Returns the C source of a diagram.
 
     Args:
         program: The diagram.
-        constants: A list to which its constants are appended, which the code then reads from the
-            batch; None for constants within the text.
+        constants: A list to which its constants are appended, which the code reads from the batch.
     """
     compiled = program.compiled
     functions = compiled.staged.items()
@@ -109,8 +108,8 @@ def _sizes(program: RolloutProgram) -> str:
     }
     lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for number, rate in enumerate(compiled.rates):
-        lines.append(c_places(number, rate, "CONSTANT"))
-    lines += [c_table(name, np.asarray(values), "CONSTANT") for name, values in DOP_TABLES.items()]
+        lines.append(c_places(number, rate))
+    lines += [c_table(name, np.asarray(values)) for name, values in DOP_TABLES.items()]
     return "\n".join([*lines, ""])
 
 

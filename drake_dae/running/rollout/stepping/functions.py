@@ -75,16 +75,6 @@ class DiagramFunctions:
         self.watched_rates = compiled.watched_rates
 
     @cached_property
-    def _many_updates(self) -> list[VectorizedFunction]:
-        rates = self.program.compiled.rates
-        return [VectorizedFunction(rate.function) for rate in rates if rate.stepped is None]
-
-    def updates_are_due(self, due: int, is_unrestricted: bool) -> bool:
-        """Whether updates of a kind are due; arguments as of `update`."""
-        kinds = [kind for number, (kind, _, _) in enumerate(self._updates) if due >> number & 1]
-        return is_unrestricted in kinds
-
-    @cached_property
     def moving(self) -> np.ndarray:
         """The held values on which the derivative of the state, or its manifold, depends."""
         compiled = self.program.compiled
@@ -167,25 +157,6 @@ class DiagramFunctions:
             if due >> number & 1 and kind == is_unrestricted:
                 values, valid = function(time, state, held, parameters, noise)
                 updated[places] = values + 0.0 * valid
-        return updated
-
-    def updates(
-        self,
-        time: float,
-        parameters: FloatArray,
-        due: int,
-        is_unrestricted: bool,
-        states: FloatArray,
-        held: FloatArray,
-        noise: FloatArray,
-    ) -> FloatArray:
-        """Returns `update` from many states, held values and random numbers, each with a row."""
-        updated, moments = held.copy(), np.full((len(held), 1), time)
-        for number, (kind, places, _) in enumerate(self._updates):
-            if due >> number & 1 and kind == is_unrestricted:
-                function = self._many_updates[number]
-                values, valid = function(moments, states, held, parameters, noise)
-                updated[:, places] = values + 0.0 * valid
         return updated
 
     def rows(

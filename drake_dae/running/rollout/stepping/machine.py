@@ -171,7 +171,7 @@ def _source(program: RolloutProgram) -> str:
         sizes[f"{name.upper()}_RES"] = max(4, function.sz_res())
     lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for number, rate in enumerate(compiled.rates):
-        lines.append(c_places(number, rate, "static const"))
+        lines.append(c_places(number, rate))
     lines.append(f"static const double TOUCHING = {TOUCHING!r};")
     lines += [c_table(name, np.asarray(values)) for name, values in DOP_TABLES.items()]
     words = {
@@ -245,21 +245,15 @@ _WATCH = """\
 """The C that evaluates the guards which are checked at samples."""
 
 
-def c_places(number: int, rate: UpdateRate, kind: str) -> str:
+def c_places(number: int, rate: UpdateRate) -> str:
     """Returns the places of an update among the held values as an array of C."""
-    return f"{kind} int places_{number}[] = {{{', '.join(map(str, [*rate.places, 0]))}}};"
+    return f"static const int places_{number}[] = {{{', '.join(map(str, [*rate.places, 0]))}}};"
 
 
-def c_table(name: str, values: FloatArray, kind: str = "static const") -> str:
-    """Returns a vector or a matrix as an array of C.
-
-    Args:
-        name: Its name.
-        values: Its entries.
-        kind: The qualifiers of its type.
-    """
+def c_table(name: str, values: FloatArray) -> str:
+    """Returns a vector or a matrix as an array of C."""
     if values.ndim == 1:
         listed = ", ".join(map(repr, [*values.tolist(), 0.0]))
-        return f"{kind} double {name}[] = {{{listed}}};"
+        return f"static const double {name}[] = {{{listed}}};"
     rows = ",\n".join(f"{{{', '.join(map(repr, row))}}}" for row in values.tolist())
-    return f"{kind} double {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}}};"
+    return f"static const double {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}}};"

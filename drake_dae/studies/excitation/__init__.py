@@ -1,1 +1,0 @@
-"""Motions and forces that determine parameters best."""

@@ -1,1 +1,0 @@
-"""Parameters and their uncertainty from records."""
