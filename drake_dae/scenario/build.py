@@ -15,8 +15,7 @@ from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
-    in_time, motion = timed(chosen.scenario, model, structure)
-    notes = (*completed.notes, *chosen.notes, *in_time.notes)
+from drake_dae.scenario.forms.keys import violated
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
