@@ -257,7 +257,7 @@ class TaskController(Diagram, Controller):
         return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
 
     def check_plant(self, plant: Plant) -> None:
-        check_plant_of_task(self.law.system, self.contact, self.sample_period, plant)
+        check_plant_of_task(self.law.system, self.sample_period, plant)
 
     def derived(
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]

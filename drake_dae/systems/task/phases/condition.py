@@ -62,10 +62,6 @@ class Condition:
         """The quantity in words: "force", or "signal ready"."""
         return f"{self.of} {self.name}".rstrip()
 
-    def margin(self, value: float) -> float:
-        """A number that is positive until the condition holds; an expression if the value is."""
-        return self.limit - value if self.above is not None else value - self.limit
-
     def __str__(self) -> str:
         side = "above" if self.above is not None else "below"
         return f"a {self.watched} {side} {self.limit:g} {UNITS[self.of]}".rstrip()

@@ -69,7 +69,8 @@ class Moment:
 
     def margin(self, condition: Condition) -> float:
         """A number that is positive until a condition holds."""
-        return condition.margin(self.value(condition))
+        value = self.value(condition)
+        return condition.limit - value if condition.above is not None else value - condition.limit
 
 
 @checked(ModelError)

@@ -275,10 +275,15 @@ class PhasePlan:
 def _contacts_of(phases: Sequence[Phase]) -> tuple[bool, ...]:
     """Whether each phase begins in contact; last whether the last one ends in contact.
 
-    At the start the robot is in contact if the first phase that says so begins in contact.
+    At the start the robot is in contact if the first phase that says so begins in contact. One
+    without a say that ends by a force begins without it.
     """
-    known = (p.begins_in_contact for p in phases if p.begins_in_contact is not None)
-    is_closed, contacts = bool(next(known, False)), []
+    known = (
+        bool(phase.begins_in_contact)
+        for phase in phases
+        if phase.begins_in_contact is not None or phase.in_contact_after(False)
+    )
+    is_closed, contacts = next(known, False), []
     for phase in phases:
         if phase.begins_in_contact is not None:
             is_closed = phase.begins_in_contact
