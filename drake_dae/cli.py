@@ -37,9 +37,7 @@ _MODULES = {
     "cache": "keys",
     "explain": "keys",
     "page": "play",
-    "live": "play",
     "render": "plot",
-    "diagram": "plot",
     "analyze": "new",
 }
 """Command -> its module, if the module has another name."""
@@ -73,7 +71,7 @@ def _main(arguments: Sequence[str] | None) -> int:
     as_json = getattr(options, "json", False)
     try:
         if options.command == "list":
-            return _list(as_json)
+            return _flushed(_list(as_json))
         run_command = _loaded(options.command)
         # The report of `analyze` contains it.
         ignored = [NonMinimumPhaseWarning] if options.command == "analyze" else []
@@ -83,7 +81,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         logging.getLogger("drake").setLevel(logging.WARNING)
         # A signal becomes an exception, so that unfinished files are removed.
         with _warnings(*ignored), ending_signals(end_at_once):
-            return run_command(options)
+            return _flushed(run_command(options))
     except DrakeDaeError as error:
         from drake_dae.scenario.manual.remedies import code_of
 
@@ -101,6 +99,12 @@ def _main(arguments: Sequence[str] | None) -> int:
     except KeyboardInterrupt as interrupt:
         print("interrupted", file=sys.stderr)
         return 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
+
+
+def _flushed(code: int) -> int:
+    """The exit code, once all output is written: the interpreter's own last flush ends with 120."""
+    sys.stdout.flush()
+    return code
 
 
 def _fail(text: str, as_json: bool, code: Callable[[str], str] = lambda _: "") -> int:

@@ -7,7 +7,15 @@ from numpy.typing import ArrayLike
 
 
 class DrakeDaeError(Exception):
-    """Base of every exception that drake_dae raises on purpose."""
+    """Base of every exception that drake_dae raises on purpose; it survives `pickle`, with data."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), self.args), dict(vars(self))
+
+
+def _restored(kind: type[DrakeDaeError], args: tuple[Any, ...]) -> DrakeDaeError:
+    """An exception without a call of its constructor; `pickle` then adds its data."""
+    return kind.__new__(kind, *args)
 
 
 class ModelError(DrakeDaeError, ValueError):

@@ -4,10 +4,12 @@ import argparse
 import json
 import logging
 import re
+import shlex
 import warnings
 from pathlib import Path
 
 from drake_dae.arrays import number_in
+from drake_dae.commands.options import program
 from drake_dae.errors import GeometryWarning, ScenarioError
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
@@ -46,7 +48,7 @@ def _new(options: argparse.Namespace) -> int:
         tip, point = _tip(options.tip)
         _, text = new_scenario(options.robot, options.surface, tip, point, out.parent)
     out.write_text(text, encoding="utf-8")
-    print(f"written: {out}\nnow run: drake-dae simulate {out}")
+    print(f"written: {out}\nnow run: {program()} simulate {shlex.quote(str(out))}")
     return 0
 
 

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any, TextIO
 from pydrake.systems.framework import Context
 
 import drake_dae
+from drake_dae.commands.options import program
 from drake_dae.commands.play import show
 from drake_dae.commands.run.files import RunFiles
 from drake_dae.commands.run.folder import (
@@ -33,12 +34,10 @@ from drake_dae.commands.run.report import RunReport, report_run
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.profile import PROFILE
 from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
-from drake_dae.scenario.parts.time_optimal import TimeOptimal
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
@@ -55,8 +54,6 @@ def run_command(options: argparse.Namespace) -> int:
     """Runs the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
-    if options.time_optimal and scenario.time_optimal is None:
-        scenario = replace(scenario, time_optimal=TimeOptimal())
     if options.open and not scenario.write.animation:
         raise ScenarioError(
             ("write.animation", ("--open shows the animation, so write.animation must be true"))
@@ -248,15 +245,15 @@ def _write(run: _CommandRun, files: RunFiles, failure: str, title: str) -> dict[
 def _print_report(report: RunReport, files: RunFiles) -> list[str]:
     """Prints the verdict, the summary and the problems; returns the names of the files."""
     folder = files.folder
-    written = [name for name in (*FILES, PROFILE, PART) if (folder / name).exists()]
+    written = [name for name in (*FILES, PART) if (folder / name).exists()]
     with files.collected():
         verdict = _colored(report.job)
         where = f"written to {folder}/: {', '.join(written)}"
         _print(f"{verdict}\n\n{report.text}\n{where}", sys.stdout)
         if ANIMATION in written:
             named = shlex.quote(str(folder))
-            drawn = "" if PLOTS[0] in written else f"; plots: drake-dae plot {named} --all"
-            _print(f"watch it: drake-dae play {named}{drawn}", sys.stdout)
+            drawn = "" if PLOTS[0] in written else f"; plots: {program()} plot {named} --all"
+            _print(f"watch it: {program()} play {named}{drawn}", sys.stdout)
     with suppress(OSError):
         _print("".join(f"error: {line}\n" for line in files.problems), sys.stderr)
     return written

@@ -92,13 +92,12 @@ class SteppedDiagram:
         if key not in self._functions:
             self._functions[key] = self._traced(*key)
         discrete, unrestricted, function = self._functions[key]
-        held, arguments = self._held, function.arguments
-        arguments[0][0], arguments[1][0], arguments[2][:] = sample.time, following.time, held
-        if sample.noise.size:
-            arguments[3][:], arguments[4][:] = sample.noise, following.noise
-        if not function.run():
+        held = self._held
+        after, begun, given, _ = function.evaluate(
+            sample.time, following.time, held, sample.noise, following.noise, self._parameters
+        )
+        if not function.is_valid:
             return False
-        after, begun, given, _ = function.outputs
         held[discrete] = after
         self.before[:] = held
         held[unrestricted] = begun
@@ -133,7 +132,6 @@ class SteppedDiagram:
                 places[1].extend(rate.places if rate.stepped is None else ())
         outputs["valid"] = valid
         function = TracedFunction("a sample", inputs, outputs, compiled=self._choice, lean=True)
-        function.arguments[5][:] = self._parameters
         return _indexed(places[0]), _indexed(places[1]), function
 
 

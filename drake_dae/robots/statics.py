@@ -87,14 +87,11 @@ class StaticPlacement:
             if is_traced:
                 step = self._step
                 first = step.evaluate(q, parameters, of_outputs, outputs, q)[0].copy()
-                at, run, (found,) = step.arguments[-1], step.run, step.outputs
 
                 def step_from(x: FloatArray) -> FloatArray:
                     if x is q:
                         return first
-                    at[...] = x  # The other arguments are still there.
-                    run()
-                    return found.copy()
+                    return step.evaluate(q, parameters, of_outputs, outputs, x)[0].copy()
 
                 if step.is_valid:
                     return NewtonModel(step_from, True)

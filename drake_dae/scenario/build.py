@@ -13,14 +13,12 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.forms.keys import violated
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.systems.control.command_filter import CommandLimits
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -49,7 +47,7 @@ def complete_with_law(scenario: Scenario) -> Completed:
 
 
 def build_completed(
-    scenario: Scenario, meshcat: Meshcat | None = None, commands: CommandLimits | None = None
+    scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:
     """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly.
 
@@ -64,8 +62,7 @@ def build_completed(
         structure,
         scene_graph,
         meshcat,
-        motion=prepared.motion,
-        commands=commands,
+        commanded=commanded,
     )
     told = filter(None, [sticking_before(scenario, model, structure)])
     return Completed(scenario, (*prepared.completed.notes, *told)), loop
@@ -78,7 +75,6 @@ class _Prepared:
     completed: Completed
     model: RobotModel
     structure: Structure
-    motion: TimedScenario | None
 
 
 def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
@@ -90,6 +86,5 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
-    in_time, motion = timed(chosen.scenario, model, structure)
-    notes = (*completed.notes, *chosen.notes, *in_time.notes)
-    return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)
+    notes = (*completed.notes, *chosen.notes)
+    return _Prepared(Completed(chosen.scenario, notes), model, structure)

@@ -1,11 +1,12 @@
 """Traced expressions as fast functions of NumPy arrays, with checks of their values."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 from math import isfinite
+from threading import RLock, local
 from typing import Any
 
 import casadi as ca
@@ -62,10 +63,11 @@ def count_operations(expression: ca.SX) -> int:
 class TracedFunction:
     """A compiled or interpreted function of CasADi expressions on preallocated NumPy arrays.
 
-    A call goes through CasADi's buffer interface and allocates nothing. It also computes one number
-    that says whether its values are valid, see `is_valid`. Only here it is decided whether a
-    function is interpreted or compiled, by the choice `compiled` of the caller. CasADi's function
-    is made when it is first needed: many blocks run as parts of a whole, and a report needs few.
+    Each thread has arrays of its own, so that calls from several threads do not mix. A call goes
+    through CasADi's buffer interface and allocates nothing. It also computes one number that says
+    whether its values are valid, see `is_valid`. Only here it is decided whether a function is
+    interpreted or compiled, by the choice `compiled` of the caller. CasADi's function is made when
+    it is first needed: many blocks run as parts of a whole, and a report needs few.
 
     Args:
         name: The name of the function in messages.
@@ -85,8 +87,7 @@ class TracedFunction:
             the matrix is called singular there.
 
     Attributes:
-        arguments: The arrays that a call reads, for `run`.
-        outputs: The arrays that a call writes.
+        sizes: The number of entries of each input.
         is_machine_code: Whether calls currently run machine code.
     """
 
@@ -120,14 +121,10 @@ class TracedFunction:
         expressions = [*dense, regularity, *checks]
         self._expressions, self._symbols = expressions, list(inputs.values())
         self._often, self._lean = often, lean
-        self.arguments = tuple(np.zeros(symbol.numel()) for symbol in self._symbols)
-        self._num_inputs = len(self.arguments)
-        self._results = results = [np.zeros(e.shape, order="F") for e in expressions]
-        results, checks = results[: len(dense)], results[len(dense) :]
-        self._pivot, self._finite, self._valid = (checks[i].reshape(-1) for i in (0, 1, -1))
-        self.outputs = tuple(
-            array.reshape(-1, order="F") if array.shape[1] == 1 else array for array in results
-        )
+        self.sizes = tuple(symbol.numel() for symbol in self._symbols)
+        self._num_inputs, self._num_outputs = len(self.sizes), len(dense)
+        self._local, self._lock = local(), RLock()
+        self._current: ca.Function | None = None  # What calls evaluate; None before the first.
         self._compiled = compiled
         self._attempts: list[CompilationAttempt] | None = None  # None before the first call.
         self._calls_left = 0
@@ -149,105 +146,103 @@ class TracedFunction:
         """The number of scalar operations of one call."""
         return int(self.function.n_instructions())
 
-    def _begin(self) -> None:
-        """Makes and binds the function, before the first call."""
-        self._attempts = attempts(self._compiled, self.num_operations) if self._often else []
-        self._calls_left = self._attempts[0].calls if self._attempts else 0
-        self._bind(self.function)
+    def _count(self) -> None:
+        """Makes the function before the first call, and machine code after some more."""
+        with self._lock:
+            if self._attempts is None:
+                self._attempts = (
+                    attempts(self._compiled, self.num_operations) if self._often else []
+                )
+                self._calls_left = self._attempts[0].calls if self._attempts else 0
+                self._current = self.function
+            if not self._attempts:
+                return
+            self._calls_left -= 1
+            if self._calls_left > 0:
+                return
+            attempt = self._attempts.pop(0)
+            self._calls_left = self._attempts[0].calls if self._attempts else 0
+            code = machine_code(self.function, self._compiled, attempt.make)
+            if code is not None:
+                self._attempts.clear()
+                self._current, self.is_machine_code = code, True
 
-    def _bind(self, function: ca.Function) -> None:
-        """Binds the function that calls evaluate to the arrays."""
-        self.is_machine_code = function is not self.function
-        self._buffer, self._evaluate = function.buffer()
-        for index, array in enumerate(self.arguments):
-            self._buffer.set_arg(index, array.data)
-        for index, array in enumerate(self._results):
-            self._buffer.set_res(index, array.reshape(-1, order="F").data)
-        if not self._calls_left:
-            vars(self)["run"] = _run(self._evaluate, self._valid)
+    @property
+    def _arrays(self) -> "_Arrays":
+        """The arrays of this thread."""
+        try:
+            arrays: _Arrays = self._local.arrays
+        except AttributeError:
+            arrays = self._local.arrays = _Arrays(
+                self.sizes, [e.shape for e in self._expressions], self._num_outputs
+            )
+        return arrays
 
-    def _seek(self) -> None:
-        """Tries to get machine code, after the number of calls of the next attempt."""
-        assert self._attempts  # There are calls left.
-        attempt = self._attempts.pop(0)
-        code = machine_code(self.function, self._compiled, attempt.make)
-        if code is None and self._attempts:
-            self._calls_left = self._attempts[0].calls
-        else:
-            self._bind(code or self.function)
-
-    def evaluate(self, *arguments: FloatArray) -> tuple[FloatArray, ...]:
+    def evaluate(self, *arguments: FloatArray | float) -> tuple[FloatArray, ...]:
         """Evaluates the function without allocation.
 
         Args:
             arguments: Arrays of the sizes of the inputs, in their order.
 
         Returns:
-            The outputs. The arrays are overwritten by the next call; copy values to keep them.
+            The outputs. The next call from this thread overwrites them; copy values to keep them.
 
         Raises:
             TypeError: The number of arguments is wrong.
         """
         if len(arguments) != self._num_inputs:
             raise TypeError(f"{self.name} takes {self.input_names}, got {len(arguments)} arguments")
+        if self._attempts is None or self._attempts:
+            self._count()
+        try:
+            arrays = self._local.arrays
+        except AttributeError:
+            arrays = self._arrays
+        if arrays.function is not self._current:
+            arrays.bind(self._current)
         # zip(..., strict=True) and [:] would take as long as the function.
-        inputs, index = self.arguments, 0
+        inputs, index = arrays.arguments, 0
         for argument in arguments:
             inputs[index][...] = argument
             index += 1  # noqa: SIM113 - enumerate takes longer.
-        self.run()
-        return self.outputs
-
-    def run(self) -> bool:
-        """Evaluates the function at its `arguments`; returns whether its `outputs` are valid.
-
-        This is the fastest call, for callers that write the arguments in place. It is replaced by
-        `_run` when there are no more attempts to compile.
-        """
-        if self._attempts is None:
-            self._begin()
-            return self.run()
-        self._calls_left -= 1
-        if not self._calls_left:
-            self._seek()
-        self._evaluate()
-        return isfinite(self._valid[0])
+        arrays.evaluate()
+        return arrays.outputs
 
     def nowhere(self) -> tuple[FloatArray, ...]:
         """Returns new arrays of nan in the shapes of the outputs, for failed evaluations."""
         return tuple(np.full_like(output, np.nan) for output in self.outputs)
 
     @property
-    def sizes(self) -> tuple[int, ...]:
-        """The number of entries of each input."""
-        return tuple(array.size for array in self.arguments)
+    def outputs(self) -> tuple[FloatArray, ...]:
+        """The outputs of this thread's last call, which its next call overwrites."""
+        return self._arrays.outputs
 
     @property
     def is_valid(self) -> bool:
         """Whether the last values are valid: all finite, and the matrix regular."""
-        return isfinite(self._valid[0])
+        return isfinite(self._arrays.valid[0])
 
     @property
     def is_finite(self) -> bool:
         """Whether every output of the last call was finite."""
-        return isfinite(self._finite[0])
+        return isfinite(self._arrays.finite[0])
 
     @property
     def is_regular(self) -> bool:
         """Whether the last values are finite and the matrix is regular; ignores the doubt."""
-        return self.is_finite and bool(self._pivot[0] >= SINGULAR_PIVOT)
+        return self.is_finite and self.pivot >= SINGULAR_PIVOT
 
     @property
     def pivot(self) -> float:
         """The pivot of the last evaluation; 1 without a matrix."""
-        return float(self._pivot[0])
+        return float(self._arrays.pivot[0])
 
     def failure(self) -> Failure:
         """Returns the failure of the last evaluation, if it was not valid."""
         for fault, limit in ((FailureKind.INPUT, np.inf), (FailureKind.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(argument) < limit)))
-                for name, argument in zip(self.input_names, self.arguments, strict=True)
+                for name, argument in zip(self.input_names, self._arrays.arguments, strict=True)
                 if not np.all(np.abs(argument) < limit)
             }
             if bad:
@@ -255,7 +250,7 @@ class TracedFunction:
         # A value may not be finite because the matrix is singular.
         if self.is_regular and self._outside:
             return Failure(self.name, FailureKind.OUTSIDE, {}, self._outside)
-        is_singular = self.is_finite or self._pivot[0] < SINGULAR_PIVOT
+        is_singular = self.is_finite or self.pivot < SINGULAR_PIVOT
         fault = FailureKind.SINGULAR if is_singular else FailureKind.VALUE
         return Failure(self.name, fault, {}, self._regular)
 
@@ -280,19 +275,18 @@ class TracedFunction:
             ModelError: The number of arguments is wrong, or one has a wrong shape or is not
                 numeric.
         """
-        if len(arguments) == self._num_inputs and all(map(_fits, arguments, self.arguments)):
+        if len(arguments) == self._num_inputs and all(map(_fits, arguments, self.sizes)):
             return tuple(output.copy() for output in self.evaluate(*arguments))  # type: ignore
-        if len(arguments) != len(self.arguments):
+        if len(arguments) != self._num_inputs:
             raise ModelError(
-                f"{self.name} takes {len(self.arguments)} arguments "
+                f"{self.name} takes {self._num_inputs} arguments "
                 f"({', '.join(self.input_names)}), got {len(arguments)}"
             )
         arrays = [
             numbers(f"{self.name}: '{label}'", argument)
             for label, argument in zip(self.input_names, arguments, strict=True)
         ]
-        for label, buffer, array in zip(self.input_names, self.arguments, arrays, strict=True):
-            size = buffer.size
+        for label, size, array in zip(self.input_names, self.sizes, arrays, strict=True):
             if array.size != size:
                 raise ModelError(f"{self.name}: '{label}' has size {array.size}, not {size}")
             if array.ndim > 1 and array.shape != (size, 1):
@@ -301,20 +295,34 @@ class TracedFunction:
         return tuple(output.copy() for output in values)
 
 
-def _fits(argument: Any, buffer: FloatArray) -> bool:
-    """Whether an argument is an array of the shape and type of an input buffer, as most are."""
+class _Arrays:
+    """The arrays of one thread, and the call that reads and writes them."""
+
+    def __init__(self, sizes: Sequence[int], shapes: Sequence[tuple[int, int]], count: int) -> None:
+        self.arguments = tuple(np.zeros(size) for size in sizes)
+        self._results = results = [np.zeros(shape, order="F") for shape in shapes]
+        checks = results[count:]
+        self.pivot, self.finite, self.valid = (checks[i].reshape(-1) for i in (0, 1, -1))
+        self.outputs = tuple(
+            array.reshape(-1, order="F") if array.shape[1] == 1 else array
+            for array in results[:count]
+        )
+        self.function: ca.Function | None = None
+
+    def bind(self, function: ca.Function) -> None:
+        """Sets the function that `evaluate` calls; CasADi keeps the addresses of the arrays."""
+        self.function = function
+        self._buffer, self.evaluate = function.buffer()
+        for index, array in enumerate(self.arguments):
+            self._buffer.set_arg(index, array.data)
+        for index, result in enumerate(self._results):
+            self._buffer.set_res(index, result.reshape(-1, order="F").data)
+
+
+def _fits(argument: Any, size: int) -> bool:
+    """Whether an argument is an array of floats of the shape of an input, as most are."""
     is_array = type(argument) is np.ndarray
-    return is_array and argument.dtype is buffer.dtype and argument.shape == buffer.shape
-
-
-def _run(evaluate: Callable[[], None], valid: FloatArray) -> Callable[[], bool]:
-    """Returns a call without attribute lookups."""
-
-    def run() -> bool:
-        evaluate()
-        return isfinite(valid[0])
-
-    return run
+    return is_array and argument.dtype == np.float64 and argument.shape == (size,)
 
 
 def _identifier(name: str) -> str:

@@ -1,10 +1,15 @@
 """The command: what it prints, what it leaves, and how it ends."""
 
+import os
 import re
+import shlex
 import signal
+import subprocess
+import sys
 import time
 import warnings
 import webbrowser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -300,6 +305,23 @@ def test_a_wrong_command_line(arguments, capsys):
         main(arguments)
     assert caught.value.code == 2
     assert "usage: drake-dae" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_printed_command_works_as_printed(tmp_path):
+    """As after `make demo`, where no `drake-dae` is on PATH."""
+    script = Path(sys.executable).with_name("drake-dae")
+    if not script.exists():
+        pytest.skip("the package is not installed")
+    bare = os.environ | {"PATH": "/usr/bin:/bin"}
+    out = tmp_path / "a run"
+    arguments = ["simulate", "two_link_wall", "--out", out, "--set", "duration=0.1"]
+    run = subprocess.run([script, *arguments], env=bare, capture_output=True, text=True, check=True)
+    (line,) = re.findall("^watch it: (.*)$", run.stdout, re.MULTILINE)
+    play, plot = line.split("; plots: ")
+    subprocess.run(f"{plot} --all", shell=True, env=bare, cwd=tmp_path, check=True)
+    assert list(out.glob("*.png"))
+    assert shlex.split(play)[0] == str(script)
 
 
 @pytest.mark.slow

@@ -194,7 +194,7 @@ def test_site_is_made_and_loads_nothing_from_outside(tmp_path):
 
 
 QUESTIONS = {
-    "fmu for dymola": "export_c_fmu",
+    "controller for embedded": "export_c",
     "unknown tool weight force error": "wrong_payload",
     "yaml autocomplete vscode": "editor_completion",
 }

@@ -41,7 +41,7 @@ def test_the_first_scenario_runs_as_printed(tmp_path, capsys):
     (tmp_path / "my_arm.urdf").write_text(arm.read_text("utf-8"), "utf-8")
     out = ["--out", str(tmp_path / "run"), "--set", "write.animation=false"]
     assert main(["simulate", str(tmp_path / "my_arm.yaml"), *out]) == 0
-    assert "\nTracked as predicted:" in capsys.readouterr().out
+    assert "\nGOOD" in capsys.readouterr().out
 
 
 def test_it_is_read_to_its_end():

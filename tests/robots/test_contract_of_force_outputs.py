@@ -15,8 +15,6 @@ from drake_dae import (
     ForceOutput,
     JointCoupler,
     NamedForce,
-    Plane,
-    PointOnSurface,
     RobotModel,
     Signal,
     Squeeze,

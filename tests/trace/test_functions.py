@@ -1,3 +1,7 @@
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+from time import sleep
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -259,3 +263,23 @@ def test_the_pivot_of_a_positive_definite_matrix_is_an_angle(size):
         assert function((columns.T @ columns).ravel(), right)[0][0] < 1e-14
         columns[:, 0] = 0.0
         assert function((columns.T @ columns).ravel(), right)[0][0] == 0.0
+
+
+def test_threads_do_not_share_arrays():
+    """Each thread reads the values of its own call: the switch comes between call and reading."""
+    x = ca.SX.sym("x", 2)
+    function = TracedFunction("square", {"x": x}, {"y": x**2}, compiled=False)
+    barrier = Barrier(4, timeout=60.0)
+
+    def values(number: int) -> bool:
+        right = True
+        for count in range(200):
+            (y,) = function.evaluate(np.array([number, count], dtype=float))
+            if count < 3:
+                barrier.wait()
+            sleep(0.0)
+            right &= y.tolist() == [number**2, count**2] and function.is_valid
+        return right
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(values, range(4)))

@@ -7,12 +7,12 @@ from drake_dae.arrays import check_whole_number
 from drake_dae.dae.tracking.constraint_damping import best_damping, unstable_from, warn_of
 from drake_dae.errors import ModelError
 
-_PHASE = 0.15
+_PHASE = 0.3
 """The allowed loss of phase by sampling and delay at the crossover frequency, in rad."""
 
-_JITTER = 0.04
+_JITTER = 0.08
 """The allowed standard deviation of accelerations from velocity noise, from sample to sample, in
-rad/s^2: 0.04 N m for a body of 1 kg m^2."""
+rad/s^2: 0.08 N m for a body of 1 kg m^2."""
 
 
 @checked(ModelError)
@@ -63,14 +63,14 @@ def contact_gains(
     pair has a damping ratio of 1/2.
 
     w is the smaller of two. First, a delay tau = (delay + 1/2) sample_time costs the phase 3 w tau
-    at the crossover frequency, of which 0.15 rad are allowed. Second, white velocity noise n makes
+    at the crossover frequency, of which 0.3 rad are allowed. Second, white velocity noise n makes
     the acceleration jump by 3 w n_k through the law, and by k_o n_(k-1) through the observer, one
     sample later. From sample to sample the standard deviation is
 
         n sqrt((3 w)^2 + (k_o - 3 w)^2 + k_o^2),
 
-    which is sqrt(14) w n for both k_o = w and k_o = 2 w, so k_o = 2 w is taken. 0.04 rad/s^2 are
-    allowed. At 1 kHz, one sample of delay and 1e-3 rad/s this gives w = 10.7 1/s. Friction is
+    which is sqrt(14) w n for both k_o = w and k_o = 2 w, so k_o = 2 w is taken. 0.08 rad/s^2 are
+    allowed. At 1 kHz, one sample of delay and 1e-3 rad/s this gives w = 21.4 1/s. Friction is
     identified at the rate k_o / 4, so that the observer reacts to a change first.
 
     Noise reaches the force through the damping c and the observer's rate k_n in the normal

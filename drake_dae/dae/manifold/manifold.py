@@ -109,13 +109,9 @@ class Manifold(Residual):
             None if the steps do not converge, so that `searched` is needed.
         """
         function = self._first_steps
-        state, parameters = function.arguments
-        state[...] = start
-        parameters[...] = p
-        is_valid = function.run()
-        sizes, moved, _ = function.outputs
+        sizes, moved, _ = function.evaluate(start, p)
         outcome = sizes.item(0)
-        if is_valid and outcome == FOUND:
+        if function.is_valid and outcome == FOUND:
             return moved
         return start if outcome == STAYS and function.is_finite else None
 

@@ -180,11 +180,10 @@ def at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
     The function reuses its result array: copy it to keep it.
     """
     function = TracedFunction("reference", {"time": time}, {"R": rows})
-    (moment,), (value,) = function.arguments, function.outputs
 
     def evaluate(time: float) -> FloatArray:
-        moment[0] = time
-        if not function.run():
+        (value,) = function.evaluate(time)
+        if not function.is_valid:
             raise not_finite(time, value)
         return value
 

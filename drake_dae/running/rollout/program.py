@@ -4,6 +4,7 @@ import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
+from threading import RLock
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,6 +19,9 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
+
+MAKING = RLock()
+"""What is made once is made by one thread; expressions of CasADi cannot be shared by several."""
 
 
 @dataclass(eq=False)
@@ -47,8 +51,9 @@ class RolloutProgram:
 
     def kept(self, name: str, make: Callable[[], T]) -> T:
         """Returns the value of a function that is called once; later the same value."""
-        if name not in self._made:
-            self._made[name] = make()
+        with MAKING:
+            if name not in self._made:
+                self._made[name] = make()
         value: T = self._made[name]
         return value
 
@@ -102,18 +107,19 @@ def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
         ModelError: A block cannot be traced, with its name and the reason; or a diagram has no
             output port with a vector.
     """
-    if isinstance(loop, Diagram):
-        return _of_diagram(loop)
-    if "program" not in loop.memory:
-        loop.memory["program"] = RolloutProgram(
-            compile_diagram(loop.diagram, list(loop.signals)),
-            loop.signals,
-            partial(_completed, loop),
-            loop.plant.get_name(),
-            loop.plant.dae.compiled,
-            ends_updated=not loop.plant.time_step,
-        )
-    program: RolloutProgram = loop.memory["program"]
+    with MAKING:
+        if isinstance(loop, Diagram):
+            return _of_diagram(loop)
+        if "program" not in loop.memory:
+            loop.memory["program"] = RolloutProgram(
+                compile_diagram(loop.diagram, list(loop.signals)),
+                loop.signals,
+                partial(_completed, loop),
+                loop.plant.get_name(),
+                loop.plant.dae.compiled,
+                ends_updated=not loop.plant.time_step,
+            )
+        program: RolloutProgram = loop.memory["program"]
     return program
 
 

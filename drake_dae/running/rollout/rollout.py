@@ -23,7 +23,7 @@ from drake_dae.running.rollout.failures import failure_of
 from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
 from drake_dae.running.rollout.lanes.library import Lanes
 from drake_dae.running.rollout.problems import Problems, problems_of
-from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.program import MAKING, RolloutProgram
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
@@ -141,15 +141,18 @@ def run_loop(
         look: Called from time to time with a function: time in s, or None -> the record after it.
             Returns whether to stop the run; its record then ends there.
     """
-    request = RolloutRequest.of(loop, times, config, compiled, lasting, look)
-    problems = problems_of(request.program, starts, parameters, request.times, seeds)
+    with MAKING:
+        request = RolloutRequest.of(loop, times, config, compiled, lasting, look)
+        problems = problems_of(request.program, starts, parameters, request.times, seeds)
+        kinds = _kinds(request.program, problems)
     rollouts: dict[int, Rollout] = {}
-    for program, indices in _kinds(request.program, problems):
+    for program, indices in kinds:
         some = problems.chosen(indices)
-        code = request.machine_code(program, len(problems))
-        lanes = None
-        if code is not None and look is None and len(some) >= SEVERAL:
-            lanes = request.lanes(program, len(problems))
+        with MAKING:
+            code = request.machine_code(program, len(problems))
+            lanes = None
+            if code is not None and look is None and len(some) >= SEVERAL:
+                lanes = request.lanes(program, len(problems))
         runs = _runs(program, some, request.settings, code, lanes)
         for index, run in zip(indices.tolist(), runs, strict=True):
             rollouts[index] = _rollout(request.program, problems, index, run)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from drake_dae.analysis.limits import LimitsAlong
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
@@ -84,6 +85,7 @@ class Feasibility:
         laws: The requirements of two laws for springs; None without springs or samples.
         sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
         gains: Why no gains can be computed where they are left out, else empty.
+        slowing: How much slower the references keep all limits; None where they keep them.
     """
 
     analysis: Analysis
@@ -97,6 +99,7 @@ class Feasibility:
     laws: SpringLaws | None = None
     sticking: str = ""
     gains: str = ""
+    slowing: LimitsAlong | None = None
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
@@ -116,6 +119,11 @@ class Feasibility:
             *map(_left, _beyond(self.joints)),
             *self.wrong_sides,
             *([self.gains] if self.gains else []),
+            *(
+                []
+                if self.slowing is None
+                else [f"most of all {self.slowing.excess}; {self.slowing.remedy}"]
+            ),
         )
 
     def __repr__(self) -> str:
@@ -142,6 +150,7 @@ class Feasibility:
             "behind": [asdict(link) for link in self.behind],
             "spring_laws": None if self.laws is None else self.laws.to_dict(),
             "sticking": self.sticking,
+            "slowing": None if self.slowing is None else asdict(self.slowing),
             "problems": list(self.problems),
         }
 

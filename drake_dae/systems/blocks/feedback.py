@@ -59,14 +59,11 @@ class Feedback(Immutable):
         Raises:
             NonFiniteError: The reference is not finite.
         """
-        x, r, parameters = self.function.arguments
-        r[...] = self.reference(time)
-        x[...] = state
-        parameters[...] = self.parameters
-        return self.function.outputs[0] if self.function.run() else None
+        control, *_ = self.function.evaluate(state, self.reference(time), self.parameters)
+        return control if self.function.is_valid else None
 
     def motion(
-        self, function: TracedFunction, parameters: FloatArray, latest: list[FloatArray]
+        self, function: TracedFunction, parameters: FloatArray
     ) -> Callable[[float, FloatArray], FloatArray | None]:
         """x' as a function of time and state, overwritten by the next call; None without a value.
 
@@ -74,17 +71,12 @@ class Feedback(Immutable):
             function: Law and plant, by `motion_under`.
             parameters: The parameters of the plant; an array of this motion alone, which must not
                 be changed.
-            latest: The `parameters` of the motion that called the function last.
         """
-        x, r, of_law, of_plant = function.arguments
-        rate, reference, of_this_law = function.outputs[1], self.reference, self.parameters
+        reference, of_this_law = self.reference, self.parameters
 
         def motion(time: float, state: FloatArray) -> FloatArray | None:
-            r[...] = reference(time)
-            x[...] = state
-            if latest[0] is not parameters:  # Otherwise they are still in place.
-                latest[0], of_law[...], of_plant[...] = parameters, of_this_law, parameters
-            return rate if function.run() else None
+            rate = function.evaluate(state, reference(time), of_this_law, parameters)[1]
+            return rate if function.is_valid else None
 
         return motion
 

@@ -257,12 +257,10 @@ class TrackingController(ParameterizedSystem, Controller):
         if self._is_plain:  # The same as above, but without another call.
             of_state, of_reference = self._evaluators
             state, reference = of_state(context), of_reference(context)
-            x, r, parameters = function.arguments
-            x[...] = state
-            r[...] = reference
-            parameters[...] = context.get_numeric_parameter(0).value()
-            if function.run():
-                return function.outputs
+            parameters = context.get_numeric_parameter(0).value()
+            values = function.evaluate(state, reference, parameters)
+            if function.is_valid:
+                return values
         inputs = [evaluate(context) for evaluate in self._evaluators]
         return self._checked(function, context, *inputs)
 

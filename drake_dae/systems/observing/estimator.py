@@ -109,7 +109,7 @@ class StateEstimator(ObservingSystem):
         filters = state_filters(observing, sample_period, *noise)
         timing = sample_period, control_lag, control_delay, plant_step
         self._functions = functions = EstimatorFunctions(law, observing, *timing, filters, noise[0])
-        start = np.zeros(functions.now.arguments[functions.now.input_names.index("held")].size)
+        start = np.zeros(functions.now.sizes[functions.now.input_names.index("held")])
         start[0] = -1.0
         self._declare(law, functions, "measured_state", start)
         self._read = functions.reads

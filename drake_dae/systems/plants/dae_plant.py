@@ -214,12 +214,11 @@ class DaePlant(ParameterizedSystem, Plant):
                     return
         elif self._is_controlled and self._exogenous is None:
             control = self._control_port.Eval(context)
-            x, u, parameters = self.dynamics.arguments
-            x[...] = context.get_continuous_state_vector().value()
-            u[...] = control
-            parameters[...] = context.get_numeric_parameter(0).value()
-            if self.dynamics.run():
-                derivatives.SetFromVector(self.dynamics.outputs[0])
+            state = context.get_continuous_state_vector().value()
+            parameters = context.get_numeric_parameter(0).value()
+            (rate,) = self.dynamics.evaluate(state, control, parameters)
+            if self.dynamics.is_valid:
+                derivatives.SetFromVector(rate)
                 return
         derivatives.SetFromVector(self._evaluate(self.dynamics, context))
 

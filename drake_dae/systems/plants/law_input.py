@@ -65,7 +65,6 @@ class LawInput:
         self._plant, self._control, self._values, self._steps = proxy(plant), control, values, steps
         self._dynamics, self._compiled = dynamics, compiled
         self._motion: tuple[TracedFunction, TracedFunction] | None = None
-        self._latest = [np.zeros(0)]
         self.port = plant.DeclareAbstractInputPort("feedback", nothing())
         sources = {plant.input_port_ticket(port.get_index()) for port in (control, self.port)}
         # Law and parameters are the same for many states: one look at the context instead of three.
@@ -85,7 +84,7 @@ class LawInput:
         if feedback is not None:
             self._steps.note_law(context, feedback.parameters)
             function = self.motion_under(feedback.function)
-            motion = feedback.motion(function, parameters, self._latest)
+            motion = feedback.motion(function, parameters)
         entry = self._plant.get_cache_entry(self._index)
         self._entry = ref(entry)
         value.set_value(_FedBack(feedback, parameters, motion, entry))
@@ -94,7 +93,6 @@ class LawInput:
         """Law and plant as one function; see `feedback.motion_under`."""
         if self._motion is None or self._motion[0] is not law:
             self._motion = law, motion_under(law, self._dynamics, self._compiled)
-            self._latest[0] = np.zeros(0)
         return self._motion[1]
 
     def motion(self, context: Context) -> Callable[[float, FloatArray], FloatArray | None] | None:

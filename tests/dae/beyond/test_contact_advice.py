@@ -83,7 +83,7 @@ def test_within_a_bound_of_an_error_the_smoothest_gains_are_taken():
     best = advised_gains(given, 1.0)
     near = advised_gains(given, 1.0, position_error=4.0 * best.position_error)
     assert best.position_error < near.position_error <= 4.0 * best.position_error
-    assert near.roughness < 0.9 * best.roughness
+    assert near.gains.position_rate < 0.9 * best.gains.position_rate
     assert near.force_error == pytest.approx(best.force_error, rel=0.1)
     soft = advised_gains(given, 1.0, force_error=1.5 * best.force_error)
     assert best.force_error < soft.force_error <= 1.5 * best.force_error

@@ -11,12 +11,12 @@ from drake_dae.errors import AdviceWarning, ModelError
 
 
 def test_one_sample_at_a_kilohertz_gives_the_rate_of_the_docstring():
-    """w = 0.04 / (sqrt(14) 1e-3) = 10.7 1/s by noise, and 0.15 / (3 1.5e-3) = 33 1/s without."""
+    """w = 0.08 / (sqrt(14) 1e-3) = 21.4 1/s by noise, and 0.3 / (3 1.5e-3) = 67 1/s without."""
     found = contact_gains(1e5, 0.03, 1e-3)
-    assert found.position_rate == pytest.approx(1.5 * 10.69, rel=1e-4)
-    assert found.constraint_damping == pytest.approx(2.3 * 10.69, rel=1e-4)
+    assert found.position_rate == pytest.approx(1.5 * 21.38, rel=1e-4)
+    assert found.constraint_damping == pytest.approx(2.3 * 21.38, rel=1e-4)
     still = contact_gains(1e5, 0.03, 1e-3, velocity_noise=0.0)
-    assert still.position_rate == pytest.approx(50.0)
+    assert still.position_rate == pytest.approx(100.0)
 
 
 def test_positions_have_butterworths_poles():
@@ -30,14 +30,14 @@ def test_positions_have_butterworths_poles():
 
 
 def test_noise_jumps_from_sample_to_sample_as_the_docstring_says():
-    """White noise of a velocity, 3 w of it now and k_o of it a sample later: 0.04 rad/s^2.
+    """White noise of a velocity, 3 w of it now and k_o of it a sample later: 0.08 rad/s^2.
 
     200,000 samples tell it to a per cent.
     """
     found, noise = contact_gains(1e5, 0.03, 1e-3), 1e-3
     n = noise * np.random.default_rng(0).standard_normal(200_000)
     accelerations = found.position_gains(3)[2] * n[1:] + found.observer_rate * n[:-1]
-    assert np.std(np.diff(accelerations)) == pytest.approx(0.04, rel=0.01)
+    assert np.std(np.diff(accelerations)) == pytest.approx(0.08, rel=0.01)
 
 
 def test_noise_of_the_force_is_that_of_the_docstring():

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -561,3 +562,28 @@ def test_observed_loops_are_those_of_drake(name, settings, compiled):
     (found,) = rollout(loop, start, parameters, grid(0.2, 1e-3), **settings)
     assert found.failure is None
     assert_equal_records(found.record, wanted, 1e-11)
+
+
+@pytest.mark.parametrize("is_compiled", [False, True])
+@pytest.mark.parametrize("name", ["two_link_wall", "wall_point_contact"])
+def test_threads_do_not_disturb_each_other(name, is_compiled):
+    """Rollouts of one loop with different parameters from four threads at once."""
+    if is_compiled and shutil.which("cc") is None:
+        pytest.skip("there is no C compiler")
+    loop, context = build_scenario(scenario(name, "duration=0.05", *fixed()))
+    state, parameters = start_values(loop, context)
+    times = grid(0.05, 0.01)
+    changed = [parameters * (1.0 + 1e-3 * i * (parameters == 9.81)) for i in range(4)]
+    changed = [parameters if i == 0 else other for i, other in enumerate(changed)]
+
+    def values(number: int) -> list[np.ndarray]:
+        (made,) = rollout(loop, state, changed[number], times, compiled=is_compiled)
+        assert made.failure is None
+        return [*(each.values for each in made.record.signals.values())]
+
+    one_by_one = [values(number) for number in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(values, [0, 1, 2, 3] * 3))
+    for number, found in enumerate(together):
+        for value, wanted in zip(found, one_by_one[number % 4], strict=True):
+            np.testing.assert_array_equal(value, wanted)

@@ -23,7 +23,7 @@ from drake_dae.dae.beyond.advising.directions import (
 from drake_dae.dae.beyond.contact_gains import ContactGains
 from drake_dae.errors import GainError, ModelError
 
-_PHASE = 0.15
+_PHASE = 0.3
 """As for `contact_gains`: the loss of phase by sampling and delay at the crossover, in rad; half of
 it with an estimator: a force along the contact that it attributes to friction couples the contact
 to free directions, and with the full phase an unknown mass of 1 kg made them swing."""
@@ -98,7 +98,7 @@ def advised_gains(
     - are stable, and settle at least at the rate `DECAY` w, if a force accelerates 1/2 to 2 times
       as in the model of the law in free directions, and 2/3 to 3/2 times along a contact whose
       stiffness is up to 2 times the stated one,
-    - lose at most 0.15 rad of phase to samples and delay, with an estimator half of it.
+    - lose at most 0.3 rad of phase to samples and delay, with an estimator half of it.
 
     Where an error is bounded, the gains of its direction are the smoothest ones within the bound.
 
@@ -119,7 +119,7 @@ def advised_gains(
     bounds = _Bounds(roughness, position_error, force_error)
     phase = _PHASE / 2.0 if situation.estimates else _PHASE
     highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
-    rates = np.geomspace(highest, highest / 30.0, 14).tolist()
+    rates = np.geomspace(highest, highest / 60.0, 17).tolist()
     candidates = []
     for fast in _state_rates(situation, highest):
         found = _pair(situation, rates, fast, bounds)
@@ -151,7 +151,7 @@ def _state_rates(situation: SensedContact, highest: float) -> Iterator[float | N
     if not situation.estimates:
         yield None
         return
-    for share in (4.0, 7.0, 12.0, 20.0):
+    for share in (2.0, 4.0, 7.0, 12.0, 20.0):
         if share * highest * situation.period <= 0.5:
             yield share * highest
 

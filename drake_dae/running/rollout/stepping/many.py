@@ -4,6 +4,7 @@ CasADi's `map` interprets each operation for each argument; NumPy does it once f
 """
 
 from collections.abc import Callable
+from threading import Lock
 from typing import Any
 
 import casadi as ca
@@ -84,7 +85,7 @@ class VectorizedFunction:
             [function.numel_out(i) for i in range(function.n_out())],
         ]
         self._inputs, self._outputs = ([np.zeros((k, BLOCK)) for k in each] for each in sizes)
-        self._one = BufferedFunction(function)
+        self._one, self._lock = BufferedFunction(function), Lock()
         if supported.issuperset(codes):
             self._steps = self._program(codes)
 
@@ -125,7 +126,10 @@ class VectorizedFunction:
                 ):
                     column[i] = value
             return results
-        parts = [self._block(arguments, i, min(i + BLOCK, count)) for i in range(0, count, BLOCK)]
+        with self._lock:  # All threads share the arrays of a block.
+            parts = [
+                self._block(arguments, i, min(i + BLOCK, count)) for i in range(0, count, BLOCK)
+            ]
         return [np.concatenate(values) for values in zip(*parts, strict=True)]
 
     def _block(self, arguments: tuple[FloatArray, ...], first: int, last: int) -> list[FloatArray]:
