@@ -39,7 +39,6 @@ DEAR = (
     "seven_joint_flexible_motors",
     "planar_4rrr",
     "biped",
-    "biped_step",
     "conveyor",
     "crank_turning",
     "four_bar",
