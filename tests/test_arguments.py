@@ -426,7 +426,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "heights": lambda: [[0.0, 0.1], [0.0, 0.2]],
     "file": lambda: None,
     "file of MeshSurface": lambda: (
-        FOLDER.parents[1] / "drake_dae" / "scenario" / "manual" / "ridge.obj"
+        FOLDER.parents[1] / "tests" / "robots" / "surfaces" / "ridge.obj"
     ),
     "middle": lambda: None,
     "ranges": lambda: {"duration": (1.0, 2.0)},

@@ -79,11 +79,7 @@ def _add_texts(commands: Any) -> None:
     )
     shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
     shown.flag("--path", "print where its file is instead")
-    keys = commands.add_parser("keys", help="print the keys of a scenario, in Markdown")
-    keys.add_argument("key", nargs="?", default="", help="as gains or Plane (default: all keys)")
     commands.add_parser("schema", help="print the JSON Schema of a scenario, for editors")
-    explain = commands.add_parser("explain", help="print what to do about an error, by its code")
-    explain.add_argument("code", nargs="?", default="", help="as E12 (default: all codes)")
 
 
 def _add_simulate(commands: Any, scenario: CommandParser) -> None:

@@ -4,8 +4,8 @@
 
 Each has to end done, or by the chosen reaction, or with an error of the library, in a time that its
 phases and retries allow. Without pushes and payloads the force of every touch has to stay below
-the expected peak. Returns 1 if one does not. With `--out` each outcome is a line of that file when it is
-known, and the tasks in the file are not run again.
+the expected peak. Returns 1 if one does not. With `--out` each outcome is a line of that file when
+it is known, and the tasks in the file are not run again.
 """
 
 import random
