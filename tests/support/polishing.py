@@ -73,14 +73,18 @@ def laws() -> tuple[TrackingLaw, TrackingLaw]:
     return law, TrackingLaw(free, poles({"tool.z": -25.0, "wall.distance": POLE}))
 
 
+def soft_wall() -> CompliantPlant:
+    """The arm at a wall of 1e5 N/m, in steps of PERIOD."""
+    return CompliantPlant(polisher(), PointMaterial(PERIOD, stiffness=1e5, radius=1e-5))
+
+
 def task_loop(
     phases: Sequence[Phase], sampling: Sampling | None = None, **settings: float
 ) -> ClosedLoop:
     """A wall of 1e5 N/m under a task; the law acts at each step, or as it is sampled."""
     period = PERIOD if sampling is None else sampling.period
     controller = TaskController(Task(phases, **settings), *laws(), sample_period=period)
-    plant = CompliantPlant(polisher(), PointMaterial(PERIOD, stiffness=1e5, radius=1e-5))
-    return wire_loop(plant, controller, settings=LoopSettings(sampling=sampling))
+    return wire_loop(soft_wall(), controller, settings=LoopSettings(sampling=sampling))
 
 
 def started(loop: ClosedLoop, distance: float = FAR, height: float = 0.3) -> Context:
