@@ -133,7 +133,7 @@ def built_data(data: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, An
     # Default gains depend on the built loop, and a task contains the values of its gains.
     if own["gains"] and base["gains"] and not own["task"]:
         tag = own["gains"].get(TAG, "!Poles")
-        if tag == base["gains"][TAG] and tag not in ("!Matrices", "!Impedance"):
+        if tag == base["gains"][TAG] and tag != "!Matrices":
             own["gains"] = base["gains"]
     if "seed" in (force := own["force_feedback"]):
         deviation = force["noise_deviation"]

@@ -47,8 +47,9 @@ def test_a_touch_is_felt_when_its_packet_comes(file):
 @pytest.mark.slow
 def test_a_task_ends_where_the_law_stops_the_robot(file):
     """After twenty samples without a measurement, with the reason and the record up to there."""
-    lost = "sampling={period: 0.002, delay: 0.001, measurements: {loss: 0.01, burst: 20, most_lost: 20}}"
-    found, changes = rolled(load_scenario(file, [lost]))
+    lost = "measurements: {loss: 0.01, burst: 20, most_lost: 20}"
+    change = f"sampling={{period: 0.002, delay: 0.001, {lost}}}"
+    found, changes = rolled(load_scenario(file, [change]))
     text = str(found.failure)
     assert "no measurement has arrived for 20 samples (sampling.measurements.most_lost)" in text
     assert found.record.time[-1] <= found.failure.time

@@ -61,7 +61,7 @@ def task_controller(
         free_system = open_contact(law.system, forces)
     with at("task.gains" if task.gains else "gains"):
         structure = find_structure(free_system)
-        gains = (task.gains or scenario.gains).design(structure)
+        gains = (task.gains or scenario.gains).design()
         free_law = TrackingLaw(free_system, gains, structure=structure, latency=law.latency)
     with at("task"):
         # The noise of the sum over the points.

@@ -8,7 +8,7 @@ from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
 from drake_dae.scenario.forms.forms import Choice
-from drake_dae.scenario.parts.parts import Coefficients, Impedance, Matrices, Poles
+from drake_dae.scenario.parts.parts import Coefficients, Matrices, Poles
 from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.task import Task
 
@@ -46,7 +46,7 @@ class ScenarioTask:
     tare_time: float = 0.0
     retries: int = 10
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
-    gains: Annotated[Poles | Coefficients | Matrices | Impedance, Choice()] | None = None
+    gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
         signals = self.make().signals
