@@ -29,7 +29,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots friction peers house equations pictures docs gallery sheet benches referee clean lint
+.PHONY: help demo check test processor benchmark campaign robots friction peers house equations pictures docs referee clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -41,7 +41,6 @@ help:
 	@echo 'make benchmark   speed, with ratios, beside peers that it installs; some 10 minutes'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: hours'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
-	@echo 'make benches     each scenario as page and as live bench, into runs/benches/; minutes'
 	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
 	@echo 'make referee     constraint forces of five engines and the right ones, into examples/referee/table.md'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
@@ -49,8 +48,6 @@ help:
 	@echo 'make equations   from each equation of the paper to its line and its test'
 	@echo 'make pictures    film the demo and a task, into $(PICTURES)/'
 	@echo 'make docs        run the pages of the book and make its site, in $(BOOK)/site/'
-	@echo 'make gallery     run all scenarios and show them on one page, in build/gallery/; some minutes'
-	@echo 'make sheet       every scenario at three moments, as page and film, into runs/sheet/; chromium'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
 
@@ -83,15 +80,10 @@ campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/support/woodpecker.py
 	$(BIN)/python tests/campaign/polish.py
 	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_tasks.py --count 1000 --seed $(SEED)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_limits.py --count 1000 --seed $(SEED)
 
 # Those of example-robot-data, and of pybullet_data and robosuite where these are installed.
 robots: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/real_robots.py $(ARGS)
-
-# To be looked at; needs Chromium.
-benches: $(VENV)/installed-dev
-	$(BIN)/python tests/campaign/benches.py --out runs/benches $(ARGS)
 
 friction: $(VENV)/installed
 	$(BIN)/python examples/unknown_friction
@@ -117,12 +109,6 @@ pictures: $(VENV)/installed
 
 docs: $(VENV)/installed-docs
 	$(BIN)/python examples/book --out $(BOOK)
-
-gallery: $(VENV)/installed
-	$(BIN)/python examples/gallery
-
-sheet: $(VENV)/installed
-	$(BIN)/python tests/campaign/contact_sheet.py $(ARGS)
 
 clean:
 	rm -rf .venv-3.* dist build .mypy_cache .pytest_cache .ruff_cache

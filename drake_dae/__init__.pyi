@@ -25,7 +25,6 @@ from .dae.references import CircleReference as CircleReference
 from .dae.references import ConstantReference as ConstantReference
 from .dae.references import CsvReference as CsvReference
 from .dae.references import ExpressionReference as ExpressionReference
-from .dae.references import GCodeReference as GCodeReference
 from .dae.references import LineReference as LineReference
 from .dae.references import PathLimits as PathLimits
 from .dae.references import PointToPointReference as PointToPointReference
@@ -34,7 +33,6 @@ from .dae.references import Reference as Reference
 from .dae.references import ReferenceRows as ReferenceRows
 from .dae.references import SinusoidReference as SinusoidReference
 from .dae.references import SpiralReference as SpiralReference
-from .dae.references import TextReference as TextReference
 from .dae.references import WaypointsReference as WaypointsReference
 from .dae.references import references_by_name as references_by_name
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure
@@ -46,10 +44,6 @@ from .dae.structure.structure import find_structure as find_structure
 from .dae.system.signals import Parameter as Parameter
 from .dae.system.signals import Signal as Signal
 from .dae.system.system import DaeSystem as DaeSystem
-from .dae.timing.motion_limits import FrictionCone as FrictionCone
-from .dae.timing.motion_limits import MotionLimits as MotionLimits
-from .dae.timing.profile import PathTiming as PathTiming
-from .dae.timing.profile import TimeOptimalReference as TimeOptimalReference
 from .dae.tracking.constraint_damping import contact_damping as contact_damping
 from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
@@ -66,7 +60,6 @@ from .diagrams.wiring import make_closed_loop as make_closed_loop
 from .diagrams.wiring import wire_loop as wire_loop
 from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
-from .pictures.diagram import save_diagram as save_diagram
 from .pictures.film import save_film as save_film
 from .pictures.runs import plot_runs as plot_runs
 from .pictures.scene.view import start_meshcat as start_meshcat
@@ -75,6 +68,7 @@ from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
 from .robots.actuation.hydraulics import ElectrohydraulicServos as ElectrohydraulicServos
 from .robots.constraints.alignment import AxisNormalToSurface as AxisNormalToSurface
 from .robots.constraints.couplers import JointCoupler as JointCoupler
+from .robots.constraints.friction import FrictionCone as FrictionCone
 from .robots.constraints.loop_joints import PrismaticLoopJoint as PrismaticLoopJoint
 from .robots.constraints.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
 from .robots.constraints.points import FixedDistance as FixedDistance
@@ -98,7 +92,6 @@ from .robots.link_side import link_side as link_side
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
 from .robots.model import RobotModel as RobotModel
-from .robots.motion_limits import robot_motion_limits as robot_motion_limits
 from .robots.outputs import AxisCoordinates as AxisCoordinates
 from .robots.outputs import ExpressionOutput as ExpressionOutput
 from .robots.outputs import JointPositions as JointPositions
@@ -115,14 +108,8 @@ from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
 from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
-from .running.bench.inline import LiveBench as LiveBench
-from .running.bench.inline import inline_page as inline_page
-from .running.bench.live import live as live
 from .running.bench.page import write_page as write_page
-from .running.bench.run import Commands as Commands
-from .running.bench.run import replay as replay
 from .running.export.export import export_code as export_code
-from .running.export.fmu.fmu import export_fmu as export_fmu
 from .running.export.steps.controller import export_controller as export_controller
 from .running.export.wasm.wasm import export_wasm as export_wasm
 from .running.rollout.problems import start_values as start_values
@@ -137,7 +124,6 @@ from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .simulation.records.record import Record as Record
 from .simulation.records.record_writer import RecordWriter as RecordWriter
-from .simulation.records.rerun_file import save_rerun as save_rerun
 from .simulation.simulate import simulate as simulate
 from .studies.study import Study as Study
 from .studies.sweep import sweep as sweep
@@ -146,7 +132,6 @@ from .studies.variations import listed_variations as listed_variations
 from .studies.variations import random_variations as random_variations
 from .symbolic import from_symbolic as from_symbolic
 from .systems.cascade.cascade import SpringCascade as SpringCascade
-from .systems.control.command_filter import CommandLimits as CommandLimits
 from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
@@ -171,7 +156,6 @@ from .systems.plants.contact_events import ContactChange as ContactChange
 from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
-from .systems.plants.hardware.lcm_arm import LcmArm as LcmArm
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
 from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant

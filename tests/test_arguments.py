@@ -8,7 +8,6 @@ tests of that name fail and say so.
 import contextlib
 import datetime
 import inspect
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
@@ -28,7 +27,6 @@ from latches import carts, hand_over
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
-from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
@@ -43,7 +41,6 @@ from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import RankMargin
-from drake_dae.dae.timing.profile import TimeProfile
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError, SimulationError
 from drake_dae.pictures.scene.run_motion import ShownLoop
@@ -62,7 +59,6 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.systems.plants.contact_events import ContactChange
-from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
 from drake_dae.systems.task.phases import Phase
 from drake_dae.trace.functions import TracedFunction
 
@@ -117,16 +113,6 @@ def estimator() -> dd.StateEstimator:
 @cache
 def cascade() -> dd.SpringCascade:
     return dd.SpringCascade(links_law(), springy(), dd.SpringLoop(60.0, motor_rate=60.0), 0.01)
-
-
-def motion_limits() -> dd.MotionLimits:
-    return dd.robot_motion_limits(arm("two_link").model)
-
-
-@cache
-def time_profile() -> TimeProfile:
-    line, press = dd.SinusoidReference(0.3, 0.1, 1.5), dd.ConstantReference(20.0)
-    return dd.PathTiming(arm("two_link").structure, motion_limits()).profile([line, press], 0.5)
 
 
 def sensed() -> dd.SensedContact:
@@ -229,30 +215,20 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.FeedbackGains: lambda: law("two_link").gains,
     dd.ForceSensor: lambda: dd.ForceSensor(1, 0.1),
     dd.Sampling: lambda: dd.Sampling(0.01),
-    dd.CommandLimits: dd.CommandLimits,
     dd.CommandedReferences: lambda: dd.CommandedReferences(
-        [dd.ConstantReference(0.5)], [2], [dd.Signal("a")], dd.CommandLimits()
+        [dd.ConstantReference(0.5)], [2], [dd.Signal("a")]
     ),
-    dd.Commands: lambda: dd.Commands([(0, "two_link_arm.link1.mass", 9.0)], 2),
     dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),
     dd.DisturbanceObserver: observer,
     dd.StateEstimator: estimator,
     dd.SensedContact: sensed,
-    dd.MotionLimits: motion_limits,
-    dd.PathTiming: lambda: dd.PathTiming(arm("two_link").structure, motion_limits()),
-    TimeProfile: time_profile,
-    dd.TimeOptimalReference: lambda: dd.TimeOptimalReference(time_profile()),
     dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
     dd.SpringCascade: cascade,
     "law of SpringCascade": links_law,
     "model of SpringCascade": springy,
     "model of link_side": springy,
-    "references of PathTiming.profile": lambda: [
-        dd.SinusoidReference(0.3, 0.1, 1.5),
-        dd.ConstantReference(20.0),
-    ],
     "end": lambda: 0.5,
     dd.SensorNoise: lambda: dd.SensorNoise(),
     dd.AdvisedGains: lambda: dd.advised_gains(sensed(), 1.0),
@@ -298,7 +274,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     SimulatorConfig: fixed_step,
     Stage: lambda: dd.DcMotors(0.1, 1e-3, 0.5),
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
-    DrakeLcmInterface: lambda: DrakeLcm("memq://"),
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
     Variable: lambda: Variable("x"),
@@ -440,11 +415,6 @@ PLACES: dict[str, Callable[[], Any]] = {
         Path(__file__).parent / "systems" / "control" / "steps.csv"
     ),
     "columns of CsvReference": lambda: ["x"],
-    "origin of TextReference": lambda: [0.0, 0.0],
-    "file of GCodeReference": lambda: str(
-        Path(__file__).parent / "systems" / "control" / "program.nc"
-    ),
-    "origin of GCodeReference": lambda: [0.0, 0.0],
     "outputs of references_by_name": lambda: ["a"],
     "degrees of references_by_name": lambda: [1],
     "q": lambda: ca.SX.sym("q"),
@@ -459,7 +429,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "heights": lambda: [[0.0, 0.1], [0.0, 0.2]],
     "file": lambda: None,
     "file of MeshSurface": lambda: (
-        FOLDER.parents[1] / "drake_dae" / "scenario" / "manual" / "ridge.obj"
+        FOLDER.parents[1] / "tests" / "robots" / "surfaces" / "ridge.obj"
     ),
     "middle": lambda: None,
     "ranges": lambda: {"duration": (1.0, 2.0)},
@@ -541,8 +511,6 @@ class Call(NamedTuple):
 
 def public() -> Iterator[tuple[str, Any]]:
     for name in dd.__all__:
-        if name == "LcmArm" and sys.version_info >= CRASHES:
-            continue
         member = getattr(dd, name)
         if callable(member) and not (
             inspect.isclass(member) and issubclass(member, (Exception, Warning, Enum))
@@ -675,9 +643,7 @@ EVERY = tuple(labels())
 SIDE_EFFECTS = {
     "start_meshcat": "it opens a port",
     "Record.save": "it writes to the given path",
-    "live": "it serves a page until Ctrl-C",
     "write_page": "it writes to the given path",
-    "Commands.save": "it writes to the given path",
     "export_code": "it writes to the given path",
     "sweep": "it writes to the given path",
     "Study.save": "it writes to the given path",

@@ -1,4 +1,4 @@
-"""`drake-dae export`: writes controller, plant and loop as C99, FMUs or WebAssembly."""
+"""`drake-dae export`: writes controller, plant and loop as C99 or WebAssembly."""
 
 import argparse
 import json
@@ -62,14 +62,6 @@ def _write_wasm(
     return export_wasm(loop, context, name, folder, scenario.integrator)
 
 
-def _write_fmu(
-    scenario: Scenario, loop: ClosedLoop, context: Context, name: str, folder: Path
-) -> Export:
-    from drake_dae.running.export.fmu.fmu import export_fmu
-
-    return export_fmu(loop, context, name, folder, scenario.integrator)
-
-
 def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
     """The parts of the scenario that the exported functions lack; none if the loop is exported."""
     if parts_of(loop).compiled is not None:
@@ -83,5 +75,5 @@ def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
     return [text for text, is_run in parts.items() if is_run]
 
 
-WRITERS = {"c": _write_c, "wasm": _write_wasm, "fmu": _write_fmu}
+WRITERS = {"c": _write_c, "wasm": _write_wasm}
 """Format -> the function that writes it."""

@@ -11,7 +11,6 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import WiringError
-from drake_dae.systems.control.command_filter import CommandLimits
 from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.references import ReferenceGenerator
@@ -21,18 +20,14 @@ from drake_dae.systems.plants.contract import Plant
 def make_generator(
     references: Sequence[Reference], law: TrackingLaw, parts: LoopSettings
 ) -> ReferenceGenerator:
-    """The reference block of a law: `CommandedReferences` if the settings have `commands`.
+    """The reference block of a law: `CommandedReferences` if the settings are `commanded`.
 
     Raises:
-        WiringError: The settings have both `governed` and `commands`.
         ReferenceSignalError: The references do not fit the law.
     """
-    if parts.commands is None:
+    if not parts.commanded:
         return ReferenceGenerator(references, law.layout.reference_degrees)
-    if parts.governed is not None:
-        raise WiringError("references that are governed cannot be commanded: leave one out")
-    degrees, signals = law.layout.reference_degrees, law.system.output_signals
-    return CommandedReferences(references, degrees, signals, parts.commands, parts.start_time)
+    return CommandedReferences(references, law.layout.reference_degrees, law.system.output_signals)
 
 
 def add_exogenous(
@@ -51,7 +46,7 @@ def add_exogenous(
     of_plant = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
     # Commands pass as many lags to the plant as to the law.
     degrees = *plant.exogenous_layout.degrees, *controller.exogenous_layout.degrees
-    lags = parts.commands, max(degrees, default=0) + 1
+    lags = parts.commanded, max(degrees, default=0) + 1
     moving = _add_exogenous(builder, plant, plant.dae, of_plant, *lags)
     known = _add_exogenous(builder, controller, controller.law.system, parts.exogenous, *lags)
     if known is not None:
@@ -64,7 +59,7 @@ def _add_exogenous(
     block: Plant | Controller,
     dae: DaeSystem,
     exogenous: Sequence[Reference],
-    commands: CommandLimits | None,
+    commanded: bool,
     depth: int,
 ) -> ReferenceGenerator | None:
     """Adds the generator of a block's exogenous signals, with as many lags as `depth`."""
@@ -84,10 +79,8 @@ def _add_exogenous(
         )
     degrees, signals = block.exogenous_layout.degrees, dae.exogenous.signals
     generator = ReferenceGenerator(exogenous, degrees)
-    if commands is not None:
-        generator = CommandedReferences(
-            exogenous, degrees, signals, commands, has_speed=False, depth=depth
-        )
+    if commanded:
+        generator = CommandedReferences(exogenous, degrees, signals, depth=depth)
     builder.AddSystem(generator)
     generator.set_name(f"{block.get_name()}_exogenous")
     builder.Connect(generator.get_output_port(), block.GetInputPort("exogenous"))

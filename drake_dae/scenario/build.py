@@ -13,7 +13,6 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.holes import misfit
 from drake_dae.scenario.feasibility.pace import paced
@@ -22,7 +21,6 @@ from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.systems.control.command_filter import CommandLimits
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -51,7 +49,7 @@ def complete_with_law(scenario: Scenario) -> Completed:
 
 
 def build_completed(
-    scenario: Scenario, meshcat: Meshcat | None = None, commands: CommandLimits | None = None
+    scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:
     """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly.
 
@@ -66,8 +64,7 @@ def build_completed(
         structure,
         scene_graph,
         meshcat,
-        motion=prepared.motion,
-        commands=commands,
+        commanded=commanded,
     )
     told = sticking_before(scenario, model, structure), misfit(scenario, model)
     return Completed(scenario, (*prepared.completed.notes, *filter(None, told))), loop
@@ -80,7 +77,6 @@ class _Prepared:
     completed: Completed
     model: RobotModel
     structure: Structure
-    motion: TimedScenario | None
 
 
 def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
@@ -93,6 +89,5 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
     slowed = paced(chosen.scenario, model, structure)
-    in_time, motion = timed(slowed.scenario, model, structure)
-    notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
-    return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)
+    notes = (*completed.notes, *chosen.notes, *slowed.notes)
+    return _Prepared(Completed(slowed.scenario, notes), model, structure)

@@ -19,8 +19,6 @@ from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.systems.control.command_filter import CommandLimits
-from drake_dae.systems.task.phases.by_hand import ended_by_hand
 
 PUSH = "push."
 """The prefix of the names of wrenches on links."""
@@ -44,7 +42,7 @@ class Commanded:
 
 
 @checked(lambda text: ScenarioError(("", text)))
-def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> Commanded:
+def build_commanded(scenario: Scenario) -> Commanded:
     """Builds a loop with `CommandedReferences`, surfaces that can be moved, and wrenches on links.
 
     Without commands the loop behaves as in the scenario: surfaces are fixed, and wrenches and
@@ -53,23 +51,26 @@ def build_commanded(scenario: Scenario, limits: CommandLimits | None = None) -> 
 
     Args:
         scenario: A scenario as returned by `load_scenario`.
-        limits: The limits with which references follow commands; `CommandLimits()` if None.
 
     Raises:
-        ScenarioError: The scenario itself is not valid; the message contains the key.
+        ScenarioError: The scenario itself is not valid, or its plant has Drake's own contact, which
+            cannot be traced; the message contains the key.
     """
-    limits, left_out = limits or CommandLimits(), dict[str, str]()
+    if scenario.plant.carries:
+        text = "Drake's own contact cannot be traced: take a !CompliantContact in its place"
+        raise ScenarioError(("plant", text))
+    left_out = dict[str, str]()
     with suppress(DrakeDaeError):
-        return _build(scenario, _with_all_parts(scenario, left_out), limits, left_out)
+        return _build(scenario, _with_all_parts(scenario, left_out), left_out)
     # A part does not fit: add one after the other, and omit those that fail.
     left_out, extended = {}, scenario
-    commanded = _build(scenario, extended, limits, left_out)
+    commanded = _build(scenario, extended, left_out)
     for name, add in _PARTS.items():
         result = add(extended)
         try:
             if isinstance(result, str):
                 raise ScenarioError(("", result))
-            commanded = _build(scenario, result, limits, left_out)
+            commanded = _build(scenario, result, left_out)
             extended = result
         except DrakeDaeError as error:
             left_out[name] = f"{name}: {error}"
@@ -87,11 +88,9 @@ def _with_all_parts(scenario: Scenario, left_out: dict[str, str]) -> Scenario:
     return scenario
 
 
-def _build(
-    original: Scenario, extended: Scenario, limits: CommandLimits, left_out: Mapping[str, str]
-) -> Commanded:
+def _build(original: Scenario, extended: Scenario, left_out: Mapping[str, str]) -> Commanded:
     """Builds the loop of an extended scenario, with the initial state of the original one."""
-    completed, loop = build_completed(extended, commands=limits)
+    completed, loop = build_completed(extended, commanded=True)
     # The original exogenous signals decide whether the loop starts at rest.
     initial = replace(completed.scenario, exogenous=original.exogenous)
     context = start_scenario(initial, loop)
@@ -103,8 +102,6 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
 
     In a compliant contact, positions are parameters of the plant, and not of the law.
     """
-    if scenario.plant.carries:
-        return "none, since the surfaces of Drake's own contact stand still"
     if scenario.plant.material is not None:
         return scenario
     for part, what in ((scenario.task, "a task"), (scenario.observer, "an observer")):
@@ -140,8 +137,6 @@ def _with_friction(scenario: Scenario) -> Scenario | str:
 
 def _with_pushes(scenario: Scenario) -> Scenario | str:
     """Adds a zero wrench to each movable link."""
-    if scenario.plant.carries:
-        return scenario  # A plant with Drake's own contact contains pushes.
     plant = robot_links(scenario.robot, SceneGraph(), drawn=False)[0].plant
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     pushes = [
@@ -152,24 +147,7 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
     return replace(scenario, known_forces=[*scenario.known_forces, *pushes])
 
 
-def _with_phases_ended_by_hand(scenario: Scenario) -> Scenario | str:
-    """Makes a task's phases end also by hand, except those that make or break contact."""
-    task = scenario.task
-    if task is None:
-        return scenario
-    contacts = task.make().contacts
-    phases = [
-        phase
-        if phase.signal or contacts[index] != contacts[index + 1]
-        else ended_by_hand(phase, index)
-        for index, phase in enumerate(task.phases)
-    ]
-    signals = {**{phase.signal: 0.0 for phase in phases if phase.signal}, **task.signals}
-    return replace(scenario, task=replace(task, phases=phases, signals=signals))
-
-
 _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
-    "phases that are ended by hand": _with_phases_ended_by_hand,
     "friction of the plant": _with_friction,
     "surfaces that are dragged": _with_moving_surfaces,
     "links that are pushed": _with_pushes,

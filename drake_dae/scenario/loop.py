@@ -22,7 +22,6 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.completion.timing import TimedScenario
 from drake_dae.scenario.controllers.task_controller import (
     opening_contact,
     task_controller,
@@ -35,7 +34,6 @@ from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.cascade.cascade import SpringCascade
-from drake_dae.systems.control.command_filter import CommandLimits
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
 
@@ -47,8 +45,7 @@ def build_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     plant: Plant | None = None,
-    motion: TimedScenario | None = None,
-    commands: CommandLimits | None = None,
+    commanded: bool = False,
 ) -> ClosedLoop:
     """Builds the closed loop of a scenario's robot.
 
@@ -59,9 +56,8 @@ def build_loop(
         scene_graph: The scene graph of the robot's geometry; needed to draw it.
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
-        motion: The time-optimal motion, from `timed`; None for the scenario's references.
-        commands: The limits with which references follow a person's commands; signals for which a
-            task waits are then inputs of the diagram. None for no commands.
+        commanded: Whether a person changes references during the run; signals for which a task
+            waits are then inputs of the diagram.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -78,18 +74,11 @@ def build_loop(
     opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
     observed = observed_structure(scenario, *law_robot(scenario, model, structure))
     law = _law(scenario, observed, latency_of(scenario, model))
-    references: list[Reference] = []
-    if motion is not None:
-        references = [motion.reference]
-    elif task is None:
-        references = _references(scenario.references, law)
+    references = [] if task is not None else _references(scenario.references, law)
     exogenous = []
     if scenario.observer is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
     limits = _limits(scenario, model)
-    if motion is not None and motion.governed is not None and limits is None:
-        # A governed motion keeps the limits of its drives, where all have one.
-        limits = model.control_limits if np.isfinite(model.control_limits).all() else None
 
     # The plant, which may have further exogenous signals.
     feedback = task is None and can_be_fed_back(law, sampling, limits)
@@ -100,8 +89,7 @@ def build_loop(
         scene_graph = of_plant.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(of_plant.scenario, plant.dae, degrees)
-    pushed = commands is not None
-    plant = plant or make_plant(scenario, model, structure, feedback, opens, pushed)
+    plant = plant or make_plant(scenario, model, structure, feedback, opens)
 
     # The parts between plant and law; errors get the key of the part.
     with at("force_feedback"):
@@ -114,11 +102,9 @@ def build_loop(
         observer=scenario.observer,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
-        governed=None if motion is None else motion.governed,
-        slowed=None if motion is None else motion.slowed,
         tolerances=scenario.tolerances,
-        signals={} if task is None or commands is not None else task.signals,
-        commands=commands,
+        signals={} if task is None or commanded else task.signals,
+        commanded=commanded,
         start_time=scenario.integrator.start_time,
     )
     _check_parts(settings, plant)
@@ -160,7 +146,6 @@ def make_plant(
     structure: Structure,
     feedback: bool = False,
     opens: Sequence[str] = (),
-    pushed: bool = False,
 ) -> Plant:
     """Makes the plant of a scenario.
 
@@ -170,7 +155,6 @@ def make_plant(
         structure: The structure of the model's system.
         feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
-        pushed: Whether the links of Drake's own plant can be pushed while it runs.
 
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
@@ -184,7 +168,6 @@ def make_plant(
         partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
         scenario.plant_parameters,
         scenario.plant_disturbances,
-        pushed,
     )
     try:
         return scenario.plant.plant(robot)
@@ -200,9 +183,8 @@ def _law(scenario: Scenario, structure: Structure, latency: float) -> TrackingLa
     stiffness = scenario.law.contact_stiffness if isinstance(scenario.law, Tracking) else None
     if stiffness is not None:
         keys = ["law", *keys]
-        if scenario.task is not None or scenario.time_optimal is not None:
-            key = "task" if scenario.task is not None else "time_optimal"
-            text = f"is not for scenarios with `{key}`; leave it out"
+        if scenario.task is not None:
+            text = "is not for scenarios with `task`; leave it out"
             raise ScenarioError(("law.contact_stiffness", text))
     with at(" or ".join(keys)):
         assert scenario.gains is not None  # advised.

@@ -39,7 +39,6 @@ class RobotToSimulate:
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
-        pushed: Whether the links of Drake's own plant can be pushed while it runs.
     """
 
     model: RobotModel
@@ -49,7 +48,6 @@ class RobotToSimulate:
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
-    pushed: bool = False
 
 
 class ScenarioPlant(ABC):
@@ -218,7 +216,6 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
                 structure=robot.structure,
                 parameters=robot.parameters,
                 disturbances=robot.disturbances,
-                pushed=robot.pushed,
             )
 
 

@@ -73,7 +73,7 @@ def test_the_head_of_the_biped_is_in_sight():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["seven_joint_wall", "seven_joint_writing", "cart_wall"])
+@pytest.mark.parametrize("name", ["seven_joint_wall", "cart_wall"])
 def test_paths_are_seen_from_the_free_side(name):
     """Who looks against the normal n, with e up, has e x n to the right."""
     run, _ = course(name, "duration=0.5")

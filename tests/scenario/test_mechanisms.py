@@ -9,7 +9,7 @@ from scenario_texts import run
 
 from drake_dae import Record
 
-NAMES = ["crank_turning", "four_bar", "conveyor", "globe_writing", "stewart_platform"]
+NAMES = ["crank_turning", "four_bar", "conveyor", "stewart_platform"]
 
 
 @pytest.fixture(scope="module")

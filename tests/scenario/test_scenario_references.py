@@ -12,7 +12,6 @@ from drake_dae import (
     PathLimits,
     PolylineReference,
     SpiralReference,
-    TextReference,
     WaypointsReference,
     build_scenario,
     load_scenario,
@@ -44,9 +43,6 @@ FORMS = {
     ),
     "!Csv {file: /a.csv, columns: [y, z], smoothing: 0.1, start_time: 2}": CsvReference(
         "/a.csv", ["y", "z"], smoothing=0.1, start_time=2.0
-    ),
-    f"!Text {{text: A B, origin: [0, 0], height: 0.1, along: [-1, 0], press: [9, 1], {GENTLE}}}": (
-        TextReference("A B", [0, 0], 0.1, LIMITS, along=[-1, 0], press=[9, 1])
     ),
 }
 
@@ -111,11 +107,6 @@ def refusal(form):
         ("!Csv {file: 'a\0b', columns: [z]}", ""),
         (f"!Csv {{file: {find_scenario('biped')}, columns: [z]}}", "no column 'time'; "),
         ("!Csv {file: a.csv, columns: z}", ".columns: expected a list, got 'z'"),
-        (f"!Text {{text: é, origin: [0, 0], height: 1, {GENTLE}}}", ": text: no letter 'É'; there"),
-        (
-            f"!Text {{text: A, origin: [0, 0], height: 1, press: 3, {GENTLE}}}",
-            ".press: expected a list",
-        ),
     ],
 )
 def test_what_is_wrong_is_reported_with_its_key(form, message):
@@ -142,30 +133,6 @@ def test_a_robot_follows_the_reference_of_a_file(tmp_path):
     middle = (record.time > 0.2) & (record.time < 0.8)
     wanted = 0.3 + 0.1 * np.sin(2 * record.time[middle])
     np.testing.assert_allclose(record["desired_output"][middle, 0], wanted, atol=5e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.thorough
-def test_the_writing_arm_writes_a_letter_with_the_given_force():
-    """The D, from (0.2, 0.5) to the left: 0.1 m wide, 0.15 m high, after the start errors are gone.
-
-    Double poles at -4 leave 0.1 of 0.03 m when it begins at 1.5 s, and 0.2 mm 1.5 s later.
-    """
-    loop, _, record = run_scenario(
-        scenario("seven_joint_writing", "duration=5.5", "compiled=false")
-    )
-    np.testing.assert_allclose(
-        record["tracking_error"], loop.predicted_error(record), rtol=0, atol=1e-6
-    )
-    force = record["constraint_force"][:, 0]
-    np.testing.assert_allclose(force[record.time < 4.2], 20.0, atol=1e-9)
-    assert force.min() == pytest.approx(5.0, abs=1e-9)
-    drawn = (record.time > 3.0) & (force > 19.0) & (record.time < 4.6)
-    y, z = 0.2 - record["controlled_output"][drawn, 0], record["controlled_output"][drawn, 1] - 0.5
-    top, slope = 0.05 + 0.15 - z, 0.05 + z  # Of its corners cut at 45 degrees.
-    side = np.where(np.abs(z - 0.075) < 0.025, np.abs(y - 0.1), np.abs(y - np.minimum(top, slope)))
-    assert np.count_nonzero(drawn) > 40
-    assert np.minimum(side, np.abs(z)).max() < 3e-3
 
 
 def test_files_in_settings_of_a_shipped_scenario_are_in_the_working_directory(

@@ -74,10 +74,8 @@ LONG = {
 # Distributions whose modules bear another name.
 IMPORT_NAMES = {
     "drake": "pydrake",
-    "mcap-ros2-support": "mcap_ros2",
     "pycollada": "collada",
     "pyyaml": "yaml",
-    "rerun-sdk": "rerun",
 }
 
 
@@ -89,9 +87,7 @@ def declared_modules() -> set[str]:
     used = [needed for extra, names in extras.items() if extra != "dev" for needed in names]
     requirements = [*project["dependencies"], *used]
     names = [re.split(r"[^\w.-]", requirement)[0] for requirement in requirements]
-    found = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
-    # Drake's wheel has the LCM messages beside pydrake.
-    return found | ({"drake"} & set(names))
+    return {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in names}
 
 
 def modules() -> dict[str, Path]:

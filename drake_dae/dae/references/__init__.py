@@ -8,20 +8,17 @@ from drake_dae.dae.references.formulas import (
     PointToPointReference,
     SinusoidReference,
 )
-from drake_dae.dae.references.gcode.gcode import GCodeReference
 from drake_dae.dae.references.paths import CircleReference, LineReference, SpiralReference
 from drake_dae.dae.references.reference import Reference, stack_references
 from drake_dae.dae.references.splines import PolylineReference
 from drake_dae.dae.references.travel import PathLimits
 from drake_dae.dae.references.waypoints import WaypointsReference
-from drake_dae.dae.references.writing import TextReference
 
 __all__ = [
     "CircleReference",
     "ConstantReference",
     "CsvReference",
     "ExpressionReference",
-    "GCodeReference",
     "LineReference",
     "PathLimits",
     "PointToPointReference",
@@ -30,7 +27,6 @@ __all__ = [
     "ReferenceRows",
     "SinusoidReference",
     "SpiralReference",
-    "TextReference",
     "WaypointsReference",
     "references_by_name",
     "stack_references",

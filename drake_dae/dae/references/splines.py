@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, positive, vector
+from drake_dae.arrays import FloatArray, numbers, positive
 from drake_dae.dae.references.paths import check_order
 from drake_dae.dae.references.pieces import PiecewisePolynomials, PiecewiseReference
 from drake_dae.dae.references.travel import PathLimits
@@ -114,19 +114,18 @@ class SplineReference(PiecewiseReference):
         return self.spline.pieces(degrees)
 
 
-def spline_within(
-    points: FloatArray, limits: PathLimits, start_time: float, order: int, among: int | None = None
+def _spline_within(
+    points: FloatArray, limits: PathLimits, start_time: float, order: int
 ) -> TimeSpline:
     """Returns the fastest spline over points with derivatives within limits.
 
     Args:
         points: The points, shape (n, k).
-        limits: The largest speed, acceleration and jerk, of the first `among` columns.
+        limits: The largest speed, acceleration and jerk, of the points.
         start_time: The time at which it leaves the first point, in s.
         order: The number of continuous derivatives.
-        among: The number of columns with limits; None for all.
     """
-    padded = np.pad(points[:, :among], ((order, order), (0, 0)), mode="edge")
+    padded = np.pad(points, ((order, order), (0, 0)), mode="edge")
     steps = [
         (np.linalg.norm(np.diff(padded, j, axis=0), axis=1).max() / limit) ** (1 / j)
         for j, limit in enumerate(limits.values, start=1)
@@ -134,18 +133,13 @@ def spline_within(
     return TimeSpline(points, float(max(steps)), start_time, order)
 
 
-def along_edges(corners: FloatArray, spacing: float) -> tuple[FloatArray, list[int]]:
-    """Returns points along straight edges, no farther apart than a spacing, with all corners.
-
-    Returns:
-        The points, shape (n, k), and the edge of each; a corner belongs to the edge before it.
-    """
-    points, edges = [corners[:1]], [0]
-    for edge, (first, last) in enumerate(pairwise(corners)):
+def _along_edges(corners: FloatArray, spacing: float) -> FloatArray:
+    """Returns points along straight edges, no farther apart than a spacing, with all corners."""
+    points = [corners[:1]]
+    for first, last in pairwise(corners):
         count = int(np.ceil(np.linalg.norm(last - first) / spacing - 1e-9))
         points.append(first + np.linspace(0.0, 1.0, count + 1)[1:, None] * (last - first))
-        edges += [edge] * count
-    return np.concatenate(points), edges
+    return np.concatenate(points)
 
 
 @checked(ReferenceSignalError)
@@ -179,12 +173,12 @@ class PolylineReference(SplineReference):
     def __post_init__(self) -> None:
         points = settle_points(self)
         length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-        check_spline(self.corner, self.order, float(length))
+        _check_spline(self.corner, self.order, float(length))
 
     @cached_property
     def spline(self) -> TimeSpline:
-        points, _ = along_edges(np.array(self.points), 2 * self.corner / self.order)
-        return spline_within(points, self.limits, self.start_time, self.order)
+        points = _along_edges(np.array(self.points), 2 * self.corner / self.order)
+        return _spline_within(points, self.limits, self.start_time, self.order)
 
 
 def settle_points(reference: Any) -> FloatArray:
@@ -209,23 +203,7 @@ def settle_points(reference: Any) -> FloatArray:
     return points
 
 
-def settle_axes(reference: Any) -> None:
-    """Converts the vector fields of a drawing in a plane to pairs of numbers.
-
-    Raises:
-        ReferenceSignalError: They are none, or `along` and `up` are not two directions.
-    """
-    names = ["origin", "along", "up"] + ["press"] * (reference.press is not None)
-    for name in names:
-        value = vector(name, getattr(reference, name), 2, ReferenceSignalError)
-        object.__setattr__(reference, name, tuple(value.tolist()))
-    if np.linalg.matrix_rank(np.array([reference.along, reference.up])) < 2:
-        raise ReferenceSignalError(
-            f"along and up must be two directions, got {reference.along!r} and {reference.up!r}"
-        )
-
-
-def check_spline(corner: float, order: int, length: float) -> None:
+def _check_spline(corner: float, order: int, length: float) -> None:
     """Checks the rounding of corners.
 
     Raises:

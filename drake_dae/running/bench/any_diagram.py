@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
 
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import (
     Context,
     Diagram,
@@ -29,8 +27,7 @@ from drake_dae.running.bench.controls import (
     slider_of_pole,
     sliders_of_plant,
 )
-from drake_dae.running.bench.inputs import PUSH, Inputs
-from drake_dae.running.bench.posed import NO_BODIES, VISUALIZER, PosedBodies
+from drake_dae.running.bench.inputs import Inputs
 from drake_dae.systems.blocks.traced import Traced
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
@@ -46,7 +43,6 @@ class DiagramParts:
     Attributes:
         robots: The plants that are drawn as robots.
         scene_graph: The geometry of the robots' links, or None.
-        posed: The bodies that Drake's SceneGraph poses.
         ports: Name -> port: all vector output ports of the diagram, and those of the robots.
         outputs: The names of the diagram's vector output ports.
         signals: Names and units of the entries of these ports.
@@ -55,7 +51,6 @@ class DiagramParts:
 
     robots: Sequence[Plant]
     scene_graph: SceneGraph | None
-    posed: PosedBodies
     ports: dict[str, OutputPort]
     outputs: Sequence[str]
     signals: Sequence[Signal]
@@ -89,22 +84,11 @@ def parts_of_diagram(diagram: Diagram, context: Context) -> DiagramParts:
         if (exogenous := _exogenous_source(wires, robot)) is not None:
             ports[f"{robot.get_name()}.exogenous"] = exogenous
     scene_graph = next((s for s in wires.systems if isinstance(s, SceneGraph)), None)
-    posed = NO_BODIES
     if scene_graph is not None:
         inspector = scene_graph.model_inspector()
         multibodies = (robot.robot("a bench").links.plant for robot in robots)
         ids = [plant.get_source_id() for plant in multibodies if plant is not None]
-        sources = [s for s in ids if s is not None and inspector.SourceIsRegistered(s)]
-        frames = chain.from_iterable(map(inspector.FramesForSource, sources))
-        drawn = {"/".join((*VISUALIZER, *inspector.GetName(f).split("::"))) for f in frames}
-        plants = [system for system in wires.systems if isinstance(system, MultibodyPlant)]
-        posed = PosedBodies.of(scene_graph, plants, drawn)
-        try:
-            posed.poses(context)
-        except RuntimeError:
-            posed = NO_BODIES
-            notes.append("bodies of a SceneGraph are not drawn, since its poses have no wire")
-        if not sources:
+        if not any(s is not None and inspector.SourceIsRegistered(s) for s in ids):
             scene_graph = None
     if robots and scene_graph is None:
         names = ", ".join(robot.get_name() for robot in robots)
@@ -112,7 +96,7 @@ def parts_of_diagram(diagram: Diagram, context: Context) -> DiagramParts:
             f"links of {names} are not drawn: add the SceneGraph of their MultibodyPlant to the "
             "diagram, builder.AddSystem(scene_graph)"
         )
-    return DiagramParts(robots, scene_graph, posed, ports, outputs, signals, notes)
+    return DiagramParts(robots, scene_graph, ports, outputs, signals, notes)
 
 
 def vector_outputs(diagram: Diagram) -> list[tuple[str, OutputPort]]:
@@ -140,7 +124,7 @@ def controls_of_diagram(diagram: Diagram, context: Context) -> Controls:
     for port, first in inputs.ports.items():
         sliders += _sliders("input", inputs, values, first, port.size(), is_signed=True)
     for block, first in inputs.blocks.items():
-        if isinstance(block, Plant | Controller) or f".{PUSH}" in inputs.names[first]:
+        if isinstance(block, Plant | Controller):
             continue
         count = block.GetMyContextFromRoot(context).get_numeric_parameter(0).size()
         is_signed = isinstance(block, ConstantVectorSource)

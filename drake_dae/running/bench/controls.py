@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
@@ -13,17 +15,15 @@ from drake_dae.dae.tracking.gains import poles
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import GainError
 from drake_dae.running.bench.inputs import PUSH, Inputs
-from drake_dae.systems.control.command_filter import SPEED
 from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.task.phases.by_hand import BY_HAND
 
 MAX_SURFACE_SPEED = 0.05
 """The largest speed, in m/s, of a surface whose motion is not in the law's model."""
 
-_ORDER = {("speed", ""): 0, ("reference", "N"): 1, ("reference", "m"): 2}
-"""(kind, unit) -> the rank of a slider; all others follow."""
+_ORDER = ("N", "m")
+"""The units of the first sliders of references; all others follow."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Control:
     """A slider, or an object that a person drags, and the inputs that it sets.
 
     Attributes:
-        kind: "speed", "reference", "surface", "signal", "plant", "pole", "parameter" or "input".
+        kind: "reference", "surface", "signal", "plant", "pole", "parameter" or "input".
         label, unit: Its name and unit.
         low, high, value: The smallest, the largest and the initial value.
         inputs: The indices in `Inputs` that it sets.
@@ -90,9 +90,8 @@ def controls_of(loop: ClosedLoop, context: Context, size: float) -> Controls:
         *_compliant_surfaces(plant, inputs, values, 0.2 * size),
     ]
     sliders += [
-        Control("signal", name, "", 0.0, 1.0, 0.0, (index,))
+        Control("signal", port.get_name().removeprefix(SIGNAL), "", 0.0, 1.0, 0.0, (index,))
         for port, index in inputs.ports.items()
-        if not (name := port.get_name().removeprefix(SIGNAL)).startswith(BY_HAND)
     ]
     sliders += sliders_of_plant(plant, controller, inputs, values)
     sliders += slider_of_pole(controller, inputs, values)
@@ -106,10 +105,6 @@ def pushes_of(plants: Sequence[Plant], inputs: Inputs) -> dict[str, int]:
         for name, index in _parameter_indices(plant.dae, inputs.blocks.get(plant)).items():
             if name.startswith(PUSH) and name.endswith(".force.0"):
                 pushes[name.removeprefix(PUSH).removesuffix(".force.0")] = index
-    for index, name in enumerate(inputs.names):
-        _, is_push, link = name.partition(f".{PUSH}")
-        if is_push and link.endswith(".force[0]"):
-            pushes.setdefault(link.removesuffix(".force[0]"), index)
     return pushes
 
 
@@ -154,23 +149,20 @@ def sliders_of_plant(
 
 
 def _commands(loop: ClosedLoop, inputs: Inputs, context: Context, size: float) -> list[Control]:
-    """Returns sliders for the speed along the path, and for an offset of each reference."""
+    """Returns sliders for a change of each reference."""
     generator = loop.generator
     if not isinstance(generator, CommandedReferences):
         return []
     first = inputs.blocks[generator]
     reference = generator.reference(context.get_time())[loop.controller.law.layout.lowest]
-    has_speed = int(generator.commands[0] is SPEED)
     sliders = []
-    if has_speed:
-        sliders.append(Control("speed", "speed along the path", "", 0.0, 2.0, 1.0, (first,)))
-    for i, signal in enumerate(generator.commands[has_speed:]):
+    for i, signal in enumerate(generator.commands):
         r = abs(reference[i])
         ranges = {"m": 0.15 * size, "N": max(r, 10.0), "N m": max(r, 1.0)}
         high = rounded(ranges.get(signal.unit, 0.5))
-        index = (first + has_speed + i,)
+        index = (first + i,)
         sliders.append(Control("reference", signal.name, signal.unit, -high, high, 0.0, index))
-    return sorted(sliders, key=lambda slider: _ORDER.get((slider.kind, slider.unit), 3))
+    return sorted(sliders, key=lambda s: _ORDER.index(s.unit) if s.unit in _ORDER else 2)
 
 
 def _exogenous_surfaces(loop: ClosedLoop, inputs: Inputs, distance: float) -> list[Control]:
@@ -238,6 +230,56 @@ def slider_of_pole(controller: Controller, inputs: Inputs, values: FloatArray) -
     set_inputs = tuple(indices), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
     fastest = rounded(max(4.0 * pole, 20.0))
     return [Control("pole", "pole of all errors", "1/s", -fastest, -0.5, -pole, *set_inputs)]
+
+
+def strongest_pushes(
+    robots: Sequence[Plant],
+    context: Context,
+    links: Sequence[str],
+    rate: float,
+) -> dict[str, float]:
+    """Returns link -> the force of the strongest push on it, N.
+
+    A law with poles at -p acts on a mass m like a spring of stiffness m p^2, and the effective mass
+    at the link's origin is 1 / (J M^-1 J^T). So a force m p^2 d moves the link by d.
+
+    Args:
+        robots: The robots that contain the links.
+        context: The context of the diagram.
+        links: The names of the links.
+        rate: p^2 d, in m/s^2.
+    """
+    masses = dict[str, float]()
+    for robot in robots:
+        multibody = robot.robot("a bench").links.plant
+        if multibody is not None:
+            state = robot.state(robot.GetMyContextFromRoot(context))
+            masses |= _effective_masses(multibody, state[: multibody.num_positions()], links)
+    return {name: mass * rate for name, mass in masses.items()}
+
+
+def _effective_masses(
+    plant: MultibodyPlant, positions: FloatArray, links: Sequence[str]
+) -> dict[str, float]:
+    """Returns link -> the effective mass at its origin, kg."""
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, positions)
+    M, world, masses = plant.CalcMassMatrix(context), plant.world_frame(), dict[str, float]()
+    for name in links:
+        model, _, body = name.rpartition("::")
+        if not plant.HasModelInstanceNamed(model):
+            continue
+        instance = plant.GetModelInstanceByName(model)
+        if not plant.HasBodyNamed(body, instance):
+            continue
+        frame = plant.GetBodyByName(body, instance).body_frame()
+        J = plant.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kV, frame, np.zeros(3), world, world
+        )
+        # In the direction of the smallest mass; the bound covers links whose origin cannot move.
+        mobility = float(np.linalg.eigvalsh(J @ np.linalg.solve(M, J.T))[-1])
+        masses[name] = 1.0 / max(mobility, 1.0 / float(np.trace(M)))
+    return masses
 
 
 def rounded(value: float) -> float:

@@ -12,11 +12,9 @@ from pydrake.systems.framework import Context, Diagram, OutputPort
 
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.running.bench.any_diagram import controls_of_diagram, parts_of_diagram
-from drake_dae.running.bench.controls import Controls, controls_of, prediction
-from drake_dae.running.bench.inputs import Inputs, with_input_values
-from drake_dae.running.bench.pushes import strongest_pushes
+from drake_dae.running.bench.controls import Controls, controls_of, prediction, strongest_pushes
+from drake_dae.running.bench.inputs import with_input_values
 from drake_dae.running.bench.scene import (
     RobotScene,
     Scene,
@@ -24,8 +22,6 @@ from drake_dae.running.bench.scene import (
     scene_of,
     surface_direction,
 )
-from drake_dae.systems.control.contract import SIGNAL
-from drake_dae.systems.plants.contract import Plant
 
 PUSHED_FRACTION = 0.15
 """The distance by which the strongest push moves a robot, as a fraction of the robot's size."""
@@ -42,12 +38,12 @@ OF_LOOP = ("state", "constraint_force", "reference", "integral", "exogenous", "k
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The common part of page and live bench, for a loop or any diagram.
+    """What a page shows of a loop or any diagram.
 
     Attributes:
         loop: The loop or diagram.
         context: The initial context of the diagram; all vector inputs of a diagram have values.
-        scene: The drawn robots and bodies.
+        scene: The drawn robots.
         controls: The inputs that a person can change.
         ports: Name -> output port: the ports on which scene and errors depend and, for a diagram,
             all output ports of the diagram with vectors.
@@ -62,11 +58,6 @@ class Bench:
     ports: Mapping[str, OutputPort]
     outputs: Sequence[str]
     data: dict[str, Any]
-
-    @property
-    def diagram(self) -> Diagram:
-        """The diagram, or the diagram of the loop."""
-        return self.loop if isinstance(self.loop, Diagram) else self.loop.diagram
 
 
 def bench_of(
@@ -87,7 +78,7 @@ def bench_of(
     if isinstance(loop, Diagram):
         context = with_input_values(loop, context)
         parts = parts_of_diagram(loop, context)
-        scene = scene_of(parts.robots, parts.scene_graph, context, parts.posed)
+        scene = scene_of(parts.robots, parts.scene_graph, context)
         controls, slowest, compared = controls_of_diagram(loop, context), USUAL_POLE, None
         outputs: list[dict[str, Any]] = [{"name": s.name, "unit": s.unit} for s in parts.signals]
         ports, plotted, notes = parts.ports, parts.outputs, [*notes, *parts.notes]
@@ -108,7 +99,6 @@ def bench_of(
     inputs = controls.inputs
     strongest = strongest_pushes(
         [robot.plant for robot in scene.robots],
-        [*inputs.pushed],
         context,
         list(controls.pushes),
         PUSHED_FRACTION * scene.size * slowest**2,
@@ -124,7 +114,6 @@ def bench_of(
         "outputs": outputs,
         "bodies": [{"name": name, "path": path} for name, path in scene.links],
         "constraints": [],
-        "opens": False,
         "surfaces": [],
         "targets": [],
         "controls": controls.data(),
@@ -134,7 +123,6 @@ def bench_of(
             if name in strongest  # A payload of the plant alone is not drawn.
         },
         "prediction": compared,
-        "phases": _phase_inputs(loop, inputs),
         "phase_names": [] if isinstance(loop, Diagram) else loop.controller.phase_names,
         "inputs": [
             {"name": name, "unit": unit, "value": value}
@@ -144,7 +132,7 @@ def bench_of(
     }
     for robot in scene.robots:
         for key, value in _robot_data(robot, controls, context).items():
-            data[key] = data[key] or value if key == "opens" else data[key] + value
+            data[key] += value
     return Bench(loop, context, scene, controls, ports, plotted, data)
 
 
@@ -154,14 +142,6 @@ def _desired(loop: ClosedLoop) -> tuple[str, list[int]]:
         return "reference", loop.controller.law.layout.lowest.tolist()
     # A task desires distances, too, while its contact is open.
     return "desired_output", list(range(loop.plant.dae.num_outputs))
-
-
-def _phase_inputs(loop: ClosedLoop | Diagram, inputs: Inputs) -> list[int | None]:
-    """Returns, for each phase of a task, the index of the input that ends it by hand, or None."""
-    if isinstance(loop, Diagram):
-        return []
-    indices = {port.get_name(): index for port, index in inputs.ports.items()}
-    return [indices.get(SIGNAL + name) for name in loop.controller.phase_ends]
 
 
 def _robot_data(robot: RobotScene, controls: Controls, context: Context) -> dict[str, Any]:
@@ -196,39 +176,22 @@ def _robot_data(robot: RobotScene, controls: Controls, context: Context) -> dict
                 "outputs": [[axis, names.index(name)] for axis, name in axes],
             }
         )
-    links = _links_in_contact(plant, controls)
     return {
         "constraints": [
             {
                 "name": constraint.name,
-                "link": links.get(constraint.name),
                 "force": path_in_meshcat(constraint, "force"),
                 "moment": path_in_meshcat(constraint, "moment") if has_moment else None,
             }
             for constraint, has_moment in zip(robot.constraints, robot.with_moment, strict=True)
         ],
-        "opens": bool(links if not plant.is_ideal else set(plant.contacts) & set(links)),
         "surfaces": surfaces,
         "targets": targets,
     }
 
 
-def _links_in_contact(plant: Plant, controls: Controls) -> dict[str, str]:
-    """Returns constraint -> the link on which it acts, for links that can be pushed."""
-    model = plant.robot("a bench")
-    wrenches, multibody, links = ConstraintWrenches(model), model.links.plant, dict[str, str]()
-    for constraint, frame in zip(wrenches.constraints, wrenches.frames, strict=True):
-        if multibody is not None and isinstance(frame, str) and multibody.HasFrameNamed(frame):
-            link = multibody.GetFrameByName(frame).body().scoped_name().get_full()
-            if link in controls.pushes:
-                links[constraint.name] = link
-    return links
-
-
 def shown_function(bench: Bench, columns: Mapping[str, ca.SX], values: ca.SX) -> ca.SX:
     """Returns the column of the scene, and below it the error coordinates of a loop.
-
-    Bodies that Drake's SceneGraph poses keep their initial poses.
 
     Args:
         bench: The bench.
@@ -257,9 +220,8 @@ def shown_function(bench: Bench, columns: Mapping[str, ca.SX], values: ca.SX) ->
         size = model.dae.parameter_symbol.numel()
         parameters = parameters_of(plant, size, f"{prefix}exogenous")
         parts.append(robot.function(state, columns[f"{prefix}constraint_force"], parameters))
-    posed = ca.SX(ca.DM(bench.scene.posed.poses(bench.context)))
     rows = [ca.vertcat(*rows) for rows in zip(*parts, strict=True)]
-    scene = ca.vertcat(ca.SX(0, 1), posed, *rows)
+    scene = ca.vertcat(ca.SX(0, 1), *rows)
     if isinstance(loop, Diagram) or bench.data["prediction"] is None:
         return scene
     controller, law = loop.controller, loop.controller.law

@@ -27,7 +27,7 @@ from drake_dae.systems.blocks.traced import Traced
 
 WEB = Path(__file__).with_name("web")
 
-SCRIPTS = ("prediction.js", "view.js", "drag.js", "plots.js", "panel.js", "bench.js")
+SCRIPTS = ("page.js", "prediction.js", "view.js", "drag.js", "plots.js", "panel.js", "bench.js")
 """The scripts of the bench, in the order in which the page contains them."""
 
 _BEGIN, _END = '<script type="text/javascript">', "</script>"
@@ -36,7 +36,7 @@ _BEGIN, _END = '<script type="text/javascript">', "</script>"
 _CONTENT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob: "
     "'self' file:; style-src 'unsafe-inline'; img-src data: blob:; worker-src data: blob:; "
-    "connect-src data: blob: {connected}"
+    "connect-src data: blob:"
 )
 """The Content-Security-Policy of the page, which loads nothing from the network."""
 
@@ -56,8 +56,8 @@ def write_page(
     Plant, law and references run in real time as WebAssembly, see `export_wasm`. The page draws the
     robot by the bundle of Drake's Meshcat, and a person pushes its links with the pointer. Sliders
     change the masses and the friction of the plant, and the poles; in a loop with
-    `LoopSettings.commands` also the references, the speed along the path and the positions of
-    exogenous surfaces. Plots show forces and errors, with the predicted error over the actual one.
+    `LoopSettings.commanded` also the references and the positions of exogenous surfaces. Plots show
+    forces and errors, with the predicted error over the actual one.
 
     The page of any other diagram plots its output ports and draws its robots. Sliders change the
     numeric parameters of its blocks and the values of its free input ports.
@@ -111,10 +111,12 @@ def page_text(
         part = diagram_part(loop, context, ports)
     else:
         if isinstance(loop.plant, Traced) and loop.plant.traced().stepped is not None:
-            raise ModelError("the plant has Drake's own contact, which cannot be exported")
+            raise ModelError(
+                "the plant has Drake's own contact, which cannot be exported: take a CompliantPlant"
+            )
         names = [n for n in ("known_exogenous", "desired_output") if diagram.HasOutputPort(n)]
         part = loop_part(loop, context, [name for name in names if name not in loop.signals])
-    bench = bench_of(loop, context, title or title_of(loop), notes)
+    bench = bench_of(loop, context, title or _title_of(loop), notes)
     with tempfile.TemporaryDirectory() as folder:
         written = write_integrated(part, LOOP, context, "page", folder, config)
         module, loader, _ = write_module([written], "page", folder, {"shown": _shown(bench, part)})
@@ -122,37 +124,33 @@ def page_text(
     nonempty = filter(part.outputs.get, part.outputs)
     identifier_of = dict(zip(nonempty, identifiers(part.outputs), strict=True))
     data = bench.data | {
-        "kind": "page",
         "places": _parameter_indices(bench, part),
         "plotted": [identifier_of[name] for name in bench.outputs],
     }
     encoded = base64.b64encode(code).decode()
-    engine = [loader_text, f'const wasm = "{encoded}";', web_text("page.js")]
-    return page_of(bench, data, engine)
+    return _page_of(bench, data, [loader_text, f'const wasm = "{encoded}";'])
 
 
-def title_of(loop: ClosedLoop | Diagram) -> str:
+def _title_of(loop: ClosedLoop | Diagram) -> str:
     """Returns the name of the robot of a loop, or the name of a diagram."""
     if not isinstance(loop, Diagram):
         return loop.plant.dae.name
     return "diagram" if "@" in loop.get_name() else loop.get_name() or "diagram"
 
 
-def page_of(bench: Bench, data: object, engine: Sequence[str], connected: str = "") -> str:
+def _page_of(bench: Bench, data: object, engine: Sequence[str]) -> str:
     """Returns Meshcat's page with the bench over it.
 
     Args:
         bench: The bench.
         data: The data of the bench's script, in the form of JSON.
-        engine: The scripts before that of the bench, which define `makeEngine`.
-        connected: The addresses to which the page may connect, as in a Content-Security-Policy.
+        engine: The scripts that define the loop and its loader.
     """
-    script = "\n".join([f"const data = {as_script(data)};", *engine, *map(web_text, SCRIPTS)])
-    added = f"<style>\n{web_text('bench.css')}</style>\n{web_text('bench.html')}"
+    script = "\n".join([f"const data = {as_script(data)};", *engine, *map(_web_text, SCRIPTS)])
+    added = f"<style>\n{_web_text('bench.css')}</style>\n{_web_text('bench.html')}"
     added += f'<script type="module">\n{script}</script>\n'
-    policy = _CONTENT_POLICY.format(connected=connected)
     head = (
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_CONTENT_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{html.escape(bench.data['title'])}</title>"
     )
@@ -161,7 +159,7 @@ def page_of(bench: Bench, data: object, engine: Sequence[str], connected: str = 
     return before.replace("<html>", '<html lang="en">', 1) + added + mark + after
 
 
-def web_text(name: str) -> str:
+def _web_text(name: str) -> str:
     """Returns the text of a file in the folder `web`."""
     return (WEB / name).read_text("utf-8")
 

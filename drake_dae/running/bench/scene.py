@@ -1,6 +1,5 @@
 """The scene of a bench: Meshcat's page of a robot, and the poses of its parts as functions."""
 
-import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,8 +18,10 @@ from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PointCoordinates
 from drake_dae.robots.surfaces.surface import rotation_of
-from drake_dae.running.bench.posed import NO_BODIES, VISUALIZER, PosedBodies
 from drake_dae.systems.plants.contract import Plant
+
+VISUALIZER = ("drake", "visualizer")
+"""The path in Meshcat that contains the links."""
 
 _BACKGROUND = [0.97, 0.97, 0.98]
 
@@ -52,31 +53,28 @@ class RobotScene:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The drawn robots and bodies.
+    """The drawn robots.
 
     Attributes:
         page: Meshcat's page at the start, self-contained.
         robots: The drawn robots.
         size: The diagonal of the bounding box of the scene, in m.
-        posed: The bodies that Drake's SceneGraph poses; they precede the bodies of the robots.
     """
 
     page: str
     robots: Sequence[RobotScene]
     size: float
-    posed: PosedBodies = NO_BODIES
 
     @property
     def links(self) -> list[tuple[str, tuple[str, ...]]]:
         """The name and the path in Meshcat of each moving body."""
-        return [*self.posed.links, *(link for robot in self.robots for link in robot.links)]
+        return [link for robot in self.robots for link in robot.links]
 
 
 def scene_of(
     plants: Sequence[Plant],
     scene_graph: SceneGraph | None,
     context: Context,
-    posed: PosedBodies = NO_BODIES,
 ) -> Scene:
     """Returns the scene of robots.
 
@@ -84,13 +82,12 @@ def scene_of(
         plants: The plants of the robots.
         scene_graph: The geometry of their links, or None.
         context: The initial context of the diagram, which is not changed.
-        posed: The bodies that Drake's SceneGraph poses.
 
     Raises:
         ModelError: A plant is not a robot.
         OSError: There is no free port for Meshcat, which makes the page.
     """
-    robots, points = list[RobotScene](), [posed.corners(context)]
+    robots, points = list[RobotScene](), [np.zeros((0, 3))]
     states = [plant.state(plant.GetMyContextFromRoot(context)) for plant in plants]
     for plant, state in zip(plants, states, strict=True):
         robots.append(_robot_scene(plant, scene_graph))
@@ -98,10 +95,8 @@ def scene_of(
         points.append(scene_points(model, ConstraintWrenches(model), state[None], scene_graph))
     corners = np.vstack(points)
     size = float(np.linalg.norm(np.ptp(corners, axis=0))) if corners.size else 1.0
-    page = _static_page(plants, scene_graph, states, posed, context)
-    # Drake's Meshcat ends the process if another thread, as of a server, collects it.
-    gc.collect()
-    return Scene(page, robots, size, posed)
+    page = _static_page(plants, scene_graph, states)
+    return Scene(page, robots, size)
 
 
 def _robot_scene(plant: Plant, scene_graph: SceneGraph | None) -> RobotScene:
@@ -125,8 +120,6 @@ def _static_page(
     plants: Sequence[Plant],
     scene_graph: SceneGraph | None,
     states: Sequence[FloatArray],
-    posed: PosedBodies,
-    context: Context,
 ) -> str:
     """Returns Meshcat's initial page, which does not depend on the server that made it."""
     meshcat = start_unwatched_meshcat()
@@ -141,7 +134,6 @@ def _static_page(
             port = links.get_input_port()
             port.FixValue(view_context, state[: port.size()])
             links.ForcedPublish(view_context)
-    posed.draw(meshcat, context, is_alone=not plants)
     return str(meshcat.StaticHtml())
 
 

@@ -92,14 +92,7 @@ def read_csv(path: str | Path, columns: Mapping[str, str] | None) -> Table:
                 f"{path}: a column of a record is 'time' or '<signal>.<name>', such as "
                 f"'control.joint1_motor', got {brief(name)}"
             )
-    return time, recorded_groups(groups)
-
-
-def recorded_groups(
-    groups: Mapping[str, Sequence[tuple[FloatArray, Signal]]],
-) -> dict[str, Recorded]:
-    """The signals of a record, each from its columns with their names and units."""
-    return {
+    return time, {
         name: Recorded(np.column_stack([c for c, _ in columns]), tuple(s for _, s in columns))
         for name, columns in groups.items()
     }
@@ -111,18 +104,18 @@ def _columns(
     """Place, name and unit of the columns that are read."""
     if len(head) == 1 and ";" in head[0]:
         raise ModelError(f"{path} separates its columns by ';'; separate them by ','")
-    parsed = [(i, *name_and_unit(text)) for i, text in enumerate(head)]
+    parsed = [(i, *_name_and_unit(text)) for i, text in enumerate(head)]
     if columns is not None:
         available = {name: (i, unit) for i, name, unit in parsed}
-        missing = [name for name in columns if name_and_unit(name)[0] not in available]
+        missing = [name for name in columns if _name_and_unit(name)[0] not in available]
         if missing:
             raise ModelError(
                 f"{path} has no column {listed(missing)}; it has {listed(available, 30)}"
             )
         parsed = []
         for column, target in columns.items():
-            place, unit = available[name_and_unit(column)[0]]
-            name, target_unit = name_and_unit(target)
+            place, unit = available[_name_and_unit(column)[0]]
+            name, target_unit = _name_and_unit(target)
             parsed.append((place, name, target_unit or unit))
     names = [name for _, name, _ in parsed]
     if names.count(TIME) != 1:
@@ -138,7 +131,7 @@ def _columns(
     return parsed
 
 
-def name_and_unit(text: str) -> tuple[str, str]:
+def _name_and_unit(text: str) -> tuple[str, str]:
     """Name and unit of a column."""
     match = _LABEL.fullmatch(text)
     return (match[1], match[2] or "") if match else (text, "")

@@ -4,6 +4,7 @@ import html
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TypeVar
 
@@ -19,8 +20,6 @@ from drake_dae.files import open_file
 from drake_dae.simulation.records.columns import Recorded as Recorded
 from drake_dae.simulation.records.columns import label, read_csv, write_csv
 from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
-from drake_dae.simulation.records.mcap_log import read_mcap, write_mcap
-from drake_dae.simulation.records.optional import optional_module
 from drake_dae.simulation.records.versions import versions
 from drake_dae.systems.plants.contact_events import ContactEvent
 
@@ -227,23 +226,6 @@ class Record:
         """
         return cls(*read_csv(path, columns))
 
-    def to_mcap(self, path: str | Path) -> None:
-        """Writes the record as MCAP, which Foxglove shows: a channel of JSON for each signal.
-
-        Raises:
-            ModelError: mcap is not installed, or a time is negative.
-        """
-        write_mcap(path, self.time, self.signals, {"versions": versions(), **self.about})
-
-    @classmethod
-    def from_mcap(cls, path: str | Path, columns: Mapping[str, str] | None = None) -> Self:
-        """Reads a file of `to_mcap`, or a robot's log in JSON or ROS 2's CDR; see `read_mcap`.
-
-        Raises:
-            ModelError: mcap is not installed, or the file cannot be read or lacks a column.
-        """
-        return cls(*read_mcap(path, columns))
-
     def to_dataframe(self) -> Any:
         """The record as a pandas DataFrame, one row for each time, "time [s]".
 
@@ -253,7 +235,7 @@ class Record:
         Raises:
             ModelError: pandas is not installed.
         """
-        pandas = optional_module("pandas", "to_dataframe", "data")
+        pandas = _optional_module("pandas", "to_dataframe")
         pairs = [
             (name, label(signal))
             for name, recorded in self.signals.items()
@@ -274,7 +256,7 @@ class Record:
         Raises:
             ModelError: xarray is not installed.
         """
-        xarray = optional_module("xarray", "to_xarray", "data")
+        xarray = _optional_module("xarray", "to_xarray")
         variables: dict[str, Any] = {}
         coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"})}
         for name, recorded in self.signals.items():
@@ -320,6 +302,18 @@ def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
     for values in columns:
         finite &= np.isfinite(values).all(axis=1)
     return count if finite.all() else int(np.argmin(finite))
+
+
+def _optional_module(module: str, user: str) -> Any:
+    """Imports a package of the extra `data`.
+
+    Raises:
+        ModelError: It is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise ModelError(f"{user} needs {module}: pip install 'drake_dae[data]'") from None
 
 
 def _read_rows(file: BinaryIO, kind: type[R]) -> R:

@@ -68,8 +68,8 @@ class Controller(System):
        output ports with these in `observed`, and has the input port `acting_control` for what acts
        on the plant. None if they are those of the plant.
     9. Phases. `changes` are the times at which phases of a run began, with reasons, and
-       `phase_ends` the signals for which phases wait, "" for none, and `phase_names` the names of
-       the phases and of the rest after them; all are empty without phases.
+       `phase_names` the names of the phases and of the rest after them; both are empty without
+       phases.
     """
 
     __slots__ = ()
@@ -77,7 +77,6 @@ class Controller(System):
     law: TrackingLaw
     shown: tuple[str, ...] = ()
     refused: Mapping[str, str] = {}
-    phase_ends: tuple[str, ...] = ()
     phase_names: tuple[str, ...] = ()
     follows: bool = False
     takes_over: bool = False

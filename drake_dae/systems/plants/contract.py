@@ -75,11 +75,9 @@ class Plant(System):
         takes a law as a value; see `DaePlant`. `laws_along` are the parameters of that law at the
         times of a run, or None.
     13. Contact. `is_ideal` says whether the constraints hold exactly while contacts are closed.
-    14. Pushes. `pushes` is a block with wrenches on links as its numeric parameters, see
-        `LinkPushes`; None for a plant whose model has them, or that is not pushed.
-    15. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
+    14. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
         surfaces and constraint forces.
-    16. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
+    15. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
         the law may not know; not negative.
     """
 
@@ -96,7 +94,6 @@ class Plant(System):
     normals: tuple[int, ...] = ()
     projects: bool = False
     is_ideal: bool = True
-    pushes: System | None = None
     remarks: tuple[str, ...] = ()
 
     @property

@@ -132,7 +132,6 @@ class TaskController(Diagram, Controller):
         super().__init__()
         check_sampled(task, sample_period)
         self.task, self.law, self.free_law = task, law, free_law
-        self.phase_ends = tuple(phase.signal for phase in task.plan.phases)
         self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
         self.sample_period = sample_period
         self.whole = law.system if whole is None else whole

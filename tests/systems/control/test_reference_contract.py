@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from members import subclasses
-from problems import double_integrator
 from pydrake.systems.framework import LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 from runs import some
@@ -16,11 +15,8 @@ from drake_dae import (
     ConstantReference,
     CsvReference,
     ExpressionReference,
-    GCodeReference,
     LineReference,
-    MotionLimits,
     PathLimits,
-    PathTiming,
     PointToPointReference,
     PolylineReference,
     Reference,
@@ -29,11 +25,8 @@ from drake_dae import (
     SinusoidReference,
     SpiralReference,
     SystemReference,
-    TextReference,
-    TimeOptimalReference,
     TrajectoryReference,
     WaypointsReference,
-    find_structure,
 )
 from drake_dae.dae.references.paced import PacedReference
 from drake_dae.errors import ReferenceSignalError
@@ -59,14 +52,6 @@ class Swing(LeafSystem):
         output.SetFromVector([*sine, t**2, 2 * t, 2.0])
 
 
-def moved_mass():
-    """The profile of a mass of 1 kg that moves to and fro with at most 3 N."""
-    system = double_integrator()
-    limits = MotionLimits(controls={system.control_signals[0].name: (-3.0, 3.0)})
-    timing = PathTiming(find_structure(system), limits)
-    return timing.profile([SinusoidReference(0.0, 0.5, 2.0)], 2.0, points=100)
-
-
 MEMBERS = {
     "constant": ConstantReference([0.3, -2.0]),
     "sinusoids": SinusoidReference(1.0, [0.5, -0.2], [1.3, 2.1], [0.1, 0.7]),
@@ -84,11 +69,9 @@ MEMBERS = {
     "polyline": PolylineReference(EDGES, LIMITS, 0.2),
     "polyline of many pieces": PolylineReference(EDGES, LIMITS, 0.01),
     "waypoints": WaypointsReference([[0.0, 0.0], [0.3, 0.2], [0.5, 0.0]], [0.1, 0.8, 1.9]),
-    "text": TextReference("L", [0.0, 0.0], 1.0, LIMITS, press=[2.0, 1.0], corner=0.3),
     "file": CsvReference(
         str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3, tolerance=0.2
     ),
-    "program": GCodeReference(str(Path(__file__).parent / "program.nc"), LIMITS, tolerance=0.05),
     "system": SystemReference(Swing(), [2, 2]),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
     "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),
@@ -97,7 +80,6 @@ MEMBERS = {
         CsvReference(str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3, tolerance=0.2),
         1.1,
     ),
-    "time-optimal": TimeOptimalReference(moved_mass()),
 }
 
 TIMES = (0.41, 0.93, 1.62)

@@ -1,7 +1,6 @@
 """The rules of `Plant`, on every member: those of the package and one of `members`."""
 
 import os
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from arms import arm, fixed_step
 from members import SpringyPlant
-from pydrake.lcm import DrakeLcm
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
@@ -20,7 +18,6 @@ from drake_dae import (
     ContactMaterial,
     ContactPlant,
     DaePlant,
-    LcmArm,
     PointMaterial,
     RobotPlant,
     TrackingLaw,
@@ -41,7 +38,6 @@ from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
 from drake_dae.studies.runs import Outcome
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.hardware.lcm_arm import CRASHES
 
 FINE = 1e-10
 """Round-off of a few hundred operations on forces of some 10 N."""
@@ -74,18 +70,8 @@ MEMBERS = {
     "compliant, continuous": lambda: CompliantPlant(
         arm("two_link").model, PointMaterial(0.0), structure=arm("two_link").structure
     ),
-    "arm behind LCM": lambda: LcmArm(
-        arm("two_link").model,
-        DrakeLcm("memq://"),
-        "iiwa",
-        structure=arm("two_link").structure,
-    ),
     "springy": lambda: SpringyPlant(arm("two_link").model, arm("two_link").structure),
 }
-
-
-if sys.version_info >= CRASHES:
-    del MEMBERS["arm behind LCM"]
 
 
 def test_no_member_is_left_out():
@@ -99,7 +85,7 @@ def test_no_member_is_left_out():
 
     package = {cls for cls in leaves(Plant) if cls.__module__.startswith("drake_dae")}
     made = {type(make()) for make in MEMBERS.values()}
-    assert package - made <= {*([LcmArm] if sys.version_info >= CRASHES else [])}
+    assert package <= made
 
 
 @pytest.fixture(params=MEMBERS)
@@ -189,7 +175,7 @@ def test_rule_8_parameters(plant):
     with pytest.raises(ModelError, match="nothing"):
         plant.set_parameter(context, "nothing", 1.0)
     place = plant.dae.parameter_slice("link2.mass")
-    if isinstance(plant, ContactPlant | LcmArm | SpringyPlant):  # A test knows its members.
+    if isinstance(plant, ContactPlant | SpringyPlant):  # A test knows its members.
         with pytest.raises(ModelError, match="fixed"):
             plant.set_parameter(context, "link2.mass", 6.0)
         np.testing.assert_array_equal(plant.parameters(context), before)
@@ -227,7 +213,7 @@ def test_rules_11_and_13_projection_and_contact(plant):
     assert plant.projects in (True, False)
     if plant.is_ideal:
         assert np.max(np.abs(record["constraint_residual"])) < 1e-9
-    elif not isinstance(plant, LcmArm):  # A contact that gives way is pressed in.
+    else:  # A contact that gives way is pressed in.
         assert np.max(np.abs(record["constraint_residual"])) > 1e-6
 
 

@@ -28,7 +28,6 @@ const prediction = data.prediction && new Prediction(data.prediction, (input) =>
 const plots = { signal: new Plot(element("signal-plot")), error: new Plot(element("error-plot")) };
 const bench = (window.bench = {
   data, engine, panel, view, samples: [], isRunning: true, rate: 3, restarts: true, off: 0, speed: 1, failure: "",
-  pulled: [], gone: null, ended: null, said: "",
 });
 
 /* What follows from a sample: error, and the predicted one. */
@@ -66,68 +65,12 @@ function follow_push() {
   view.push.setLength((FULL * data.size * size) / data.pushes[bench.push.name].most, 0.05 * data.size, 0.03 * data.size);
 }
 
-/* Loses each contact: a surface of compliant contact goes away, and comes back slowly when its
-   phase has ended; else the tool is pulled off for a moment, harder than it presses. */
-const PULL = 0.15, GONE = 0.6, AWAY = 0.15; /* s, s, m */
-function lose() {
-  const { time, place } = bench.samples.at(-1);
-  const ways = data.surfaces.filter(({ direction, controls }) => direction && controls.some(is_slow));
-  for (const { direction, controls } of ways) {
-    controls.forEach((control, axis) => {
-      const [input] = data.controls[control].inputs;
-      panel.give(input, panel.present[input] - AWAY * direction[axis], "surface");
-    });
-  }
-  if (ways.length) bench.gone = { until: time + GONE, place };
-  else pull();
-}
-const is_slow = (control) => control !== null && data.controls[control].rate > 0;
-function pull() {
-  const { scene, time } = bench.samples.at(-1), at = View.places();
-  data.constraints.forEach(({ link }, k) => {
-    const force = vector(scene, at.forces + 3 * k), size = force.length();
-    if (!link || !size) return;
-    const body = 12 * data.bodies.findIndex(({ name }) => name === link) + 9;
-    force.multiplyScalar(1 + data.pushes[link].most / size);
-    const lever = vector(scene, at.points + 3 * k).sub(vector(scene, body));
-    give(link, [...force.toArray(), ...lever.cross(force).toArray()], "push");
-    bench.pulled.push({ link, until: time + PULL });
-  });
-}
-function let_go() {
-  const isOver = ({ until }) => bench.samples.at(-1).time >= until;
-  for (const { link } of bench.pulled.filter(isOver)) give(link, [0, 0, 0, 0, 0, 0], "released");
-  bench.pulled = bench.pulled.filter((one) => !isOver(one));
-}
-
-/* Ends the phase of a task. What was given is taken back when the next phase has begun. */
-function next() {
-  const { place } = bench.samples.at(-1), input = data.phases[place];
-  bench.said = "";
-  if (place >= data.phases.length) bench.said = "the task is over";
-  else if (input === null) bench.said = "this phase makes or breaks the contact, and ends by itself";
-  else {
-    panel.give(input, 1, "signal");
-    bench.ended = { input, place };
-  }
-  bench.fresh = true;
-}
-function take_back() {
-  if (bench.samples.at(-1).place === bench.ended.place) return;
-  panel.give(bench.ended.input, 0, "signal");
-  bench.ended = null;
-}
-
 /* Runs some ticks, with the push of the pointer as it is now. */
 async function advance(ticks) {
   if (bench.failure) return;
   if (bench.push) follow_push();
-  if (bench.pulled.length) let_go();
-  if (bench.ended) take_back();
-  const now = bench.samples.at(-1);
-  if (bench.gone && (now.time >= bench.gone.until || now.place !== bench.gone.place)) bench.gone = null;
   /* What moves at a limited speed has a new place at each tick. */
-  for (; !bench.gone && panel.moves(data.tick) && ticks > 1; ticks--) await one(1);
+  for (; panel.moves(data.tick) && ticks > 1; ticks--) await one(1);
   await one(ticks);
 }
 async function one(ticks) {
@@ -156,7 +99,7 @@ function draw() {
   element("clock").textContent = `t = ${last.time.toFixed(2)} s, ${rate}${slow}` +
     (last.phase ? `, ${last.phase}` : "") +
     (prediction ? `; error off prediction by ${bench.off.toExponential(1)}` : "");
-  element("state").textContent = bench.failure || bench.said;
+  element("state").textContent = bench.failure;
   element("state").className = bench.failure ? "wrong" : "";
   element("run").textContent = bench.isRunning ? "pause" : "run";
 }
@@ -172,22 +115,6 @@ function draw_errors(chosen) {
   ]), legend, sizes.reduce((most, size) => Math.max(most, Math.abs(size ?? 0)), 0));
 }
 
-/* Sticks of a gamepad move the target along its axes; the last axis changes the first force. */
-function gamepad(seconds) {
-  const pad = Array.from(navigator.getGamepads?.() ?? []).find(Boolean);
-  if (!pad) return;
-  const turned = pad.axes.map((value) => (Math.abs(value) < 0.15 ? 0 : value));
-  const move = (control, value) => {
-    const { high, low } = data.controls[control];
-    if (value) panel.set(control, panel.value(control) + 0.5 * seconds * value * (high - low));
-  };
-  const [first, second] = data.targets[0]?.axes ?? [];
-  if (first) move(first[1], second ? turned[0] ?? 0 : -(turned[1] ?? 0));
-  if (second) move(second[1], -(turned[1] ?? 0));
-  const pressed = data.controls.findIndex(({ kind, unit }) => kind === "reference" && unit === "N");
-  if (pressed >= 0) move(pressed, -(turned[3] ?? 0));
-}
-
 let before = performance.now(), owed = 0, isBusy = false;
 async function picture(now) {
   requestAnimationFrame(picture);
@@ -195,7 +122,6 @@ async function picture(now) {
   const passed = (now - before) / 1000;
   before = now;
   if (bench.isRunning) {
-    gamepad(passed);
     const wanted = passed * RATES[bench.rate];
     owed = Math.min(owed + wanted, MOST);
     const ticks = Math.floor(owed / data.tick);
@@ -220,7 +146,7 @@ async function picture(now) {
 async function restart() {
   panel.reset();
   pushed(null);
-  Object.assign(bench, { pulled: [], gone: null, ended: null, said: "", samples: [], restarts: true, failure: "", isRunning: true, fresh: true });
+  Object.assign(bench, { samples: [], restarts: true, failure: "", isRunning: true, fresh: true });
   taken(await engine.start());
 }
 const change_rate = (by) => {
@@ -232,17 +158,10 @@ const act = {
   step: () => (bench.isRunning = false, bench.failure || advance(1)),
   slower: () => change_rate(-1),
   faster: () => change_rate(1),
-  next,
-  lose,
   restart,
-  async save() {
-    element("state").textContent = `saved: ${await engine.save()}`;
-  },
 };
 for (const [name, action] of Object.entries(act)) element(name).addEventListener("click", action);
 
-element("lose").hidden = !data.opens;
-element("next").hidden = !data.phases.length;
 element("title").textContent = data.title;
 data.outputs.forEach(({ name, unit }, i) => element("signal").append(new Option(unit ? `${name} [${unit}]` : name, i)));
 const units = data.desired ? [...new Set(data.outputs.map(({ unit }) => unit))] : [];
@@ -265,5 +184,5 @@ for (const name of ["signal", "error"]) element(name).addEventListener("change",
 viewer.gui.domElement.style.display = "none";
 new Drag(view, panel, pushed);
 await restart();
-Object.assign(bench, { advance, draw, gamepad, isReady: true });
+Object.assign(bench, { advance, draw, isReady: true });
 requestAnimationFrame(picture);

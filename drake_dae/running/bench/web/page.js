@@ -2,7 +2,7 @@
 async function makeEngine() {
   const { create } = await load(Uint8Array.from(atob(wasm), (letter) => letter.charCodeAt(0)));
   const loop = create("loop");
-  let tick = 0, log = [];
+  let tick = 0;
 
   function sample() {
     const desired = loop.outputs[data.desired], place = loop.outputs.phase?.[0];
@@ -20,13 +20,12 @@ async function makeEngine() {
   return {
     async start() {
       loop.reset();
-      [tick, log] = [0, []];
+      tick = 0;
       loop.show();
       return sample();
     },
     set(input, value) {
       for (const place of data.places[input]) loop.view("parameters", place, 1)[0] = value;
-      log.push([tick, data.inputs[input].name, value]);
     },
     /* Samples after each of some ticks. */
     async advance(ticks) {
@@ -37,14 +36,6 @@ async function makeEngine() {
         found.push(sample());
       }
       return found;
-    },
-    async save() {
-      const text = JSON.stringify({ title: data.title, tick: data.tick, end: tick, commands: log });
-      const link = document.createElement("a");
-      link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
-      link.download = "commands.json";
-      link.click();
-      return "commands.json";
     },
   };
 }

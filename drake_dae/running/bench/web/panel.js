@@ -26,7 +26,7 @@ class Panel {
   }
   group(kind, title, isOpen) {
     const chosen = data.controls.map((control, i) => [control, i])
-      .filter(([control]) => control.kind === kind || (kind === "reference" && control.kind === "speed"));
+      .filter(([control]) => control.kind === kind);
     if (!chosen.length) return;
     const folder = document.createElement("details");
     folder.open = isOpen;

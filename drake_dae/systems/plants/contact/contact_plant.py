@@ -19,7 +19,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import BodyIndex, Frame
+from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
@@ -49,7 +49,6 @@ from drake_dae.systems.plants.contact.contact_material import (
 from drake_dae.systems.plants.contact.disturbance_forces import (
     AppliedDisturbances,
     DisturbanceForce,
-    LinkPushes,
 )
 from drake_dae.systems.plants.contact.stepped_stages import SteppedStages, check_step
 from drake_dae.systems.plants.contact.traced_contact import traced_contact
@@ -102,7 +101,6 @@ class ContactPlant(Diagram, Plant):
         parameters: Parameter name -> the plant's value if it differs from the model: positions and
             friction of surfaces, masses of bodies, and numbers of stages.
         disturbances: Forces on the robot that its law does not know.
-        pushed: Whether its links have `pushes`, which are set in the context.
 
     Attributes:
         dae, model, structure, time_step: As for `Plant`.
@@ -127,7 +125,6 @@ class ContactPlant(Diagram, Plant):
         structure: ConstraintStructure,
         parameters: Mapping[str, ArrayLike] | None = None,
         disturbances: Sequence[DisturbanceForce] = (),
-        pushed: bool = False,
     ) -> None:
         super().__init__()
         check_model(model, material)
@@ -154,17 +151,10 @@ class ContactPlant(Diagram, Plant):
         plant.Finalize()
         check_same(plant, model)
         self._masses = other_masses(model, plant, self._values)
-        port = plant.get_applied_spatial_force_input_port()
-        if pushed:
-            bodies = (plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies()))
-            links = [body for body in bodies if not plant.IsAnchored(body)]
-            self.pushes = inner.AddSystem(LinkPushes(links))
-            inner.Connect(self.pushes.get_output_port(), port)
-            port = self.pushes.get_input_port()
         if disturbances:
             frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
             applied = inner.AddSystem(AppliedDisturbances(plant, disturbances, frames))
-            inner.Connect(applied.get_output_port(), port)
+            inner.Connect(applied.get_output_port(), plant.get_applied_spatial_force_input_port())
         forces = ContactForces(model, structure, pairs, self._values)
         self._forces = inner.AddSystem(forces)
         self.contact_force_signals = forces.contact_force_signals

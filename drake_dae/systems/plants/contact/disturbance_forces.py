@@ -1,20 +1,18 @@
-"""Disturbance forces on a robot, and pushes that are set while it runs."""
+"""Disturbance forces on a robot."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
-import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
-from pydrake.multibody.tree import Frame, RigidBody
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.multibody.tree import Frame
+from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief, number, positive
 from drake_dae.dae.references import ExpressionReference
-from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
@@ -123,51 +121,3 @@ class AppliedDisturbances(LeafSystem):
         for applied, force in zip(self._applied, self._forces, strict=True):
             applied.F_Bq_W = SpatialForce([0.0, 0.0, 0.0], force(time))
         output.set_value(self._applied)
-
-
-class LinkPushes(LeafSystem):
-    """Applies a force and a moment to each of some links, which are set in the context.
-
-    Numeric parameter 0 has six numbers for each link, named by `commands`: the force at its origin
-    in N, then the moment in N m, both in the world; zero by default.
-
-    Input port:
-        spatial_forces: Those of others, which are passed on; none without a wire.
-
-    Output port:
-        all_spatial_forces: The input of the plant's port `applied_spatial_force`.
-
-    Args:
-        links: The links.
-
-    Attributes:
-        commands: Names and units of the parameters.
-    """
-
-    __slots__ = SHARED_DICTIONARY
-
-    def __init__(self, links: Sequence[RigidBody]) -> None:
-        super().__init__()
-        self.set_name("pushes")
-        parts = {"force": "N", "moment": "N m"}
-        self.commands = tuple(
-            Signal(f"push.{link.scoped_name().get_full()}.{part}[{k}]", unit)
-            for link in links
-            for part, unit in parts.items()
-            for k in range(3)
-        )
-        self._links = [link.index() for link in links]
-        self.DeclareNumericParameter(BasicVector(np.zeros(len(self.commands))))
-        forces = Value[list[ExternallyAppliedSpatialForce]]
-        self._others = self.DeclareAbstractInputPort("spatial_forces", forces())
-        self.DeclareAbstractOutputPort("all_spatial_forces", forces, weakly(self._calc))
-
-    def _calc(self, context: Context, output: Value) -> None:
-        forces = list(self._others.Eval(context)) if self._others.HasValue(context) else []
-        rows = context.get_numeric_parameter(0).value().reshape(-1, 6)
-        for link, row in zip(self._links, rows, strict=True):
-            applied = ExternallyAppliedSpatialForce()
-            applied.body_index = link
-            applied.F_Bq_W = SpatialForce(row[3:], row[:3])
-            forces.append(applied)
-        output.set_value(forces)

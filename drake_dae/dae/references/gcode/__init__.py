@@ -1,1 +1,0 @@
-"""References from programs of machine tools, in G-code."""

@@ -1,4 +1,0 @@
-typedef struct {
-  ${prefix}_plant plant;
-  double start[${guard}_PLANT_STATES + 1];
-} Own;
