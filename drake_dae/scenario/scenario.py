@@ -23,7 +23,6 @@ from drake_dae.scenario.forms.values import Interval
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
     Constraint,
-    Damping,
     DisturbanceForce,
     Encoders,
     Force,
@@ -181,7 +180,7 @@ class Scenario:
     law: Law | None = None
     gains: Gains | None = None
     integral: list[str] | None = None
-    constraint_damping: Damping | None = None
+    constraint_damping: Gains | None = None
     observer: Observer | None = None
     identified: list[str] = field(default_factory=list)
     largest_roughness: float | None = None

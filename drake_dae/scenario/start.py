@@ -193,7 +193,7 @@ def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
     if last is not gains:
         if last_key != (key := repr(gains)):
             law = loop.controller.law
-            design = law.design(gains.design(law.structure))
+            design = law.design(gains.design())
         loop.memory["gains"] = gains, key, design
     return cast(FeedbackGains, design)
 

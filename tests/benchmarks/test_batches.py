@@ -4,18 +4,13 @@ By what they take of all cores together, in turn, since how fast a core is chang
 """
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from arms import error_controlled
-from parallel_bars import bars, parallelogram
-from pydrake.systems.framework import DiagramBuilder
 from runs import scenario
 from timing import has_compiler
 
 from drake_dae import (
-    DaePlant,
     build_scenario,
     grid_variations,
     rollout,
@@ -118,32 +113,6 @@ def test_ten_thousand_short_runs(report):
     run()
     took = in_turn({"lanes": run}, 4)["lanes"]
     report("two_link_wall: 10,000 rollouts of 1 s", {"processor time [s]": f"{took:.2f} (<0.5)"})
-
-
-def test_a_plant_without_a_law(report):
-    """10 s of a four-bar linkage at 1e-6, of which only the ends are recorded."""
-    model, _ = bars(1, 9.81)
-    plant, builder = DaePlant(replace(model.dae, compiled=True)), DiagramBuilder()
-    builder.AddSystem(plant)
-    builder.ExportOutput(plant.GetOutputPort("state"), "state")
-    diagram = builder.Build()
-    start = parallelogram(model.links.plant, np.pi / 2, -1.0)
-
-    def run(count):
-        starts = np.tile(start, (count, 1))
-        config = error_controlled(1e-6)
-        found = rollout(diagram, starts, None, [0.0, 10.0], config=config, compiled=True)
-        assert all(each.failure is None for each in found)
-
-    run(1)
-    seconds = in_turn({"lanes": lambda: run(512), "alone": lambda: run(1)}, 10)
-    report(
-        "four-bar linkage without a law, 10 s to 1e-6: processor time",
-        {
-            "512 side by side [ms a run]": f"{1e3 * seconds['lanes'] / 512:.2f} (<0.6)",
-            "alone [ms]": f"{1e3 * seconds['alone']:.1f}",
-        },
-    )
 
 
 def test_a_run_of_a_sweep(report):
