@@ -29,7 +29,7 @@ PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
 	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
 
-.PHONY: help demo check test processor benchmark campaign robots friction peers house equations pictures docs gallery sheet referee clean lint
+.PHONY: help demo check test processor benchmark campaign robots friction peers house equations pictures docs referee clean lint
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -48,8 +48,6 @@ help:
 	@echo 'make equations   from each equation of the paper to its line and its test'
 	@echo 'make pictures    film the demo and a task, into $(PICTURES)/'
 	@echo 'make docs        run the pages of the book and make its site, in $(BOOK)/site/'
-	@echo 'make gallery     run all scenarios and show them on one page, in build/gallery/; some minutes'
-	@echo 'make sheet       every scenario at three moments, as page and film, into runs/sheet/; chromium'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
 	@echo 'PYTHON=/path/to/python3.x chooses the interpreter; now $(or $(PYTHON),none found) $(VERSION)'
 
@@ -82,7 +80,6 @@ campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/support/woodpecker.py
 	$(BIN)/python tests/campaign/polish.py
 	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_tasks.py --count 1000 --seed $(SEED)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_limits.py --count 1000 --seed $(SEED)
 
 # Those of example-robot-data, and of pybullet_data and robosuite where these are installed.
 robots: $(VENV)/installed-dev
@@ -112,12 +109,6 @@ pictures: $(VENV)/installed
 
 docs: $(VENV)/installed-docs
 	$(BIN)/python examples/book --out $(BOOK)
-
-gallery: $(VENV)/installed
-	$(BIN)/python examples/gallery
-
-sheet: $(VENV)/installed
-	$(BIN)/python tests/campaign/contact_sheet.py $(ARGS)
 
 clean:
 	rm -rf .venv-3.* dist build .mypy_cache .pytest_cache .ruff_cache

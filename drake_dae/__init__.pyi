@@ -44,10 +44,6 @@ from .dae.structure.structure import find_structure as find_structure
 from .dae.system.signals import Parameter as Parameter
 from .dae.system.signals import Signal as Signal
 from .dae.system.system import DaeSystem as DaeSystem
-from .dae.timing.motion_limits import FrictionCone as FrictionCone
-from .dae.timing.motion_limits import MotionLimits as MotionLimits
-from .dae.timing.profile import PathTiming as PathTiming
-from .dae.timing.profile import TimeOptimalReference as TimeOptimalReference
 from .dae.tracking.constraint_damping import contact_damping as contact_damping
 from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
@@ -64,7 +60,6 @@ from .diagrams.wiring import make_closed_loop as make_closed_loop
 from .diagrams.wiring import wire_loop as wire_loop
 from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
-from .pictures.diagram import save_diagram as save_diagram
 from .pictures.film import save_film as save_film
 from .pictures.runs import plot_runs as plot_runs
 from .pictures.scene.view import start_meshcat as start_meshcat
@@ -73,6 +68,7 @@ from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
 from .robots.actuation.hydraulics import ElectrohydraulicServos as ElectrohydraulicServos
 from .robots.constraints.alignment import AxisNormalToSurface as AxisNormalToSurface
 from .robots.constraints.couplers import JointCoupler as JointCoupler
+from .robots.constraints.friction import FrictionCone as FrictionCone
 from .robots.constraints.loop_joints import PrismaticLoopJoint as PrismaticLoopJoint
 from .robots.constraints.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
 from .robots.constraints.points import FixedDistance as FixedDistance
@@ -96,7 +92,6 @@ from .robots.link_side import link_side as link_side
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
 from .robots.model import RobotModel as RobotModel
-from .robots.motion_limits import robot_motion_limits as robot_motion_limits
 from .robots.outputs import AxisCoordinates as AxisCoordinates
 from .robots.outputs import ExpressionOutput as ExpressionOutput
 from .robots.outputs import JointPositions as JointPositions

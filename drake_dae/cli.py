@@ -32,13 +32,11 @@ time of a short run.
 
 
 _MODULES = {
-    "schema": "keys",
-    "print": "keys",
-    "cache": "keys",
-    "explain": "keys",
+    "schema": "texts",
+    "print": "texts",
+    "cache": "texts",
     "page": "play",
     "render": "plot",
-    "diagram": "plot",
     "analyze": "new",
 }
 """Command -> its module, if the module has another name."""
@@ -84,13 +82,10 @@ def _main(arguments: Sequence[str] | None) -> int:
         with _warnings(*ignored), ending_signals(end_at_once):
             return _flushed(run_command(options))
     except DrakeDaeError as error:
-        from drake_dae.scenario.manual.remedies import code_of
-
         # A scenario's error has a line for each problem; other texts, as of Drake, become one line.
         is_listed = isinstance(error, ScenarioError)
         text = str(error) if is_listed else " ".join(str(error).split())
-        kind = type(error)
-        return _fail(text, as_json, lambda line: f" [{code_of(line, kind)}]")
+        return _fail(text, as_json)
     except BrokenPipeError:
         # The reader of the output, such as head, has closed it; Python would report that on exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -108,10 +103,9 @@ def _flushed(code: int) -> int:
     return code
 
 
-def _fail(text: str, as_json: bool, code: Callable[[str], str] = lambda _: "") -> int:
-    """Prints an error, each line with its code; returns the exit code."""
-    lines = [f"error: {line}{code(line)}" for line in text.splitlines()]
-    print(*lines, sep="\n", file=sys.stderr)
+def _fail(text: str, as_json: bool) -> int:
+    """Prints an error line by line; returns the exit code."""
+    print(*(f"error: {line}" for line in text.splitlines()), sep="\n", file=sys.stderr)
     if as_json:
         print(json.dumps({"error": text}))
     return 1

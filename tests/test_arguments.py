@@ -41,7 +41,6 @@ from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import RankMargin
-from drake_dae.dae.timing.profile import TimeProfile
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError, SimulationError
 from drake_dae.pictures.scene.run_motion import ShownLoop
@@ -114,16 +113,6 @@ def estimator() -> dd.StateEstimator:
 @cache
 def cascade() -> dd.SpringCascade:
     return dd.SpringCascade(links_law(), springy(), dd.SpringLoop(60.0, motor_rate=60.0), 0.01)
-
-
-def motion_limits() -> dd.MotionLimits:
-    return dd.robot_motion_limits(arm("two_link").model)
-
-
-@cache
-def time_profile() -> TimeProfile:
-    line, press = dd.SinusoidReference(0.3, 0.1, 1.5), dd.ConstantReference(20.0)
-    return dd.PathTiming(arm("two_link").structure, motion_limits()).profile([line, press], 0.5)
 
 
 def sensed() -> dd.SensedContact:
@@ -235,19 +224,11 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.DisturbanceObserver: observer,
     dd.StateEstimator: estimator,
     dd.SensedContact: sensed,
-    dd.MotionLimits: motion_limits,
-    dd.PathTiming: lambda: dd.PathTiming(arm("two_link").structure, motion_limits()),
-    TimeProfile: time_profile,
-    dd.TimeOptimalReference: lambda: dd.TimeOptimalReference(time_profile()),
     dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
     dd.SpringCascade: cascade,
     "law of SpringCascade": links_law,
     "model of SpringCascade": springy,
     "model of link_side": springy,
-    "references of PathTiming.profile": lambda: [
-        dd.SinusoidReference(0.3, 0.1, 1.5),
-        dd.ConstantReference(20.0),
-    ],
     "end": lambda: 0.5,
     dd.SensorNoise: lambda: dd.SensorNoise(),
     dd.AdvisedGains: lambda: dd.advised_gains(sensed(), 1.0),
@@ -448,7 +429,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "heights": lambda: [[0.0, 0.1], [0.0, 0.2]],
     "file": lambda: None,
     "file of MeshSurface": lambda: (
-        FOLDER.parents[1] / "drake_dae" / "scenario" / "manual" / "ridge.obj"
+        FOLDER.parents[1] / "tests" / "robots" / "surfaces" / "ridge.obj"
     ),
     "middle": lambda: None,
     "ranges": lambda: {"duration": (1.0, 2.0)},

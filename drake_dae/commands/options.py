@@ -62,8 +62,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     _add_new(commands)
     _add_export(commands, scenario)
     _add_page(commands, scenario)
-    _add_gallery(commands)
-    _add_pictures(commands, scenario)
+    _add_pictures(commands)
     cache = commands.add_parser("cache", help="show the machine code in the cache, or remove it")
     cache.flag("--clear", "remove it all")
     options = parser.parse_args(arguments)
@@ -80,11 +79,7 @@ def _add_texts(commands: Any) -> None:
     )
     shown.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
     shown.flag("--path", "print where its file is instead")
-    keys = commands.add_parser("keys", help="print the keys of a scenario, in Markdown")
-    keys.add_argument("key", nargs="?", default="", help="as gains or Plane (default: all keys)")
     commands.add_parser("schema", help="print the JSON Schema of a scenario, for editors")
-    explain = commands.add_parser("explain", help="print what to do about an error, by its code")
-    explain.add_argument("code", nargs="?", default="", help="as E12 (default: all codes)")
 
 
 def _add_simulate(commands: Any, scenario: CommandParser) -> None:
@@ -100,11 +95,6 @@ def _add_simulate(commands: Any, scenario: CommandParser) -> None:
     )
     run.path("--out", "folder for the results (default: runs/<scenario>-<time>)")
     run.flag("--meshcat", "show the robot while it runs, in a browser")
-    run.flag(
-        "--time-optimal",
-        "follow the references as paths, in the shortest time that the limits of drives and joints "
-        "allow; as the scenario's key `time_optimal`",
-    )
     run.flag("--open", "open the animation in a browser at the end")
     run.flag(
         "--rollout",
@@ -204,30 +194,7 @@ def _add_page(commands: Any, scenario: CommandParser) -> None:
     page.json("print the files with their sizes as JSON")
 
 
-def _add_gallery(commands: Any) -> None:
-    gallery = commands.add_parser(
-        "gallery",
-        help="run scenarios and show them on one page",
-        description="Runs scenarios and writes a page with a card for each: picture, animation, a "
-        "page to steer it, verdict, figures and YAML. A scenario runs again only if its file or "
-        "drake_dae has changed, so that the same command continues a gallery that was interrupted.",
-        epilog="exit code: 0, or 1 for an error, also where a scenario failed: its card says why",
-    )
-    gallery.add_argument(
-        "scenarios",
-        metavar="NAME",
-        nargs="*",
-        help="a shipped scenario or a YAML file (default: all shipped scenarios, some minutes)",
-    )
-    gallery.path(
-        "--out",
-        "folder for the page, index.html, and the runs (default: gallery)",
-        metavar="DIR",
-        default=Path("gallery"),
-    )
-
-
-def _add_pictures(commands: Any, scenario: CommandParser) -> None:
+def _add_pictures(commands: Any) -> None:
     film = commands.add_parser(
         "render",
         help="render a run into a GIF, an MP4 or a strip of pictures",
@@ -240,14 +207,6 @@ def _add_pictures(commands: Any, scenario: CommandParser) -> None:
         "a .gif or .mp4 (by ffmpeg), or a .png for four moments side by side (default: film.gif in "
         "the folder)",
     )
-    blocks = commands.add_parser(
-        "diagram",
-        parents=[scenario],
-        help="draw the blocks of a scenario's loop and their wires",
-        description="Draws the Drake diagram of a scenario: its blocks, and the wires with the "
-        "names of their ports. Graphviz's program `dot` draws it; a .dot is written without it.",
-    )
-    blocks.path("--out", "a .svg, .png, .pdf or .dot (default: <scenario>.svg)", metavar="FILE")
     plot = commands.add_parser(
         "plot",
         help="draw signals of runs over each other",

@@ -11,16 +11,13 @@ from drake_dae.commands.run.folder import FILM, SCENARIO, load_run, runs_by_name
 from drake_dae.commands.run.report import report_run
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
-from drake_dae.pictures.diagram import save_diagram
 from drake_dae.pictures.film import save_film
 from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.profile import PROFILE
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.parts.parts import Write
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
 
 SUFFIXES = (".png", ".pdf", ".svg")
@@ -30,8 +27,7 @@ def run_command(options: argparse.Namespace) -> int:
     """Draws or renders what the options name; returns the exit code."""
     if options.command == "plot" and options.all:
         return _plot_all(options)
-    draw = {"render": _render, "plot": _plot, "diagram": _diagram}[options.command]
-    path = draw(options)
+    path = _render(options) if options.command == "render" else _plot(options)
     print(f"written to {path}")
     return 0
 
@@ -71,21 +67,11 @@ def _plot_all(options: argparse.Namespace) -> int:
         problems += files.problems
         if files.problems:  # Pictures there may be of an earlier time.
             continue
-        written = [name for name in (*PLOTS, PROFILE) if (folder / name).exists()]
+        written = [name for name in PLOTS if (folder / name).exists()]
         print(f"written to {folder}/: {', '.join(written)}")
     for line in problems:
         print(f"error: {line}", file=sys.stderr)
     return 1 if problems else 0
-
-
-def _diagram(options: argparse.Namespace) -> Path:
-    """Draws the blocks of a scenario's loop and their wires."""
-    file = find_scenario(options.scenario)
-    path: Path = options.out or Path(f"{file.stem}.svg")
-    loop, _ = build_scenario(load_scenario(file, options.settings))
-    with stage(path.parent, path.name) as temporary:
-        save_diagram(loop.diagram, temporary / path.name)
-    return path
 
 
 def _plot(options: argparse.Namespace) -> Path:

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -34,12 +34,10 @@ from drake_dae.commands.run.report import RunReport, report_run
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.profile import PROFILE
 from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
-from drake_dae.scenario.parts.time_optimal import TimeOptimal
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
@@ -56,8 +54,6 @@ def run_command(options: argparse.Namespace) -> int:
     """Runs the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
-    if options.time_optimal and scenario.time_optimal is None:
-        scenario = replace(scenario, time_optimal=TimeOptimal())
     if options.open and not scenario.write.animation:
         raise ScenarioError(
             ("write.animation", ("--open shows the animation, so write.animation must be true"))
@@ -249,7 +245,7 @@ def _write(run: _CommandRun, files: RunFiles, failure: str, title: str) -> dict[
 def _print_report(report: RunReport, files: RunFiles) -> list[str]:
     """Prints the verdict, the summary and the problems; returns the names of the files."""
     folder = files.folder
-    written = [name for name in (*FILES, PROFILE, PART) if (folder / name).exists()]
+    written = [name for name in (*FILES, PART) if (folder / name).exists()]
     with files.collected():
         verdict = _colored(report.job)
         where = f"written to {folder}/: {', '.join(written)}"

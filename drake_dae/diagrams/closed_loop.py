@@ -18,13 +18,11 @@ from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState, PacketsWithNoise
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.pictures.diagram import diagram_svg
 from drake_dae.simulation.records.afterwards import completed
 from drake_dae.simulation.records.record import Record, computed_record, recorded_values
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
@@ -54,7 +52,6 @@ class ClosedLoop:
         observer: The observer of the disturbance or the state, or None.
         link: The link to the drives, with jitter and losses, or None.
         packets: The link from the sensors, with late and lost measurements, or None.
-        feasible: The block that keeps the limits of a governed motion, or None.
         memory: A cache for rollouts and starts.
     """
 
@@ -74,15 +71,10 @@ class ClosedLoop:
     observer: Observer | None = None
     link: LinkWithNoise | None = None
     packets: PacketsWithNoise | None = None
-    feasible: FeasibleControl | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
         return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.signals)})"
-
-    def _repr_html_(self) -> str | None:
-        """The blocks and wires, in a notebook."""
-        return diagram_svg(self.diagram)
 
     @property
     def reference(self) -> ReferenceGenerator:

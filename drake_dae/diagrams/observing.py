@@ -7,7 +7,6 @@ from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import Sampling
-from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.observing.estimator import StateEstimator
 from drake_dae.systems.observing.observer import DisturbanceObserver
 from drake_dae.systems.observing.observer_rates import Observing
@@ -26,7 +25,7 @@ def add_observer(
     sampling: Sampling | None,
     control: OutputPort,
     reference: OutputPort,
-    limits: ControlLimits | FeasibleControl | None,
+    limits: ControlLimits | None,
     encoders: Encoders | None,
 ) -> Observer:
     """Adds the observer and connects it to the controller's exogenous port.

@@ -1,23 +1,19 @@
 """The parts of a closed loop: adding them to a diagram, and checks."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import Adder, AffineSystem, MatrixGain
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import ConstantReference, Reference
-from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
 
@@ -137,43 +133,6 @@ def check_parts(
         )
     if not controller.HasInputPort("measured_force"):
         raise WiringError("the law takes no measured force; make it with measured_force=True")
-
-
-def add_feasible(
-    builder: DiagramBuilder,
-    controller: Controller,
-    governed: MotionLimits,
-    control_limits: ArrayLike,
-    sample_period: float,
-) -> FeasibleControl:
-    """Adds limits of the control under which errors deviate least from their prediction.
-
-    Its ports for the state and for exogenous signals are left open.
-
-    Args:
-        builder: The builder of the diagram, with the controller in it.
-        controller: The controller.
-        governed: The limits of joints and forces.
-        control_limits: The largest |u|, shape (p,).
-        sample_period: The time in s in which the control is constant; 0 if it is continuous.
-
-    Raises:
-        WiringError: They do not fit.
-    """
-    structure, names = controller.law.damped_structure, controller.law.system.control_signals
-    sizes = np.asarray(control_limits, dtype=float).reshape(-1).tolist()
-    if len(sizes) != len(names):
-        raise WiringError(
-            f"control_limits has {len(sizes)} entries, there are {len(names)} controls"
-        )
-    controls = {signal.name: (-size, size) for signal, size in zip(names, sizes, strict=True)}
-    try:
-        limits = replace(governed, controls=controls)
-        block = builder.AddSystem(FeasibleControl(structure, limits, sample_period))
-    except ModelError as error:
-        raise WiringError(str(error)) from None
-    builder.Connect(controller.GetOutputPort("control"), block.GetInputPort("control"))
-    return block
 
 
 def add_watch(

@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference
-from drake_dae.dae.timing.motion_limits import MotionLimits
 from drake_dae.errors import WiringError
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.observing.observer_rates import Observing
@@ -39,11 +38,6 @@ class LoopSettings:
             constant if empty.
         plant_exogenous: The references of the plant's exogenous signals; None if they equal the
             law's.
-        governed: The limits that a `PathGovernor` keeps by slowing down the references; None for no
-            governor. If `control_limits` are given as well, `FeasibleControl` keeps both, and the
-            record has its "departure".
-        slowed: The limits at which the governor slows the references down, before those of
-            `governed` are reached, with room for errors of the model; those of `governed` if None.
         tolerances: The tolerated errors; a run that exceeds them ends with an exception.
         signals: Name -> reference of a signal for which a controller waits, such as phases of a
             task; the signal is set where the reference is above 1/2. For any other signal the loop
@@ -61,8 +55,6 @@ class LoopSettings:
     observer: Observing | None = None
     exogenous: Sequence[Reference] = ()
     plant_exogenous: Sequence[Reference] | None = None
-    governed: MotionLimits | None = None
-    slowed: MotionLimits | None = None
     tolerances: Tolerances | None = None
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
     commanded: bool = False

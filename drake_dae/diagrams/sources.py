@@ -23,13 +23,10 @@ def make_generator(
     """The reference block of a law: `CommandedReferences` if the settings are `commanded`.
 
     Raises:
-        WiringError: The settings have both `governed` and `commanded`.
         ReferenceSignalError: The references do not fit the law.
     """
     if not parts.commanded:
         return ReferenceGenerator(references, law.layout.reference_degrees)
-    if parts.governed is not None:
-        raise WiringError("references that are governed cannot be commanded: leave one out")
     return CommandedReferences(references, law.layout.reference_degrees, law.system.output_signals)
 
 

@@ -15,7 +15,6 @@ from drake_dae.diagrams.force_feedback import add_force_feedback
 from drake_dae.diagrams.observing import add_observer
 from drake_dae.diagrams.parts import (
     add_block,
-    add_feasible,
     add_hold,
     add_signals,
     add_watch,
@@ -39,7 +38,6 @@ from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.drake_references import SystemReference
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.sampling import Sampling
-from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.plants.contract import Plant
 
 
@@ -92,15 +90,6 @@ def make_closed_loop(
         references = references_by_name(references, names, law.layout.reference_degrees)
     period = settings.period(plant.time_step)
     reference = make_generator(references, law, settings)
-    if settings.governed is not None:
-        if law.exogenous_degrees and settings.observer is None:
-            raise WiringError(
-                "governed: the law has exogenous signals that no observer estimates, and a "
-                "governor, which changes the time, does not know them; leave governed out"
-            )
-        start = settings.start_time
-        kept = settings.slowed or settings.governed
-        reference = PathGovernor(references, law, kept, start, period)
     try:
         outputs = law.layout.values(reference.reference(settings.start_time))
     except DrakeDaeError:
@@ -171,13 +160,8 @@ def wire_loop(
     # Its control goes to the plant, held between samples and limited by drives; or the plant uses
     # the law itself.
     sampling = None if parts.sampling is None else hold_before(plant, parts.sampling)
-    control, control_limits = controller.GetOutputPort("control"), parts.control_limits
-    feasible = None
-    if parts.governed is not None and control_limits is not None:
-        period = parts.period(plant.time_step)
-        feasible = add_feasible(builder, controller, parts.governed, control_limits, period)
-        control, control_limits = feasible.GetOutputPort("control"), None
-    control, link, limits = add_drives(builder, plant, control, sampling, control_limits)
+    control = controller.GetOutputPort("control")
+    control, link, limits = add_drives(builder, plant, control, sampling, parts.control_limits)
     if controller.HasOutputPort("feedback"):
         builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
     else:
@@ -194,24 +178,15 @@ def wire_loop(
     # updated while a contact is open or lost, or a drive is at its limit.
     holds, observer = open_holds(builder, plant, controller), None
     if observing is not None and goal is not None:
-        # A state that is estimated must not depend on a control that depends on it.
-        stops = limits or (feasible if observing.state_rate is None else None)
-        ports = state, sampling, control, goal, stops
+        ports = state, sampling, control, goal, limits
         observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)
         if packets is not None:
             builder.Connect(packets.missed, observer.GetInputPort("missed"))
         if observing.state_rate is not None:
             state = observer.GetOutputPort("estimated_state")
         holds.append(observer.GetOutputPort("hold"))
-    for block in (reference, feasible):
-        if block is not None and block.HasInputPort("estimated_state"):
-            builder.Connect(state, block.GetInputPort("estimated_state"))
-            if observer is not None:
-                estimates = observer.GetOutputPort("exogenous")
-                builder.Connect(estimates, block.GetInputPort("exogenous"))
-    for block in (limits if observer is None else None, feasible):
-        if block is not None:
-            holds.append(block.GetOutputPort("is_limited"))
+    if limits is not None and observer is None:
+        holds.append(limits.GetOutputPort("is_limited"))
     add_hold(builder, controller, holds)
     add_signals(builder, controller, parts.signals)
 
@@ -232,12 +207,6 @@ def wire_loop(
             plant, controller, measured, packets, link, limits, observer, parts.sensor
         ),
     }
-    if feasible is not None:
-        named["excess"] = (feasible.GetOutputPort("excess"), plant.dae.control_signals)
-        named["departure"] = (feasible.GetOutputPort("departure"), feasible.departure_signals)
-        if observer is not None:
-            estimates = controller.law.system.exogenous.signals
-            named["compensated"] = (observer.GetOutputPort("exogenous"), estimates)
     if reference is not None:
         named |= further_signals(reference)
     sources = {"reference": reference, "exogenous": moving}
@@ -268,7 +237,6 @@ def wire_loop(
         observer,
         link,
         packets,
-        feasible,
     )
 
 

@@ -13,7 +13,6 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
-from drake_dae.scenario.completion.timing import TimedScenario, timed
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.holes import misfit
 from drake_dae.scenario.feasibility.pace import paced
@@ -65,7 +64,6 @@ def build_completed(
         structure,
         scene_graph,
         meshcat,
-        motion=prepared.motion,
         commanded=commanded,
     )
     told = sticking_before(scenario, model, structure), misfit(scenario, model)
@@ -79,7 +77,6 @@ class _Prepared:
     completed: Completed
     model: RobotModel
     structure: Structure
-    motion: TimedScenario | None
 
 
 def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
@@ -92,6 +89,5 @@ def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
     slowed = paced(chosen.scenario, model, structure)
-    in_time, motion = timed(slowed.scenario, model, structure)
-    notes = (*completed.notes, *chosen.notes, *slowed.notes, *in_time.notes)
-    return _Prepared(Completed(in_time.scenario, notes), model, structure, motion)
+    notes = (*completed.notes, *chosen.notes, *slowed.notes)
+    return _Prepared(Completed(slowed.scenario, notes), model, structure)

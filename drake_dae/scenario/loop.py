@@ -22,7 +22,6 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.completion.timing import TimedScenario
 from drake_dae.scenario.controllers.task_controller import (
     opening_contact,
     task_controller,
@@ -46,7 +45,6 @@ def build_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
     plant: Plant | None = None,
-    motion: TimedScenario | None = None,
     commanded: bool = False,
 ) -> ClosedLoop:
     """Builds the closed loop of a scenario's robot.
@@ -58,7 +56,6 @@ def build_loop(
         scene_graph: The scene graph of the robot's geometry; needed to draw it.
         meshcat: The Meshcat for a live view; None for no view.
         plant: A plant in place of the scenario's; None for the scenario's.
-        motion: The time-optimal motion, from `timed`; None for the scenario's references.
         commanded: Whether a person changes references during the run; signals for which a task
             waits are then inputs of the diagram.
 
@@ -77,18 +74,11 @@ def build_loop(
     opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
     observed = observed_structure(scenario, *law_robot(scenario, model, structure))
     law = _law(scenario, observed, latency_of(scenario, model))
-    references: list[Reference] = []
-    if motion is not None:
-        references = [motion.reference]
-    elif task is None:
-        references = _references(scenario.references, law)
+    references = [] if task is not None else _references(scenario.references, law)
     exogenous = []
     if scenario.observer is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
     limits = _limits(scenario, model)
-    if motion is not None and motion.governed is not None and limits is None:
-        # A governed motion keeps the limits of its drives, where all have one.
-        limits = model.control_limits if np.isfinite(model.control_limits).all() else None
 
     # The plant, which may have further exogenous signals.
     feedback = task is None and can_be_fed_back(law, sampling, limits)
@@ -112,8 +102,6 @@ def build_loop(
         observer=scenario.observer,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
-        governed=None if motion is None else motion.governed,
-        slowed=None if motion is None else motion.slowed,
         tolerances=scenario.tolerances,
         signals={} if task is None or commanded else task.signals,
         commanded=commanded,
@@ -195,9 +183,8 @@ def _law(scenario: Scenario, structure: Structure, latency: float) -> TrackingLa
     stiffness = scenario.law.contact_stiffness if isinstance(scenario.law, Tracking) else None
     if stiffness is not None:
         keys = ["law", *keys]
-        if scenario.task is not None or scenario.time_optimal is not None:
-            key = "task" if scenario.task is not None else "time_optimal"
-            text = f"is not for scenarios with `{key}`; leave it out"
+        if scenario.task is not None:
+            text = "is not for scenarios with `task`; leave it out"
             raise ScenarioError(("law.contact_stiffness", text))
     with at(" or ".join(keys)):
         assert scenario.gains is not None  # advised.

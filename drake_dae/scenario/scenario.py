@@ -30,6 +30,7 @@ from drake_dae.scenario.parts.families import (
     Encoders,
     Force,
     ForceOutput,
+    FrictionCone,
     Gains,
     LargestErrors,
     Law,
@@ -42,7 +43,6 @@ from drake_dae.scenario.parts.families import (
     Sampling,
     Stage,
     Task,
-    Timing,
     Tolerances,
 )
 from drake_dae.scenario.robot_file.robot import Robot
@@ -113,6 +113,8 @@ class Scenario:
             number, or one per entry. Relative degrees are checked for all values within bounds; if
             both bounds are equal, the value is fixed. Bounds do not restrict a run, only values
             that are `identified`.
+        friction_cones: Contacts that must not slide, such as grips: `analyze` and the verdict of a
+            run say where their forces leave these cones.
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
@@ -151,8 +153,6 @@ class Scenario:
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
             of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list, "tool.y, elbow".
             Completed outputs without a reference keep their initial value.
-        time_optimal: The references are paths that are followed in the shortest time within the
-            robot's limits. If left out, the references are functions of time.
         task: A sequence of phases with opening and closing contact, in place of references.
         start: The start; without positions it is computed (not for a task).
         duration: The duration of the run, in s.
@@ -178,6 +178,7 @@ class Scenario:
     known_forces: list[Load] = field(default_factory=list)
     exogenous: dict[str, list[Reference]] = field(default_factory=dict)
     bounds: dict[str, Interval] = field(default_factory=dict)
+    friction_cones: list[FrictionCone] = field(default_factory=list)
     compliances: dict[str, float] | None = None
     law: Law | None = None
     gains: Gains | None = None
@@ -194,7 +195,6 @@ class Scenario:
     tolerances: Tolerances | None = None
     may_diverge: bool = False
     references: dict[str, Reference] = field(default_factory=dict)
-    time_optimal: Timing | None = None
     task: Task | None = None
     start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0

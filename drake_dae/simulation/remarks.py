@@ -8,7 +8,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.references import Reference
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
@@ -16,15 +15,11 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import Limits
 from drake_dae.systems.control.phase_change import PhaseChange
-from drake_dae.systems.governing.feasible_control import FeasibleControl
 from drake_dae.trace.functions import TracedFunction
 
 _AT_ONCE, _AWAY = 0.1, 1e-3
 """A touch within this time of the start of its phase, in s, and as far before the surface, in m, is
 none: a tool does not come that far."""
-
-EXCEEDED = 1e-3
-"""An excess over the limit of an acceleration that is told, as a share of it."""
 
 
 def surface_remarks(model: RobotModel, record: Record) -> list[str]:
@@ -107,66 +102,6 @@ def ball_remarks(radius: float | None) -> list[str]:
         f"Compliant contact is that of a ball of {1e3 * radius:.3g} mm. Where the robot tilts by "
         "an angle a the ball rolls,\nand touches 2 * radius * sin(a / 2) beside the point of the "
         "constraint; no stiffness changes that, a smaller\nplant.radius does."
-    ]
-
-
-def departure_remarks(record: Record, feasible: FeasibleControl | None) -> list[str]:
-    """A remark on the times at which limits made the error deviate from its prediction.
-
-    Args:
-        record: A record; with "departure" where limits hold by `FeasibleControl`.
-        feasible: That block; None where there is none.
-    """
-    if feasible is None:
-        return []
-    values, signals = record["departure"], record.signals["departure"].signals
-    is_off = np.abs(values).max(axis=1, initial=0.0) > 0.0
-    if not is_off.any():
-        return []
-    times = record.time[is_off]
-    share = float(np.sum(np.diff(record.time)[is_off[:-1]]))
-    amounts = ", ".join(
-        f"{signal.name.removeprefix('departure of ')} by up to {size:.2g} {signal.unit}"
-        for signal, size in zip(signals, np.abs(values).max(axis=0), strict=True)
-        if size > 0.0
-    )
-    states, commanded = record["state"][is_off], record["control"] + record["excess"]
-    beyond = feasible.beyond(states, commanded[is_off], _compensated(record, is_off))
-    causes = ", ".join(name for name, over in beyond.items() if over.max() > 0.0)
-    return [
-        f"Between {times[0]:.4g} and {times[-1]:.4g} s, for {share:.2g} s in all, no motion along "
-        f"the path was within the limits{f' ({causes})' if causes else ''}: the highest "
-        f"derivatives of the errors left their prediction, of {amounts}."
-    ]
-
-
-def _compensated(record: Record, rows: Booleans | None = None) -> FloatArray | None:
-    """The recorded estimates of an observer, at some rows; None without an observer."""
-    if "compensated" not in record:
-        return None
-    values = record["compensated"]
-    return values if rows is None else values[rows]
-
-
-def rate_remarks(record: Record, feasible: FeasibleControl | None) -> list[str]:
-    """A remark on accelerations beyond their limits, which no motion along the path avoids.
-
-    Args:
-        record: A record with state and control.
-        feasible: The block that keeps other limits; None where there is none.
-    """
-    if feasible is None:
-        return []
-    beyond = feasible.beyond(record["state"], record["control"], _compensated(record))
-    over = {name: share for name, share in beyond.items() if name.endswith("'")}
-    over = {name: share for name, share in over.items() if share.max(initial=0.0) > EXCEEDED}
-    if not over:
-        return []
-    times = record.time[np.max([*over.values()], axis=0) > EXCEEDED]
-    texts = ", ".join(f"{name} by {share.max():.2g} of it" for name, share in over.items())
-    return [
-        f"Between {times[0]:.4g} and {times[-1]:.4g} s no motion along the path was within the "
-        f"limits of accelerations, and these were exceeded: {texts}."
     ]
 
 

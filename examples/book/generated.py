@@ -1,4 +1,4 @@
-"""The reference pages generated from the code: public names, keys, commands, errors, equations."""
+"""The reference pages generated from the code: public names, keys, commands, equations."""
 
 import ast
 import contextlib
@@ -10,10 +10,9 @@ from pathlib import Path
 from unittest.mock import patch
 
 import drake_dae
+from book.keys import keys_page
 from book.pages import BOOK, blocks, pages
 from drake_dae.commands.options import parse_options
-from drake_dae.scenario.manual.page import keys_page
-from drake_dae.scenario.manual.remedies import remedies_page
 
 ROOT = BOOK.parents[1]
 sys.path.append(str(ROOT / "tests" / "support"))
@@ -42,7 +41,6 @@ def generated_pages() -> dict[str, str]:
         "reference/names.md": names_page(),
         "reference/keys.md": keys_page(),
         "reference/commands.md": commands_page(),
-        "reference/error_codes.md": remedies_page(),
         "reference/equations.md": equations_page(),
     }
 

@@ -24,7 +24,7 @@ document.addEventListener("DOMContentLoaded", () => {
 // Pages that answer a question come first, lists of them last; the name of an object leads to it.
 var Scorer = {
   score: ([docname, , , , score]) => {
-    if (docname.startsWith("how_to/index_") || docname === "reference/error_codes") return score * 0.5;
+    if (docname.startsWith("how_to/index_")) return score * 0.5;
     return docname.startsWith("how_to/") ? score * 1.5 : score;
   },
   objNameMatch: 99,

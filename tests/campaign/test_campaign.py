@@ -6,11 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from campaign import bad_files, bad_inputs, drops, random_limits, random_robots, random_tasks
+from campaign import bad_files, bad_inputs, drops, random_robots, random_tasks
 from campaign.outcomes import BAD, REFUSED, RESULT
 from runs import some
-
-from drake_dae.scenario.completion import timing
 
 FEW, MANY = range(40), range(40, 110)
 FEW_ROBOTS, MANY_ROBOTS = (8, 17), (16, 34, *range(40, 48))
@@ -65,58 +63,6 @@ def test_a_box_that_falls_neither_sinks_in_nor_gains_energy(seed: int, tmp_path:
 def test_a_random_task_ends_as_chosen_and_hits_no_harder_than_predicted(seed: int, tmp_path: Path):
     found = random_tasks.outcome(*random_tasks.random_task(random.Random(seed)), tmp_path)
     assert not found.startswith(random_tasks.BAD), found
-
-
-# 0 and 3 keep their limits, 2 is refused, and in 4 and 674 the plant is heavier than the law's
-# model: 674 exceeded a speed by 6 % while the governor kept the joints at its limit exactly. The
-# path of 602 is looked up in a table.
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "seed",
-    [
-        0,
-        2,
-        3,
-        602,
-        *(pytest.param(i, marks=pytest.mark.thorough) for i in (4, 674, *range(20, 40))),
-    ],
-)
-def test_a_random_motion_keeps_its_limits_or_says_which_it_cannot_keep(seed: int, tmp_path: Path):
-    run = random_limits.random_run(random.Random(seed), tmp_path, random_limits.CHEAP)
-    found = random_limits.outcome(run)
-    assert not found.startswith(random_limits.BAD), found
-
-
-@pytest.mark.slow
-def test_a_friction_cone_that_is_not_kept_is_named(tmp_path: Path, monkeypatch):
-    """It has two rows, of which the first one is exceeded if limits are tested at points alone."""
-    kept = random_limits.random_run(random.Random(753), tmp_path, {"tray": 1.0})
-    assert random_limits.outcome(kept).startswith("kept: cone")
-    monkeypatch.setattr("drake_dae.dae.timing.profile.BETWEEN", ())
-    run = random_limits.random_run(random.Random(753), tmp_path, {"tray": 1.0})
-    found = random_limits.outcome(run)
-    assert found.startswith("left: "), found
-    assert "largest friction cone of grip.fz" in found
-
-
-@pytest.mark.slow
-def test_where_a_path_turns_sharply_its_limits_hold_between_points_too(tmp_path: Path, monkeypatch):
-    """With points spread by length alone a cone was exceeded twice.
-
-    Without a reserve of cones it was exceeded by 0.5 %, since a profile could exceed it by 2 %.
-    """
-    monkeypatch.setattr(timing, "OF_CONES", 1.0)
-    run = random_limits.random_run(random.Random(408), tmp_path, {"tray": 1.0})
-    found = random_limits.outcome(run)
-    assert found.startswith("kept: cone"), found
-
-
-@pytest.mark.slow
-def test_what_is_reserved_of_a_cone_keeps_the_error_on_its_prediction(tmp_path: Path):
-    """Without it the control was limited while the tray follows its path exactly."""
-    run = random_limits.random_run(random.Random(550), tmp_path, {"tray": 1.0})
-    found = random_limits.outcome(run)
-    assert found.startswith("kept: cone"), found
 
 
 @pytest.mark.slow

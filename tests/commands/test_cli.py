@@ -156,7 +156,7 @@ def test_view_opens_the_animation(demo, monkeypatch, capsys):
     assert capsys.readouterr().out == f"opened {opened[0]}\n"
     monkeypatch.setattr(webbrowser, "open", lambda _: False)
     assert main(["play", str(folder)]) == 1
-    assert error_line(capsys) == f"error: found no browser here; open {opened[0]} in one [E20]"
+    assert error_line(capsys) == f"error: found no browser here; open {opened[0]} in one"
 
 
 def test_view_says_what_is_missing(demo, tmp_path, capsys):
@@ -164,8 +164,8 @@ def test_view_says_what_is_missing(demo, tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
     for path, text in (
-        (folder.parent / "runn", f"no folder '.*runn'; there is {folder} "),
-        (tmp_path / "none", r"no folder '.*none' "),
+        (folder.parent / "runn", f"no folder '.*runn'; there is {folder}"),
+        (tmp_path / "none", r"no folder '.*none'"),
         (folder / "summary.txt", "is a file; name the folder of a run"),
         (run, "'.*run' is no folder of a run: `drake-dae simulate --out FOLDER` makes one"),
     ):
@@ -189,7 +189,7 @@ def test_open_shows_the_animation_at_the_end(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     assert main([*short, *QUICK, "--out", str(tmp_path), "--open"]) == 1
     assert error_line(capsys) == (
-        "error: write.animation: --open shows the animation, so write.animation must be true [E10]"
+        "error: write.animation: --open shows the animation, so write.animation must be true"
     )
     assert len(opened) == 1
 
@@ -364,9 +364,9 @@ def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, 
     for command_of in (simulate, new):
         monkeypatch.setattr(command_of, "find_scenario", warn)
     assert main(["simulate", "two_tanks"]) == 1
-    assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\nerror: empty [E10]\n"
+    assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\nerror: empty\n"
     assert main(["analyze", "two_tanks"]) == 1
-    assert capsys.readouterr().err == "error: empty [E10]\n"
+    assert capsys.readouterr().err == "error: empty\n"
 
 
 def test_a_rollout_leaves_the_files_of_a_run(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""`drake-dae print`, `keys` and `schema`: what one reads before a scenario runs."""
+"""`drake-dae print` and `schema`: what one reads before a scenario runs."""
 
 import json
 
@@ -7,7 +7,6 @@ import pytest
 
 from drake_dae import load_scenario
 from drake_dae.cli import main
-from drake_dae.scenario.manual.page import keys_page
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 
 
@@ -39,23 +38,6 @@ def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_the_keys_of_one_form_and_one_key_in_all_forms(capsys):
-    for name in ("Plane", "!Plane"):
-        assert main(["keys", name]) == 0
-        text = capsys.readouterr().out.rstrip("\n")
-        assert text.startswith("## !Plane\n")
-        assert text in keys_page()
-    assert main(["keys", "gains"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line for line in lines if line.startswith("#")] == ["## Scenario", "## ScenarioTask"]
-    assert [line.split("`")[1] for line in lines if line.startswith("| `")] == ["gains", "gains"]
-    assert main(["keys", "gainz"]) == 1
-    assert "no key 'gainz'; did you mean 'gain' or 'gains'?" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_page_and_the_schema_are_printed(capsys):
-    assert main(["keys"]) == 0
-    assert capsys.readouterr().out == keys_page() + "\n"
+def test_the_schema_is_printed(capsys):
     assert main(["schema"]) == 0
     jsonschema.Draft202012Validator.check_schema(json.loads(capsys.readouterr().out))

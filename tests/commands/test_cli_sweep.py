@@ -29,7 +29,7 @@ def test_it_leaves_its_files_and_prints_the_summary(tmp_path, monkeypatch, capsy
     assert main(other) == 1
     assert capsys.readouterr().err == (
         "error: 'runs/two_link_wall-sweep/runs.jsonl' belongs to another study: duration = 0.2 "
-        "there, 0.3 here. Choose another folder, or remove it [E20]\n"
+        "there, 0.3 here. Choose another folder, or remove it\n"
     )
 
 

@@ -11,13 +11,11 @@ from pydrake.systems.framework import Context
 
 from drake_dae.commands.run.folder import ANIMATION, PART, RECORD, stage
 from drake_dae.commands.run.report import RunReport
-from drake_dae.dae.timing.profile import TimeOptimalReference
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, describe_os_error
 from drake_dae.pictures.animation import animate
 from drake_dae.pictures.moments import events_of, sorted_events
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
-from drake_dae.pictures.profile import PROFILE, save_profile
 from drake_dae.pictures.scene.friction import slips
 from drake_dae.pictures.scene.run_motion import contact_paths, follow
 from drake_dae.scenario.parts.parts import Write
@@ -70,7 +68,7 @@ class RunFiles:
     def write_pictures(
         self, report: RunReport, loop: ClosedLoop, context: Context, wanted: Write, title: str = ""
     ) -> None:
-        """Writes the plots, the profiles of time-optimal references, and the animation."""
+        """Writes the plots and the animation."""
         record, limits = report.record, report.limits
         if not (wanted.plots or wanted.animation):
             return
@@ -84,10 +82,6 @@ class RunFiles:
             with self.collected(), stage(self.folder, *plots) as temporary, _frozen():
                 plotted = record, report.predicted, limits.control
                 save_plots(*plotted, temporary, paths, report.accuracy, events)
-            for reference in loop.generator.references if loop.generator is not None else ():
-                if isinstance(reference, TimeOptimalReference):
-                    with self.collected(), stage(self.folder, PROFILE) as temporary:
-                        save_profile(reference.profile, temporary)
         if wanted.animation and motion is not None:
             with self.collected(), stage(self.folder, ANIMATION) as temporary:
                 page = animate(motion, loop.scene_graph, title, phase_spans(record), events)

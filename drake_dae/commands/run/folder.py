@@ -15,7 +15,6 @@ from tempfile import mkdtemp
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
 from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.profile import PROFILE
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.simulation.records.record import Record
 
@@ -147,9 +146,7 @@ def new_folder(paths: Iterator[Path]) -> Path:
 
 
 def _present(folder: Path) -> list[Path]:
-    return [
-        folder / name for name in (*FILES, PROFILE, PART, FILM) if os.path.lexists(folder / name)
-    ]
+    return [folder / name for name in (*FILES, PART, FILM) if os.path.lexists(folder / name)]
 
 
 def _check(folder: Path, text: str | None) -> None:

@@ -11,14 +11,13 @@ from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.followed import followed_lines
+from drake_dae.scenario.feasibility.limits import limits_of_run
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.remarks import (
     ball_remarks,
-    departure_remarks,
     limit_remarks,
-    rate_remarks,
     reference_remarks,
     stop_remarks,
     surface_remarks,
@@ -74,6 +73,7 @@ def report_run(
     model, config = loop.plant.model, scenario.integrator
     predicted = loop.predicted_error(record)
     limits = Limits() if model is None else Limits.of(model)
+    exceeded = limits_of_run(loop, record, scenario.friction_cones)
     fixed = loop.plant.time_step or not config.use_error_control
     accuracy = None if fixed else config.accuracy
     reasons = _reasons(scenario, loop, record)
@@ -84,7 +84,11 @@ def report_run(
         record,
         predicted,
         {} if scenario.tolerances is None else scenario.tolerances.outputs,
-        [*shortfalls(record, limits), *map(str, links_in_the_way(loop, record, context))],
+        [
+            *shortfalls(record, limits),
+            *exceeded,
+            *map(str, links_in_the_way(loop, record, context)),
+        ],
         limits.pushing,
         changes,
         is_cut_short=bool(failure) or is_interrupted,
@@ -98,8 +102,6 @@ def report_run(
     lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons, added)]
     lines += _contact_remarks(scenario, loop, record)
     lines += map(str, (*near.distances, *near.speeds))
-    lines += departure_remarks(record, loop.feasible)
-    lines += rate_remarks(record, loop.feasible)
     lines += reference_remarks({**scenario.references, **scenario.exogenous, "task": scenario.task})
     lines += _task_remarks(scenario, changes, statistics)
     lines += [fill(str(line), WIDTH) for line in followed_lines(loop, record, context)]

@@ -22,9 +22,9 @@ from drake_dae.errors import ReferenceSignalError
 class PathReference(FormulaReference):
     """A motion along a path, r(t) = p(s(t - start_time)), from rest to rest.
 
-    s is a `Travel` with `order` continuous derivatives, as many as the law needs; time-optimal
-    motions have two (double S) or one (Drake's Toppra). If the curve makes acceleration or jerk too
-    large, the whole motion is slowed until both are within limits.
+    s is a `Travel` with `order` continuous derivatives, as many as the law needs. If the
+    curve makes acceleration or jerk too large, the whole motion is slowed until both are within
+    limits.
 
     A member has p(s) with |dp/ds| <= 1, for 0 <= s <= `length`.
     """

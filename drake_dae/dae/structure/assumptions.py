@@ -51,8 +51,8 @@ class ViolationKind(Enum):
     )
     NUMBERS = (
         "The structure must be the same for all values of parameters and signals. Give such a "
-        "parameter or signal another default, or give its range by `DaeSystem.with_bounds`; "
-        "equal bounds fix it at its default"
+        "parameter or signal another default, or give its range, by `DaeSystem.with_bounds` or "
+        "`bounds` of a scenario; equal bounds fix it at its default"
     )
     BOUNDS = "Give narrower bounds, which exclude this value"
     CONTROL_RANK = (

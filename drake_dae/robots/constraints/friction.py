@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from drake_dae.arguments import checked
+from drake_dae.arrays import positive
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.presliding import Bristles, Presliding
@@ -93,3 +95,30 @@ def bristles_of(name: str, parameters: Sequence[Parameter]) -> Bristles:
     symbols = {p.name.removeprefix(f"{name}."): p.symbol for p in parameters}
     keys = ("presliding_distance", "static_ratio", "stribeck_speed", "damping_time")
     return Bristles.of([f"{name}.bristle_{axis}" for axis in "xyz"], [symbols[key] for key in keys])
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class FrictionCone:
+    """The limit |tangential force| <= friction * normal force of a contact that must not slide.
+
+    Attributes:
+        normal: The name of the normal force, a constraint force that is positive in contact.
+        tangents: The names of one or two tangential forces.
+        friction: The coefficient of friction, positive.
+
+    Raises:
+        ModelError: The friction is not positive, or there are not one or two tangential forces.
+    """
+
+    normal: str
+    tangents: Sequence[str]
+    friction: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tangents", tuple(self.tangents))
+        positive("friction", self.friction)
+        if not 1 <= len(self.tangents) <= 2:
+            raise ModelError(
+                f"a friction cone has one or two tangential forces, got {len(self.tangents)}"
+            )

@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 
 from drake_dae.analysis.analyze import along, analyze, examine
+from drake_dae.analysis.limits import limits_along
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.reference import common_period
 from drake_dae.dae.structure.structure import Structure, find_structure
@@ -21,12 +22,13 @@ from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
-from drake_dae.scenario.completion.timing import timed
 from drake_dae.scenario.controllers.task_controller import check_task
+from drake_dae.scenario.feasibility.limits import robot_limits
 from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.feasibility.springs import spring_laws
 from drake_dae.scenario.feasibility.task import TaskNeeds, task_needs
+from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.loop import build_loop, exogenous_references
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
 from drake_dae.scenario.observed import law_robot
@@ -117,8 +119,6 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
             sticking=sticking_note(chosen, model, needs.states, needs.constraint_inputs),
         )
     gains = _without_gains(scenario, model, structure)
-    in_time, motion_in_time = timed(scenario, model, structure)
-    scenario = in_time.scenario
     laws = None
     if scenario.is_cascade:
         # The requirements of the links, as if they were rigid.
@@ -146,7 +146,7 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
         identified=[],
         tolerances=None,
     )
-    loop = build_loop(ideal, model, structure, motion=motion_in_time)
+    loop = build_loop(ideal, model, structure)
     context = start_scenario(ideal, loop)
     reference, begin = loop.reference.reference, scenario.integrator.start_time
 
@@ -163,7 +163,11 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
     analysis = along(
         examined or examine(model.dae), reference, times, start, period or None, exogenous
     )
-    motion = analysis.motion
+    motion, slowing = analysis.motion, None
+    if motion is not None and analysis.structure is not None:
+        with at("friction_cones"):
+            limits = robot_limits(model, scenario.friction_cones)
+        slowing = limits_along(analysis.structure, limits, reference, motion)
     return Feasibility(
         analysis,
         scenario.duration,
@@ -177,6 +181,7 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
             else sticking_note(scenario, model, motion.states, motion.constraint_inputs)
         ),
         gains=gains,
+        slowing=slowing,
     )
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from drake_dae.analysis.limits import LimitsAlong
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
@@ -86,6 +87,7 @@ class Feasibility:
         task: The requirements of a task, phase by phase; None without a task.
         sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
         gains: Why no gains can be computed where they are left out, else empty.
+        slowing: How much slower the references keep all limits; None where they keep them.
     """
 
     analysis: Analysis
@@ -100,6 +102,7 @@ class Feasibility:
     task: TaskNeeds | None = None
     sticking: str = ""
     gains: str = ""
+    slowing: LimitsAlong | None = None
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
@@ -120,6 +123,11 @@ class Feasibility:
             *self.wrong_sides,
             *(() if self.task is None else self.task.problems),
             *([self.gains] if self.gains else []),
+            *(
+                []
+                if self.slowing is None
+                else [f"most of all {self.slowing.excess}; {self.slowing.remedy}"]
+            ),
         )
 
     def __repr__(self) -> str:
@@ -147,6 +155,7 @@ class Feasibility:
             "spring_laws": None if self.laws is None else self.laws.to_dict(),
             "task": None if self.task is None else self.task.to_dict(),
             "sticking": self.sticking,
+            "slowing": None if self.slowing is None else asdict(self.slowing),
             "problems": list(self.problems),
         }
 

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 from drake_dae.dae import references
 from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
 from drake_dae.robots import constraints as contact
-from drake_dae.robots.constraints import presliding
+from drake_dae.robots.constraints import friction, presliding
 from drake_dae.robots.surfaces import implicit, maps, plate, surface, surfaces
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
 from drake_dae.scenario.parts import parts as parts
-from drake_dae.scenario.parts import time_optimal, written
+from drake_dae.scenario.parts import written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
 from drake_dae.systems.control import sampling
@@ -97,6 +97,7 @@ Load = Annotated[
 ]
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
+FrictionCone = Annotated[friction.FrictionCone, Form(_WRITTEN)]
 Law = Annotated[parts.Tracking | parts.SpringCascadeForm, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 _Pegs = Annotated[
@@ -116,7 +117,6 @@ Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]
 LargestErrors = Annotated[parts.LargestErrors, Form()]
-Timing = Annotated[time_optimal.TimeOptimal, Form()]
 _Guards = Annotated[
     tuple[Annotated[phases.PhaseGuard, Form()], ...], pydantic.Strict(False)
 ]  # In data a tuple is a list.

@@ -79,7 +79,7 @@ class Tracking:
     Attributes:
         contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
             of forces change within periods of the contact: its deflection is then fed ahead. It
-            needs rigid joints, and references, no task and no `time_optimal`.
+            needs rigid joints, and references, no task.
     """
 
     contact_stiffness: float | None = None

@@ -19,7 +19,6 @@ from drake_dae import (
     DisturbanceObserver,
     ExpressionReference,
     ForceSensor,
-    MotionLimits,
     Observing,
     PointMaterial,
     ReferenceGenerator,
@@ -43,8 +42,6 @@ from drake_dae.systems.cascade.spring_view import SpringView
 from drake_dae.systems.cascade.torque_loop import TorqueLoop
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Packets, Sampling
-from drake_dae.systems.governing.feasible_control import FeasibleControl
-from drake_dae.systems.governing.governor import PathGovernor
 from drake_dae.systems.plants.unilateral.modes import ROUND_OFF
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 from drake_dae.systems.sensing.link import ControlLink
@@ -82,17 +79,6 @@ def references_with_parameters():
     height = SinusoidReference(0.3, 0.3, 1.5)
     force = ExpressionReference(push, {"level": 20.0, "wave": [5.0, 2.0]})
     return ReferenceGenerator([height, force], law("two_link").degrees)
-
-
-def narrow():
-    """Limits that the arm needs more than."""
-    controls = {"joint1_motor": (-60.0, 60.0), "joint2_motor": (-30.0, 30.0)}
-    return MotionLimits(controls, forces={"wall.force": (5.0, None)})
-
-
-def governor(period, of=None):
-    own = references().references
-    return PathGovernor(own, of or law("two_link"), narrow(), 0.4, period)
 
 
 def robot(kind):
@@ -208,13 +194,6 @@ BLOCKS = {
     ),
     "StateSensor with noise": lambda: StateSensor(
         4, 2, Encoders(position_noise=0.1, velocity_noise=0.2), 0.01
-    ),
-    "PathGovernor": lambda: governor(0.0),
-    "PathGovernor with samples": lambda: governor(0.01),
-    "PathGovernor beside an observer": lambda: governor(0.01, found_friction()),
-    "FeasibleControl": lambda: FeasibleControl(arm("two_link").structure, narrow()),
-    "FeasibleControl beside an observer": lambda: FeasibleControl(
-        found_friction().structure, narrow()
     ),
     "ForceSensor with all of it": lambda: ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2], 0.4),
     "ForceSensor that drifts": lambda: ForceSensor(2, 0.02, drift=[0.4, -0.3]),

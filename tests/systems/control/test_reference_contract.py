@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from members import subclasses
-from problems import double_integrator
 from pydrake.systems.framework import LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 from runs import some
@@ -17,9 +16,7 @@ from drake_dae import (
     CsvReference,
     ExpressionReference,
     LineReference,
-    MotionLimits,
     PathLimits,
-    PathTiming,
     PointToPointReference,
     PolylineReference,
     Reference,
@@ -28,10 +25,8 @@ from drake_dae import (
     SinusoidReference,
     SpiralReference,
     SystemReference,
-    TimeOptimalReference,
     TrajectoryReference,
     WaypointsReference,
-    find_structure,
 )
 from drake_dae.dae.references.paced import PacedReference
 from drake_dae.errors import ReferenceSignalError
@@ -55,14 +50,6 @@ class Swing(LeafSystem):
         t = context.get_time()
         sine = [np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)]
         output.SetFromVector([*sine, t**2, 2 * t, 2.0])
-
-
-def moved_mass():
-    """The profile of a mass of 1 kg that moves to and fro with at most 3 N."""
-    system = double_integrator()
-    limits = MotionLimits(controls={system.control_signals[0].name: (-3.0, 3.0)})
-    timing = PathTiming(find_structure(system), limits)
-    return timing.profile([SinusoidReference(0.0, 0.5, 2.0)], 2.0, points=100)
 
 
 MEMBERS = {
@@ -93,7 +80,6 @@ MEMBERS = {
         CsvReference(str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3, tolerance=0.2),
         1.1,
     ),
-    "time-optimal": TimeOptimalReference(moved_mass()),
 }
 
 TIMES = (0.41, 0.93, 1.62)

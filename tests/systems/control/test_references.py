@@ -5,7 +5,7 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
-from arms import arm, law
+from arms import law
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient
 from pydrake.common import RandomDistribution
 from pydrake.math import BsplineBasis
@@ -15,16 +15,12 @@ from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial
 from drake_dae import (
     ConstantReference,
     ExpressionReference,
-    LoopSettings,
     PointToPointReference,
     ReferenceGenerator,
-    RobotPlant,
     SinusoidReference,
     SystemReference,
     TrackingController,
     TrajectoryReference,
-    make_closed_loop,
-    robot_motion_limits,
 )
 from drake_dae.errors import ModelError, NonFiniteError, ReferenceSignalError
 
@@ -326,15 +322,7 @@ def test_wrong_parameters_are_refused():
 
 def test_what_takes_no_parameters_says_so():
     moving = ExpressionReference(lambda t, rise: 0.3 + rise * t, {"rise": 0.1})
-    tracking, chosen = law("two_link"), arm("two_link")
+    tracking = law("two_link")
     generator = ReferenceGenerator([moving, ConstantReference(20.0)], tracking.degrees)
     with pytest.raises(ModelError, match="need a wire from their ReferenceGenerator"):
         TrackingController(tracking, references=generator, feedback=True)
-    limits = robot_motion_limits(chosen.model)
-    with pytest.raises(ModelError, match="a governor takes references without parameters"):
-        make_closed_loop(
-            RobotPlant(chosen.model, structure=chosen.structure),
-            tracking,
-            [moving, ConstantReference(20.0)],
-            LoopSettings(governed=limits),
-        )

@@ -1,11 +1,13 @@
-"""`drake-dae print`, `keys`, `schema`, `explain`, `cache`: scenarios, errors, machine code."""
+"""`drake-dae print`, `schema`, `cache`: scenarios, their keys, machine code."""
 
 import argparse
 import json
+from collections.abc import Iterator, Mapping
+from typing import Any
 
-from drake_dae.arrays import unknown_name
 from drake_dae.errors import MachineCodeError, ScenarioError
-from drake_dae.scenario.manual.remedies import remedies, remedy_section
+from drake_dae.scenario.forms.typed_yaml import TAG
+from drake_dae.scenario.scenario import scenario_schema
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.cache import cache_folder, clear, contents
 from drake_dae.trace.compiler import find_compiler
@@ -19,17 +21,7 @@ def run_command(options: argparse.Namespace) -> int:
     if options.command == "cache":
         _cache(options.clear)
         return 0
-    if options.command == "explain":
-        print(_explained(options.code))
-        return 0
-    # The keys take most of a second to load.
-    from drake_dae.scenario.manual.page import keys_page, named_keys
-    from drake_dae.scenario.manual.schema import editor_schema
-
-    if options.command == "schema":
-        print(json.dumps(editor_schema(), indent=1))
-    else:
-        print(named_keys(options.key) if options.key else keys_page())
+    print(json.dumps(editor_schema(), indent=1))
     return 0
 
 
@@ -48,19 +40,6 @@ def _scenario(options: argparse.Namespace) -> str:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
 
 
-def _explained(code: str) -> str:
-    """What to do about the errors of a code; all codes with their titles if it is empty.
-
-    Raises:
-        ScenarioError: There is no such code.
-    """
-    if not code:
-        return "\n".join(f"{code}  {remedy.title}" for code, remedy in remedies().items())
-    if code.upper() not in remedies():
-        raise ScenarioError(("", unknown_name("code", code, remedies())))
-    return remedy_section(code.upper())
-
-
 def _cache(is_cleared: bool) -> None:
     """Prints the size of the cache of machine code, and the compiler; or empties the cache."""
     files = contents()
@@ -75,3 +54,30 @@ def _cache(is_cleared: bool) -> None:
         print(f"compiler  {' '.join(find_compiler().command)}")
     except MachineCodeError as error:
         print(f"compiler  none: {error}")
+
+
+def editor_schema() -> dict[str, Any]:
+    """`scenario_schema` without the entries "_tag", so that editors complete and check keys.
+
+    An editor passes the value after a tag, so any form fits where a tag chooses.
+    """
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$comment": f"Tags, for an editor: {', '.join(custom_tags())}",
+        **scenario_schema(tags=False),
+        "patternProperties": {"^_": True},
+    }
+
+
+def custom_tags() -> list[str]:
+    """All tags, as the YAML language server takes them: "!Sphere mapping"."""
+    return [f"{tag} mapping" for tag in dict.fromkeys(_tags(scenario_schema()))]
+
+
+def _tags(schema: Mapping[str, Any]) -> Iterator[str]:
+    for value in schema.values():
+        for part in value if isinstance(value, list) else [value]:
+            if isinstance(part, dict):
+                if TAG in part:
+                    yield part[TAG]["const"]
+                yield from _tags(part)
