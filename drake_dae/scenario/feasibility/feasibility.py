@@ -10,6 +10,7 @@ from pydrake.geometry import SceneGraph
 from drake_dae.analysis.analyze import along, analyze, examine
 from drake_dae.analysis.limits import limits_along
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.references.reference import common_period
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
@@ -146,7 +147,10 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
     exogenous = exogenous_references(
         scenario, loop.plant.dae, loop.controller.law.exogenous_degrees
     )
-    analysis = along(examined or examine(model.dae), reference, times, start, exogenous)
+    period = common_period([r.repeats for r in (*loop.reference.references, *exogenous)])
+    analysis = along(
+        examined or examine(model.dae), reference, times, start, period or None, exogenous
+    )
     motion, slowing = analysis.motion, None
     if motion is not None and analysis.structure is not None:
         with at("friction_cones"):
