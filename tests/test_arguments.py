@@ -22,7 +22,6 @@ import pytest
 from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from latches import carts, hand_over
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
@@ -56,7 +55,7 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.results import Outcome, RunResult
+from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.task.phases import Phase
 from drake_dae.trace.functions import TracedFunction
@@ -247,7 +246,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Reaction: lambda: Reaction(ca.SX(2, 1)),
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
     RigidTransform: RigidTransform,
-    RunResult: lambda: RunResult(0, Outcome.FINISHED, figures={"steps": 1.0}),
+    RunResult: lambda: RunResult(Outcome.FINISHED, figures={"steps": 1.0}),
     SceneGraph: SceneGraph,
     Scenario: scenario,
     SimulatorConfig: fixed_step,
@@ -319,8 +318,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "law of TaskController": lambda: laws()[0],
     "free_law": lambda: laws()[1],
     "force of open_contact": lambda: "wall.force",
-    "plan of laws_of_latches": lambda: hand_over().plan,
-    "system of laws_of_latches": lambda: carts().dae,
     "system of open_contact": lambda: arm("two_link").model.dae,
     "outputs of TaskController.rest_state": lambda: [0.3, 0.02],
     "name of TaskController.set_parameter": lambda: "wall.position",

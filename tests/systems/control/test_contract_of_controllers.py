@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from arms import arm, error_controlled, fixed_step, law
 from members import RestingController
-from polishing import laws, polisher, task_loop
+from polishing import PERIOD, laws, soft_wall, task_loop
 
 from drake_dae import (
     Approach,
@@ -21,7 +21,6 @@ from drake_dae import (
     Tolerances,
     TrackingController,
     TrackingLaw,
-    UnilateralRobotPlant,
     poles,
     simulate,
     wire_loop,
@@ -41,7 +40,7 @@ def integrating():
 
 
 def task():
-    return TaskController(Task([Approach(), Press(20.0)]), *laws())
+    return TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=PERIOD)
 
 
 MEMBERS = {
@@ -55,7 +54,7 @@ MEMBERS = {
 def robot(controller):
     """The plant that a controller is for, and its state at rest at the goals."""
     if controller.takes_over:
-        return UnilateralRobotPlant(polisher(), {"wall": 0.0}), None
+        return soft_wall(), None
     q = arm("two_link").model.configuration([0.3], [1.2, -1.6])
     found, state = arm("two_link"), [*q, 0.0, 0.0]
     return RobotPlant(found.model, structure=found.structure), state
