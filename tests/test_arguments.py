@@ -23,7 +23,6 @@ from actuated import actuated
 from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from latches import carts, hand_over
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
@@ -340,8 +339,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "law of TaskController": lambda: laws()[0],
     "free_law": lambda: laws()[1],
     "force of open_contact": lambda: "wall.force",
-    "plan of laws_of_latches": lambda: hand_over().plan,
-    "system of laws_of_latches": lambda: carts().dae,
     "system of open_contact": lambda: arm("two_link").model.dae,
     "outputs of TaskController.rest_state": lambda: [0.3, 0.02],
     "name of TaskController.set_parameter": lambda: "wall.position",

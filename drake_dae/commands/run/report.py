@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from textwrap import fill
 from typing import Any
 
 from pydrake.systems.framework import Context
@@ -10,7 +9,6 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.followed import followed_lines
 from drake_dae.scenario.feasibility.limits import limits_of_run
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
@@ -24,7 +22,7 @@ from drake_dae.simulation.remarks import (
     touch_remarks,
 )
 from drake_dae.simulation.simulate import RunStatistics
-from drake_dae.simulation.summary import WIDTH, Limits, shortfalls, summary
+from drake_dae.simulation.summary import Limits, shortfalls, summary
 from drake_dae.simulation.verdict import TrackingResult, as_data, judge
 from drake_dae.systems.control.phase_change import PhaseChange
 
@@ -104,7 +102,6 @@ def report_run(
     lines += map(str, (*near.distances, *near.speeds))
     lines += reference_remarks({**scenario.references, **scenario.exogenous, "task": scenario.task})
     lines += _task_remarks(scenario, changes, statistics)
-    lines += [fill(str(line), WIDTH) for line in followed_lines(loop, record, context)]
     is_unexplained = verdict.tracking is TrackingResult.OFF and not reasons
     data = {
         "missed": job.outcome is JobOutcome.BAD or is_unexplained,

@@ -10,6 +10,7 @@ from pydrake.geometry import SceneGraph
 from drake_dae.analysis.analyze import along, analyze, examine
 from drake_dae.analysis.limits import limits_along
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.references.reference import common_period
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
@@ -23,10 +24,8 @@ from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.limits import robot_limits
-from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.feasibility.springs import spring_laws
-from drake_dae.scenario.feasibility.task import TaskNeeds, task_needs
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.loop import build_loop, exogenous_references
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
@@ -100,24 +99,14 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
         if scenario.task is None and not scenario.is_cascade:
             examined = examine_scenario(model)
         if examined is None or examined.structure is None or examined.problems:
-            structure = scenario_structure(model, scenario.task)
+            structure = scenario_structure(model)
         else:
             structure = examined.structure
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    if scenario.task is not None:
-        chosen = paced(advised(scenario, model, structure).scenario, model, structure).scenario
-        needs = task_needs(chosen, model, structure)
-        behind = _in_the_way(needs, model, scene_graph)
-        return Feasibility(
-            analyze(structure.system),
-            scenario.duration,
-            *_ranges(needs, model),
-            behind=behind,
-            task=needs,
-            sticking=sticking_note(chosen, model, needs.states, needs.constraint_inputs),
-        )
     gains = _without_gains(scenario, model, structure)
+    if scenario.task is not None:
+        return Feasibility(analyze(model.dae), scenario.duration, gains=gains)
     laws = None
     if scenario.is_cascade:
         # The requirements of the links, as if they were rigid.
@@ -158,7 +147,10 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
     exogenous = exogenous_references(
         scenario, loop.plant.dae, loop.controller.law.exogenous_degrees
     )
-    analysis = along(examined or examine(model.dae), reference, times, start, exogenous)
+    period = common_period([r.repeats for r in (*loop.reference.references, *exogenous)])
+    analysis = along(
+        examined or examine(model.dae), reference, times, start, period or None, exogenous
+    )
     motion, slowing = analysis.motion, None
     if motion is not None and analysis.structure is not None:
         with at("friction_cones"):
@@ -230,7 +222,7 @@ def sample_times(
 
 
 def _in_the_way(
-    motion: PinnedMotion | TaskNeeds, model: RobotModel, scene_graph: SceneGraph
+    motion: PinnedMotion, model: RobotModel, scene_graph: SceneGraph
 ) -> tuple[LinkBehind | Collision, ...]:
     """The links that move behind a surface, and those that collide."""
     shapes, along = LinkShapes(model, scene_graph), (motion.times, motion.states)
@@ -240,7 +232,7 @@ def _in_the_way(
     return behind + collisions(shapes, *along)
 
 
-def _ranges(motion: PinnedMotion | TaskNeeds, model: RobotModel) -> _Ranges:
+def _ranges(motion: PinnedMotion, model: RobotModel) -> _Ranges:
     """The controls, joint forces, constraint forces and joints of a `Feasibility`."""
     dae, limits = model.dae, Limits.of(model)
     if not motion.times.size:
@@ -273,7 +265,7 @@ def _ranges(motion: PinnedMotion | TaskNeeds, model: RobotModel) -> _Ranges:
     return controls, joint_forces, constraint_forces, limited
 
 
-def _forces(dae: DaeSystem, motion: PinnedMotion | TaskNeeds) -> FloatArray:
+def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
     """All constraint forces at each state, shape (k, M), as `constraint_force` of a plant."""
     if dae.sharing is None:
         return motion.constraint_inputs

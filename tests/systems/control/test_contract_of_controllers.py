@@ -5,7 +5,7 @@ import pytest
 from actuated import actuated, at_rest
 from arms import arm, error_controlled, fixed_step, law
 from members import RestingController
-from polishing import laws, polisher, task_loop
+from polishing import PERIOD, laws, soft_wall, task_loop
 
 from drake_dae import (
     Approach,
@@ -24,7 +24,6 @@ from drake_dae import (
     Tolerances,
     TrackingController,
     TrackingLaw,
-    UnilateralRobotPlant,
     link_side,
     poles,
     simulate,
@@ -45,7 +44,7 @@ def integrating():
 
 
 def task():
-    return TaskController(Task([Approach(), Press(20.0)]), *laws())
+    return TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=PERIOD)
 
 
 def cascade():
@@ -66,7 +65,7 @@ MEMBERS = {
 def robot(controller):
     """The plant that a controller is for, and its state at rest at the goals."""
     if controller.takes_over:
-        return UnilateralRobotPlant(polisher(), {"wall": 0.0}), None
+        return soft_wall(), None
     q = arm("two_link").model.configuration([0.3], [1.2, -1.6])
     found, state = arm("two_link"), [*q, 0.0, 0.0]
     if controller.observed is not None:
