@@ -49,7 +49,6 @@ from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
 from .dae.tracking.gains import gain_matrices as gain_matrices
 from .dae.tracking.gains import poles as poles
-from .dae.tracking.impedance import impedance_gains as impedance_gains
 from .dae.tracking.tracking import TrackingLaw as TrackingLaw
 from .dae.zero_dynamics.zero_dynamics import ZeroDynamics as ZeroDynamics
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop

@@ -57,7 +57,7 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.results import Outcome, RunResult
+from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.task.phases import Phase
 from drake_dae.trace.functions import TracedFunction
@@ -268,7 +268,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Reaction: lambda: Reaction(ca.SX(2, 1)),
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
     RigidTransform: RigidTransform,
-    RunResult: lambda: RunResult(0, Outcome.FINISHED, figures={"steps": 1.0}),
+    RunResult: lambda: RunResult(Outcome.FINISHED, figures={"steps": 1.0}),
     SceneGraph: SceneGraph,
     Scenario: scenario,
     SimulatorConfig: fixed_step,

@@ -190,7 +190,7 @@ def _law(scenario: Scenario, structure: Structure, latency: float) -> TrackingLa
         assert scenario.gains is not None  # advised.
         return TrackingLaw(
             structure.system,
-            scenario.gains.design(structure),
+            scenario.gains.design(),
             structure=structure,
             measured_force=force.is_measured,
             force_gain=force.gain,

@@ -5,7 +5,6 @@ between several classes is written with the name as a tag, for example `surface:
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -16,7 +15,6 @@ from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
 from drake_dae.dae.beyond.spring_loop import SpringLoop
-from drake_dae.errors import ScenarioError
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -25,7 +23,6 @@ from drake_dae.scenario.forms.values import Interval
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
     Constraint,
-    Damping,
     DisturbanceForce,
     Encoders,
     Force,
@@ -183,7 +180,7 @@ class Scenario:
     law: Law | None = None
     gains: Gains | None = None
     integral: list[str] | None = None
-    constraint_damping: Damping | None = None
+    constraint_damping: Gains | None = None
     observer: Observer | None = None
     identified: list[str] = field(default_factory=list)
     largest_roughness: float | None = None
@@ -246,13 +243,6 @@ class Scenario:
         ) == scenario_reader().write(other)
 
 
-_FILLED_IN = ("law", "gains", "integral", "plant")
-"""The keys on which it depends what a scenario fills in."""
-
-_NEW = object()
-"""No part of a scenario."""
-
-
 @cache
 def scenario_reader(keys: tuple[str, ...] = ()) -> Reader[Scenario]:
     """The reader and writer of scenarios as plain data, of some keys or of all."""
@@ -280,33 +270,15 @@ def scenario_data(scenario: Scenario, keys: tuple[str, ...] = ()) -> dict[str, A
     return dict(scenario_reader(keys).write(scenario))
 
 
-def read_scenario(
-    data: Mapping[str, Any], folder: Path | None = None, known: dict[Any, Any] | None = None
-) -> Scenario:
+def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
     """Makes a scenario from plain data, with the paths of its robot unchanged.
 
     Args:
         data: Plain data.
         folder: The folder of relative file names; None for the working directory.
-        known: A cache for many scenarios with most parts in common. Parts that are the same objects
-            as in the data before are not read again; the parts of this scenario are added.
 
     Raises:
         ScenarioError: Keys are unknown or missing, or values are not valid; all problems are
             listed.
     """
-    if known is None:
-        return scenario_reader().read(data, folder)
-    last, before = known.get("last", ({}, None))
-    changed = {key: part for key, part in data.items() if last.get(key, _NEW) is not part}
-    scenario = None
-    if last.keys() == data.keys() and changed.keys().isdisjoint(_FILLED_IN):
-        with suppress(ScenarioError):  # The whole reader lists all problems.
-            read = scenario_reader().read_part
-            parts = {key: read(key, part, folder, known) for key, part in changed.items()}
-            scenario = object.__new__(Scenario)  # Nothing else is to be checked or filled in.
-            vars(scenario).update(vars(before) | parts)
-    if scenario is None:
-        scenario = scenario_reader().read(data, folder, known)
-    known["last"] = data, scenario
-    return scenario
+    return scenario_reader().read(data, folder)

@@ -85,7 +85,7 @@ def test_a_sweep_follows_each_length_as_a_run_does(is_rolled, tmp_path):
     (tmp_path / "wall.yaml").write_text(WALL)
     lengths = {"task.phases.2.length": [0.05, 0.02]}
     chosen = load_scenario(tmp_path / "wall.yaml", ["duration=1.8"])
-    file = tmp_path / "runs.jsonl"
+    file = tmp_path / "runs.db"
     study = sweep(chosen, grid_variations(lengths), file, workers=1, rollout=is_rolled)
     assert study.table()["outcome"] == ["finished", "finished"]
     settings = ["duration=1.8", "task.phases.2.length=0.02"]

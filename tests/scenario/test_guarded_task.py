@@ -124,7 +124,7 @@ def test_a_sweep_varies_a_guard(file, tmp_path):
     key = "task.phases.1.guards.0.most"
     chosen = load_scenario(file, ["task.phases.1.tolerance=3", "duration=0.46"])
     variations = grid_variations({key: [9.0, 40.0]})
-    study = sweep(chosen, variations, tmp_path / "runs.jsonl", workers=1, rollout=True)
+    study = sweep(chosen, variations, tmp_path / "runs.db", workers=1, rollout=True)
     held, pressed = study.values("largest wall.force [N]")
     assert 9.0 < held < 9.5
     assert_allclose(pressed, 10.0, atol=0.1)

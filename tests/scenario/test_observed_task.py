@@ -182,7 +182,7 @@ def test_a_study_varies_the_noise_that_a_task_knows(file, tmp_path):
     name = "force_feedback.noise_deviation"
     chosen = load_scenario(file, ["duration=0.4"])
     variations = grid_variations({name: [0.1, 0.3]})
-    study = sweep(chosen, variations, tmp_path / "runs.jsonl", workers=1, rollout=True)
+    study = sweep(chosen, variations, tmp_path / "runs.db", workers=1, rollout=True)
     for k, noise in enumerate((0.1, 0.3)):
         alone = rolled(file, tmp_path, "duration=0.4", f"{name}={noise}")
         largest = np.max(np.abs(alone["tracking_error"][:, 1]))

@@ -1,6 +1,6 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import isfinite
 
 import casadi as ca
@@ -67,16 +67,12 @@ class Manifold(Residual):
         self,
         state: ArrayLike,
         parameters: ArrayLike | None = None,
-        crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
         """Returns the consistent state next to a state, to round-off, by Newton's method.
 
         Args:
             state: A state near N*, shape (n,).
             parameters: Values of all parameters; the defaults if None.
-            crosses: A function that returns whether the motion crosses a singular configuration
-                close to a state. The projection then ignores the directions in which the
-                constraints lose their rank. None without singular configurations.
 
         Returns:
             The consistent state, shape (n,).
@@ -86,15 +82,13 @@ class Manifold(Residual):
             ModelError: The state has a wrong shape.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
-        return self.projected(start, p, crosses)
+        return self.projected(start, p)
 
-    def projected(
-        self, start: FloatArray, p: FloatArray, crosses: Callable[[FloatArray], bool] | None = None
-    ) -> FloatArray:
+    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
         moved = self.first_steps(start, p)
         if moved is None:
-            return self.searched(start, p, crosses)
+            return self.searched(start, p)
         return moved if moved is start else moved.copy()
 
     def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:

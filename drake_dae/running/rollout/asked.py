@@ -116,15 +116,11 @@ def record_of(
     after: float | None = None,
     context: Context | None = None,
 ) -> Record:
-    """Returns the record of a run, or of its rows after a time in s.
-
-    The rows may be those of several runs with the same times, shape (runs, k, width).
-    """
-    times = times[: rows.shape[-2]]
+    """Returns the record of a run, or of its rows after a time in s."""
+    times = times[: len(rows)]
     first = 0 if after is None else int(np.searchsorted(times, after, side="right"))
-    columns, stop, signals = by_columns(rows[..., first:, :]), 0, {}
+    columns, stop, signals = by_columns(rows[first:]), 0, {}
     for name, entries in program.signals.items():
         start, stop = stop, stop + len(entries)
-        values = np.swapaxes(columns[..., start:stop, :], -1, -2)
-        signals[name] = recorded_values(values, tuple(entries))
+        signals[name] = recorded_values(columns[start:stop].T, tuple(entries))
     return program.complete(computed_record(times[first:], signals), context)

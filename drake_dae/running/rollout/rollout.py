@@ -20,7 +20,7 @@ from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
-from drake_dae.running.rollout.lanes.batch import run_briefly, run_many
+from drake_dae.running.rollout.lanes.batch import run_many
 from drake_dae.running.rollout.lanes.library import Lanes
 from drake_dae.running.rollout.problems import Problems, problems_of
 from drake_dae.running.rollout.program import MAKING, RolloutProgram
@@ -28,7 +28,6 @@ from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
 from drake_dae.simulation.records.record import Record, RecordAfter
-from drake_dae.simulation.records.together import RunsTogether
 from drake_dae.trace.compiled import Compiled
 
 SEVERAL = 8
@@ -157,42 +156,6 @@ def run_loop(
         for index, run in zip(indices.tolist(), runs, strict=True):
             rollouts[index] = _rollout(request.program, problems, index, run)
     return [rollouts[index] for index in range(len(problems))]
-
-
-def run_together(
-    loop: ClosedLoop,
-    starts: ArrayLike,
-    parameters: ArrayLike,
-    times: ArrayLike,
-    *,
-    config: SimulatorConfig,
-    seeds: Sequence[Seed],
-    lasting: float,
-) -> list[RunsTogether]:
-    """Runs a loop from several starts at once, in the vector registers of one core.
-
-    The arguments are those of `run_loop`.
-
-    Returns:
-        The runs that reached their end. Others fail, take more than `USUAL` steps, or have no
-        machine code for several runs at once; use `run_loop` for these starts.
-
-    Raises:
-        InconsistentStateError: A start is not on N*.
-    """
-    request = RolloutRequest.of(loop, times, config, None, lasting)
-    problems = problems_of(request.program, starts, parameters, request.times, seeds)
-    together = []
-    for program, indices in _kinds(request.program, problems):
-        lanes = request.lanes(program, len(problems))
-        if lanes is None:
-            continue
-        some = problems.chosen(indices)
-        done, steps, rows = run_briefly(lanes, program, some, request.settings, USUAL)
-        if done.size:
-            record = record_of(request.program, problems.times, rows)
-            together.append(RunsTogether(indices[done].tolist(), record, steps))
-    return together
 
 
 def _kinds(program: RolloutProgram, problems: Problems) -> list[tuple[RolloutProgram, np.ndarray]]:

@@ -10,7 +10,6 @@ from drake_dae.robots.constraints.points import PointOnSurface
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.plate import Plate
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.parts.parts import Impedance
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.task.contacts.laws import laws_of_latches
 from drake_dae.systems.task.contacts.open_contact import open_contact
@@ -30,10 +29,6 @@ def check_task(scenario: Scenario) -> None:
     if (task := scenario.task) is not None:
         names = [name for name in task.make().signals if name not in task.signals]
         problems += [(f"task.signals.{name}", "needed: a phase waits for it") for name in names]
-        gains = {"gains": scenario.gains, "task.gains": task.gains}
-        text = "an !Impedance is not for a task with latches; give !Poles or !Coefficients"
-        if task.make().plan.latches:
-            problems += [(key, text) for key, own in gains.items() if isinstance(own, Impedance)]
         ending = [c.name for c in scenario.constraints if isinstance(c, Constraint) and c.ends]
         entering = [phase.name for phase in task.phases if phase.enters_holes]
         if ending and entering and not scenario.plant.has_sides:
@@ -137,7 +132,7 @@ def task_controller(
         free_system = open_contact(law.system, forces)
     with at("task.gains" if task.gains else "gains"):
         structure = find_structure(free_system)
-        gains = (task.gains or scenario.gains).design(structure)
+        gains = (task.gains or scenario.gains).design()
         free_law = TrackingLaw(free_system, gains, structure=structure, latency=law.latency)
     with at("task"):
         # The noise of the sum over the points.
@@ -153,8 +148,6 @@ def _latched(
     task = scenario.task
     assert task is not None
     assert scenario.gains is not None
-    assert not isinstance(scenario.gains, Impedance)
-    assert not isinstance(task.gains, Impedance)
     if task.contact:
         text = "its phases name the latches that they open and close; leave it out"
         raise ScenarioError(("task.contact", text))

@@ -144,5 +144,4 @@ Phase = Annotated[
     Choice(_PHASE_DATA),
 ]
 Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase], **_BY_NAME})]
-Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices | parts.Impedance, Choice()]
-Damping = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
+Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]

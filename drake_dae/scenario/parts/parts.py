@@ -7,9 +7,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import positive
 from drake_dae.dae.beyond.spring_loop import DAMPING, SpringLoop
-from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
-from drake_dae.dae.tracking.impedance import impedance_gains
 from drake_dae.errors import GainError, ModelError
 from drake_dae.scenario.forms.values import Numbers
 from drake_dae.systems.observing.observer_rates import Observing
@@ -188,7 +186,7 @@ class Poles(PerOutput):
         outputs: Output name -> its poles, in 1/s; "*" is all others. Only without `all`.
     """
 
-    def design(self, structure: Structure | None = None) -> GainDesign:
+    def design(self) -> GainDesign:
         """The design of the gains."""
         return poles(self.all or self.outputs)
 
@@ -203,7 +201,7 @@ class Coefficients(PerOutput):
             `all`.
     """
 
-    def design(self, structure: Structure | None = None) -> GainDesign:
+    def design(self) -> GainDesign:
         """The design of the gains."""
         return gain_coefficients(self.all or self.outputs)
 
@@ -224,33 +222,9 @@ class Matrices:
             if len({len(row) for row in matrix}) != 1:
                 raise GainError(f"groups: the rows of {matrix} have different lengths")
 
-    def design(self, structure: Structure | None = None) -> GainDesign:
+    def design(self) -> GainDesign:
         """The design of the gains."""
         return gain_matrices(*self.groups)
-
-
-@dataclass(frozen=True)
-class Impedance:
-    """Gains by which some outputs yield to forces as springs and dampers; see `impedance_gains`.
-
-    A hole then turns and moves a peg in the same way on any robot. The gains are those at the
-    start. It is for rigid joints, and not for a task with latches.
-
-    Attributes:
-        stiffness: Output name -> its stiffness, in N/m for an output in m, in N m/rad for one in
-            rad, in N m for a component of an axis.
-        damping_ratio: The damping ratio of these outputs.
-        poles: Name of another output -> its poles, in 1/s; "*" is all others.
-    """
-
-    stiffness: dict[str, float]
-    damping_ratio: float = 1.0
-    poles: dict[str, list[float]] = field(default_factory=dict)
-
-    def design(self, structure: Structure) -> GainDesign:
-        """The design of the gains, for the law with this structure."""
-        rest = poles(self.poles) if self.poles else None
-        return impedance_gains(structure, self.stiffness, self.damping_ratio, rest)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from drake_dae.arrays import positive, unknown_name
 from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
 from drake_dae.scenario.forms.forms import Choice, Form
-from drake_dae.scenario.parts.parts import Coefficients, Impedance, Matrices, Poles
+from drake_dae.scenario.parts.parts import Coefficients, Matrices, Poles
 from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.phases.plan import named
 from drake_dae.systems.task.task import Task
@@ -81,7 +81,7 @@ class ScenarioTask:
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
     pace: Mapping[str, float] = field(default_factory=dict)
     within_limits: Annotated[WithinLimits, Form()] | None = None
-    gains: Annotated[Poles | Coefficients | Matrices | Impedance, Choice()] | None = None
+    gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
 
     def __post_init__(self) -> None:
         signals = self.make().signals

@@ -82,9 +82,7 @@ def _control_along(
 ) -> FloatArray:
     """The control of a continuous law, as a function of the other signals."""
     plant, controller, law = loop.plant, loop.controller, loop.controller.law
-    of_plant = inputs["parameters"]
     gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
-    motion = plant.motion_under(law.function) if gains is not None else None
     if gains is None:
         gains = _parameters_along(loop, controller, context, times)
     if law.measured_force and "measured_force" not in inputs:
@@ -95,16 +93,7 @@ def _control_along(
             else np.zeros((times.size, plant.dae.num_constraints))
         )
     inputs["parameters"] = gains
-    if motion is None or not motion.is_machine_code:
-        return function_along(law.function, inputs)
-
-    def without_plant(moment: tuple[FloatArray, ...]) -> tuple[FloatArray, ...] | None:
-        """The control at times at which the plant cannot be evaluated."""
-        values = law.function.evaluate(*moment[:3])
-        return values if law.function.is_valid else None
-
-    # Uses the machine code of plant and law, instead of compiling the law by itself.
-    return function_along(motion, {**inputs, "law": gains, "plant": of_plant}, without_plant)
+    return function_along(law.function, inputs)
 
 
 def _parameters_along(

@@ -65,8 +65,7 @@ class RunProgress:
             state is a trial.
         state: The continuous state of the block then; empty if it has none.
         failures: The number of failed trials since then.
-        reason: The message of the earliest of them.
-        reason_time: The time of that trial, in s.
+        reason: The error of the earliest of them.
         start: The start of the simulation, in s.
         steps: The number of accepted steps.
         mark: The time after the last `PACE_STEPS` steps, in s.
@@ -79,8 +78,7 @@ class RunProgress:
     time: float = inf
     state: FloatArray = field(default_factory=lambda: np.zeros(0))
     failures: int = 0
-    reason: str = ""
-    reason_time: float = inf
+    reason: SimulationError | None = None
     start: float = 0.0
     steps: int = 0
     mark: float = 0.0
@@ -132,12 +130,13 @@ class StepWatch:
             raise error from None
         progress.failures += 1
         # A state that is not finite is the consequence of another failure.
-        if error.time < progress.reason_time and np.isfinite(error.state).all():
-            progress.reason, progress.reason_time = str(error), error.time
+        earliest = inf if progress.reason is None else progress.reason.time
+        if error.time < earliest and np.isfinite(error.state).all():
+            progress.reason = error
         if step > SHORTEST * abs(error.time) and progress.failures < FAILURES:
             return
         raise no_step_leads_on(
-            self._system.get_name(), progress.time, progress.state.copy(), error, progress.reason
+            self._system.get_name(), progress.time, progress.state.copy(), progress.reason or error
         ) from None
 
     def parameters_along(self, context: Context, times: FloatArray) -> FloatArray:
@@ -204,7 +203,7 @@ class StepWatch:
                 self._check_pace(progress, time)
         progress.time = time
         if progress.failures:
-            progress.failures, progress.reason, progress.reason_time = 0, "", inf
+            progress.failures, progress.reason = 0, None
         return _DONE
 
     def _check_pace(self, progress: RunProgress, time: float) -> None:

@@ -17,6 +17,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.shared_forces import manifold_of_left_out
+from drake_dae.dae.structure.singular import dependent_constraints
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError, SingularityError
 from drake_dae.systems.blocks.along import function_along
@@ -26,6 +27,7 @@ from drake_dae.systems.blocks.failures import (
     jammed_contact,
     off_manifold,
     off_start,
+    singular_configuration,
 )
 from drake_dae.systems.blocks.feedback import Feedback
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
@@ -33,7 +35,6 @@ from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, wea
 from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.crossing import Crossing
 from drake_dae.systems.plants.law_input import LawInput
 from drake_dae.systems.plants.traced_plant import traced_plant
 from drake_dae.trace.functions import TracedFunction
@@ -73,11 +74,8 @@ class DaePlant(ParameterizedSystem, Plant):
         controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
             zero.
 
-    The motion passes through isolated singular configurations, where gradients of constraints are
-    dependent, along the branch of N* of its velocity; see `Passage`. Within 1e-3 of it (the sine of
-    an angle between gradients) `constraint_force` and `controlled_output` are without their
-    unbounded components. If no continuation is determined, as at rest, and always with friction,
-    exogenous signals or shared forces, A(x) is singular and an error is raised.
+    A run ends at a singular configuration, where gradients of constraints become dependent; the
+    error names them.
 
     At a trial state of an integrator, missing values are nan, and error control takes a shorter
     step. At an accepted state, or if no step is short enough, an error is raised.
@@ -133,18 +131,15 @@ class DaePlant(ParameterizedSystem, Plant):
         force = system.forces(constraint_input)
         self._is_controlled = system.num_controls > 0
         rate = derivatives.expand(derivatives.rate)
-        self._crossing = Crossing(structure)
-        self._otherwise, doubt = self._crossing.values, self._crossing.doubt
-        self.dynamics = structure.trace("dynamics", rate, self._is_controlled, doubt)
-        self._force = structure.trace("constraint force", force, elimination.beta.nnz() > 0, doubt)
+        self.dynamics = structure.trace("dynamics", rate, self._is_controlled)
+        self._force = structure.trace("constraint force", force, elimination.beta.nnz() > 0)
         needs_control = elimination.n_star.nnz() > 0
-        self._output = structure.trace("controlled output", output, needs_control, doubt)
+        self._output = structure.trace("controlled output", output, needs_control)
         self.functions: dict[str, TracedFunction] = {
             "constraint_force": self._force,
             "constraint_residual": structure.manifold.residual_function,
             "controlled_output": self._output,
         }
-        self._crossing.stands_in_for(self.dynamics, self._force, self._output)
 
         self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
@@ -274,16 +269,7 @@ class DaePlant(ParameterizedSystem, Plant):
         for name in function.input_names:
             if name not in given or np.shape(given[name])[1:] != (sizes[name],):
                 raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {sizes[name]})")
-        return function_along(
-            function, given, lambda at: self._crossing.values(function, at[0], at[1:-1], at[-1])
-        )
-
-    def _crosses(self, state: FloatArray, context: Context) -> bool:
-        """Whether the system passes a singular configuration near a state."""
-        control = self._control(context) if self._is_controlled else np.zeros(0)
-        if control is None:
-            return False
-        return self._crossing.happens(state, control, self._values(context))
+        return function_along(function, given)
 
     @checked(ModelError)
     def explained(
@@ -293,9 +279,13 @@ class DaePlant(ParameterizedSystem, Plant):
         *inputs: FloatArray,
         held: FloatArray | None = None,
     ) -> SimulationError:
-        """Returns in a Painleve paradox the error with its outcome."""
-        is_known = isinstance(error, SingularityError) and (inputs or not self._is_controlled)
-        if not (self.dae.frictional_contacts and is_known):
+        """Returns the error with dependent constraints, or in a Painleve paradox its outcome."""
+        if not isinstance(error, SingularityError):
+            return error
+        if not self.dae.frictional_contacts:
+            names = dependent_constraints(self.structure, error.state, parameters)
+            return singular_configuration(self.dae.name, error.time, error.state, names)
+        if not inputs and self._is_controlled:
             return error
         control = inputs[0] if self._is_controlled else np.zeros(0)
         taken = (control,) if "control" in self._force.input_names else ()
@@ -369,9 +359,7 @@ class DaePlant(ParameterizedSystem, Plant):
         projected = manifold.first_steps(x, parameters)
         if projected is None:
             try:
-                projected = manifold.searched(
-                    x, parameters, lambda near: self._crosses(near, context)
-                )
+                projected = manifold.searched(x, parameters)
             except InconsistentStateError as error:
                 raise off_manifold(context.get_time(), x.copy(), error) from error
         if projected is x:

@@ -36,7 +36,7 @@ from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
-from drake_dae.studies.results import Outcome
+from drake_dae.studies.runs import Outcome
 from drake_dae.systems.plants.contract import Plant
 
 FINE = 1e-10
@@ -295,7 +295,7 @@ def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monk
     found = []
     for kind in ("!OwnPlant {maker: 'members:SpringyPlant'}", "!IdealConstraints {}"):
         scenario = load_scenario(path, [*settings, f"plant={kind}"])
-        study = sweep(scenario, changes, tmp_path / f"{len(found)}.jsonl", workers=1)
+        study = sweep(scenario, changes, tmp_path / f"{len(found)}.db", workers=1)
         assert {run.outcome for run in study.results} == {Outcome.FINISHED}, study.results
         found.append([run.figures["largest error of tool.z [m]"] for run in study.results])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-5)

@@ -64,25 +64,6 @@ def run_many(
     return batch.ended(partial(go_on, code), num_cores())
 
 
-def run_briefly(
-    lanes: Lanes, program: RolloutProgram, problems: Problems, settings: Settings, most: int
-) -> tuple[np.ndarray, list[int], FloatArray]:
-    """Runs a diagram many times, on one core.
-
-    Args:
-        lanes, program, problems, settings: As of `run_many`.
-        most: The number of steps after which a run does not continue.
-
-    Returns:
-        The indices of the runs that end side by side, and their steps and rows.
-    """
-    batch = RunBatch(program, problems, settings, most, lanes.constants)
-    lanes.code.run_lanes(ctypes.byref(batch.structure()))
-    done, rows = np.flatnonzero(batch.arrays["endings"] == 0), batch.arrays["rows"]
-    steps = [RunState.from_buffer(batch.arrays["runs"][index]).steps for index in done]
-    return done, steps, rows if done.size == len(rows) else rows[done]
-
-
 class RunBatch:
     """Runs that go side by side.
 
