@@ -19,11 +19,9 @@ from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 import casadi as ca
 import numpy as np
 import pytest
-from actuated import actuated
 from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from latches import carts, hand_over
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
@@ -91,16 +89,6 @@ def observed_law() -> dd.TrackingLaw:
 
 
 @cache
-def springy() -> dd.RobotModel:
-    return actuated("two_link", "flexible").model
-
-
-@cache
-def links_law() -> dd.TrackingLaw:
-    return dd.TrackingLaw(dd.link_side(springy()).dae, dd.poles(-4.0))
-
-
-@cache
 def observer() -> dd.DisturbanceObserver:
     return dd.DisturbanceObserver(observed_law(), dd.Observing(10.0), 0.01)
 
@@ -108,11 +96,6 @@ def observer() -> dd.DisturbanceObserver:
 @cache
 def estimator() -> dd.StateEstimator:
     return dd.StateEstimator(observed_law(), dd.Observing(10.0, state_rate=40.0), 0.01)
-
-
-@cache
-def cascade() -> dd.SpringCascade:
-    return dd.SpringCascade(links_law(), springy(), dd.SpringLoop(60.0, motor_rate=60.0), 0.01)
 
 
 def sensed() -> dd.SensedContact:
@@ -224,11 +207,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.DisturbanceObserver: observer,
     dd.StateEstimator: estimator,
     dd.SensedContact: sensed,
-    dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
-    dd.SpringCascade: cascade,
-    "law of SpringCascade": links_law,
-    "model of SpringCascade": springy,
-    "model of link_side": springy,
     "end": lambda: 0.5,
     dd.SensorNoise: lambda: dd.SensorNoise(),
     dd.AdvisedGains: lambda: dd.advised_gains(sensed(), 1.0),
@@ -340,8 +318,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "law of TaskController": lambda: laws()[0],
     "free_law": lambda: laws()[1],
     "force of open_contact": lambda: "wall.force",
-    "plan of laws_of_latches": lambda: hand_over().plan,
-    "system of laws_of_latches": lambda: carts().dae,
     "system of open_contact": lambda: arm("two_link").model.dae,
     "outputs of TaskController.rest_state": lambda: [0.3, 0.02],
     "name of TaskController.set_parameter": lambda: "wall.position",

@@ -151,8 +151,6 @@ def wire_loop(
     builder.Connect(control, plant.GetInputPort("control"))
     if goal is not None and controller.HasInputPort("reference"):
         builder.Connect(goal, controller.GetInputPort("reference"))
-    if controller.HasInputPort("acting_control"):
-        builder.Connect(control, controller.GetInputPort("acting_control"))
 
     # Exogenous signals go to the plant, and to the law as known there.
     moving, known = add_exogenous(builder, plant, controller, parts)

@@ -119,7 +119,7 @@ def _check_outside(
     On a contact that gives way it may be as deep as the force that counts as none presses it.
     """
     task, material = scenario.task, scenario.plant.material
-    if task is None or (plan := task.make().plan).latches or plan.contacts[0]:
+    if task is None or (plan := task.make().plan).contacts[0]:
         return
     for contact in opening_contact(scenario, model):
         if (touch := contact.touch(model.links)) is None:

@@ -2,7 +2,7 @@
 
     python tests/campaign/polish.py
 
-prints one line for each plant: the speed just before it touches, the largest force, what the
+prints one line for each contact: the speed just before it touches, the largest force, what the
 outputs are off while it polishes, from 2 s on (rms), and how long it took.
 """
 
@@ -19,7 +19,7 @@ from runs import run_scenario, scenario
 SAMPLED = "sampling={period: 0.001, delay: 0.001}"
 DRAKE = "plant=!MultibodyPlant"
 PLANTS = {
-    "ideal": (),
+    "equations": (),
     "point 1e5 N/m": (f"{DRAKE} {{stiffness: 1.0e5}}",),
     "point, friction 0.3": (f"{DRAKE} {{radius: 1.0e-5, friction: 0.3}}",),
     "the same, sampled": (f"{DRAKE} {{radius: 1.0e-5, friction: 0.3}}", SAMPLED),

@@ -82,7 +82,7 @@ class ReferenceSegment:
     @property
     def law(self) -> int:
         """The number of the active law."""
-        return self.change.law
+        return int(self.change.in_contact)
 
     def reference(self, time: float) -> FloatArray:
         """R at a time in s, shape (sum (mu_i + 1),)."""

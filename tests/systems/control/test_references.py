@@ -316,4 +316,3 @@ def test_wrong_parameters_are_refused():
     one, two = (ExpressionReference(lambda t, a: a * t, {"a": a}) for a in (1.0, 2.0))
     with pytest.raises(ReferenceSignalError, match="two references have a parameter 'a'"):
         ReferenceGenerator([one, two], [0, 0])
-
