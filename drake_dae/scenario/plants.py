@@ -34,7 +34,6 @@ class RobotToSimulate:
 
     Attributes:
         model, structure: The robot, and the structure of its system.
-        feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
@@ -43,7 +42,6 @@ class RobotToSimulate:
 
     model: RobotModel
     structure: Structure
-    feedback: bool
     opens: Sequence[str]
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
@@ -125,7 +123,7 @@ class IdealConstraints(ScenarioPlant):
         if self.pegs:
             text = "a peg is for a contact that opens: give a task, or take !Unilateral"
             raise ScenarioError(("plant.pegs", text))
-        return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
+        return RobotPlant(robot.model, structure=robot.structure)
 
 
 @checked(ModelError)

@@ -11,7 +11,6 @@ from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.links_behind import LinkBehind
-from drake_dae.scenario.feasibility.springs import SpringLaws
 
 WRONG_SIDE = (
     ": turn its normal around if its free side is the other one, or choose another posture or place"
@@ -77,7 +76,6 @@ class Feasibility:
         is_resolved: Whether the times resolve the reference; otherwise values between them are not
             known.
         behind: Links that move behind a contact surface.
-        laws: The requirements of two laws for springs; None without springs or samples.
         sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
         gains: Why no gains can be computed where they are left out, else empty.
         slowing: How much slower the references keep all limits; None where they keep them.
@@ -91,7 +89,6 @@ class Feasibility:
     joints: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
     behind: tuple[LinkBehind, ...] = ()
-    laws: SpringLaws | None = None
     sticking: str = ""
     gains: str = ""
     slowing: LimitsAlong | None = None
@@ -140,7 +137,6 @@ class Feasibility:
                 for key in ("controls", "joint_forces", "constraint_forces", "joints")
             },
             "behind": [asdict(link) for link in self.behind],
-            "spring_laws": None if self.laws is None else self.laws.to_dict(),
             "sticking": self.sticking,
             "slowing": None if self.slowing is None else asdict(self.slowing),
             "problems": list(self.problems),
@@ -163,8 +159,6 @@ class Feasibility:
                     "known. A shorter duration takes them closer together."
                 )
             parts.append([text])
-        if self.laws is not None:
-            parts.append(self.laws.lines)
         if self.sticking:
             parts.append([self.sticking])
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])

@@ -9,7 +9,7 @@ from drake_dae import build_scenario, rollout, start_values
 from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.export.parts import parts_of
-from drake_dae.running.rollout import beside
+from drake_dae.running.rollout import drake_stepped
 from drake_dae.running.rollout.program import program_of
 from drake_dae.scenario.rolled import roll_scenario, rollout_times
 
@@ -27,7 +27,6 @@ LATE = "sampling={period: 2.0e-3, delay: 3.0e-3}"
 LOOPS = {
     "a law with observer and integrals": ("wall_point_contact",),
     "hydroelastic contact": ("wall_hydroelastic",),
-    "behind springs": ("wall_flexible_contact",),
     "a continuous law": ("two_link_wall", *CONTINUOUS),
     "a continuous law whose references move": ("two_link_wall", *CONTINUOUS[:3]),
     "a law that acts late, at another period": ("two_link_wall", *CONTINUOUS, LATE),
@@ -96,19 +95,6 @@ def test_many_starts_are_each_alone():
 
 
 @pytest.mark.slow
-def test_a_run_that_diverges_ends_with_what_it_recorded():
-    """Springs behind Drake's contact, with a load that the law does not know."""
-    load = "plant_payloads=[{frame: tool, mass: 0.5}]"
-    found = scenario("wall_flexible_contact", load, "duration=1.0")
-    loop, context = build_scenario(found)
-    rolled = roll_scenario(found, loop, context)
-    assert isinstance(rolled.failure, SimulationError)
-    assert "the run diverges" in str(rolled.failure)
-    assert 0.0 < rolled.record.time[-1] == rolled.failure.time < 1.0
-    assert np.isfinite(rolled.record["state"]).all()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "setting"),
     [
@@ -145,7 +131,7 @@ def test_a_step_that_drake_cannot_make_ends_the_run_with_its_reason(monkeypatch)
                 raise RuntimeError("no convergence.")
             super().step(time, given, outputs)
 
-    monkeypatch.setattr(beside, "DrakeSteps", Failing)
+    monkeypatch.setattr(drake_stepped, "DrakeSteps", Failing)
     found = chosen("a law with observer and integrals")
     rolled = roll_scenario(found, *build_scenario(found))
     assert isinstance(rolled.failure, SimulationError)
