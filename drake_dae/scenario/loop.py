@@ -17,7 +17,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import hold_before
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.state_feedback import make_sensor
-from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
+from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.controllers.task_controller import (
@@ -76,7 +76,6 @@ def build_loop(
     limits = _limits(scenario, model)
 
     # The plant, which may have further exogenous signals.
-    feedback = task is None and can_be_fed_back(law, sampling, limits)
     of_plant = own_model(scenario, model.links) if plant is None else None
     plant_exogenous = None
     if of_plant is not None:
@@ -84,7 +83,7 @@ def build_loop(
         scene_graph = of_plant.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(of_plant.scenario, plant.dae, degrees)
-    plant = plant or make_plant(scenario, model, structure, feedback, opens)
+    plant = plant or make_plant(scenario, model, structure, opens)
 
     # The parts between plant and law; errors get the key of the part.
     with at("force_feedback"):
@@ -123,7 +122,6 @@ def make_plant(
     scenario: Scenario,
     model: RobotModel,
     structure: Structure,
-    feedback: bool = False,
     opens: Sequence[str] = (),
 ) -> Plant:
     """Makes the plant of a scenario.
@@ -132,7 +130,6 @@ def make_plant(
         scenario: The scenario.
         model: The robot, with payloads if the plant does not add them itself.
         structure: The structure of the model's system.
-        feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
 
     Raises:
@@ -142,7 +139,6 @@ def make_plant(
     robot = RobotToSimulate(
         model,
         structure,
-        feedback,
         opens,
         partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
         scenario.plant_parameters,

@@ -133,9 +133,6 @@ BLOCKS = {
     "CommandedReferences": commanded,
     "ReferenceGenerator with parameters": references_with_parameters,
     "TrackingController": lambda: TrackingController(law("two_link")),
-    "TrackingController that knows its references": lambda: TrackingController(
-        law("two_link"), references=references()
-    ),
     "TrackingController of a measured force": lambda: TrackingController(measured_law(())),
     "TrackingController with an integral": lambda: TrackingController(
         measured_law(("tool.z",)), integral_limits=0.3
