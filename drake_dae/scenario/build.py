@@ -38,14 +38,6 @@ def build_scenario(
     return loop, start_scenario(completed.scenario, loop)
 
 
-def complete_with_law(scenario: Scenario) -> Completed:
-    """Completes a scenario, also by gains, without building its loop.
-
-    Errors are as for `build_scenario`.
-    """
-    return _prepared(scenario, SceneGraph(), drawn=False).completed
-
-
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:
@@ -77,10 +69,10 @@ class _Prepared:
     structure: Structure
 
 
-def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
+def _prepared(scenario: Scenario, scene_graph: SceneGraph) -> _Prepared:
     if scenario.task is not None:
         check_task(scenario)
-    completed, model = completed_model(scenario, scene_graph, drawn=drawn)
+    completed, model = completed_model(scenario, scene_graph)
     try:
         structure = scenario_structure(model)
     except AssumptionError as error:
