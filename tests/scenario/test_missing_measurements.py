@@ -71,5 +71,5 @@ def test_the_expected_peak_of_a_touch_counts_the_missing_measurements(file):
 
 def test_a_scenario_names_the_key_of_a_number_that_makes_no_sense(file):
     lost = "sampling={period: 0.002, measurements: {loss: 2}}"
-    with pytest.raises(ScenarioError, match=r"sampling.measurements: the loss of measurements"):
+    with pytest.raises(ScenarioError, match=r"sampling\.measurements: .*loss"):
         load_scenario(file, [lost])
