@@ -109,8 +109,7 @@ Plant = Annotated[
     | plants.OwnPlant,
     Choice({Sequence[contact_material.Peg]: _Pegs}),
 ]
-_PACKETS: dict[Any, Any] = {sampling.Packets: Annotated[sampling.Packets, Form()]}
-Sampling = Annotated[sampling.Sampling, Form(_PACKETS)]
+Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]
