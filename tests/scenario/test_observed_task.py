@@ -342,7 +342,6 @@ def test_parameters_of_another_system_are_taken_by_name(file):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("tolerances={outputs: {tool.z: 0.01}}", "tolerances: the phases of a task have their own"),
         (
             "force_feedback=!ModelForce {}",
             "the observer of a task needs the measured force, since the model's force",
