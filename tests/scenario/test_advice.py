@@ -72,7 +72,6 @@ def test_encoders_are_estimated_at_rates_for_their_noise():
     )
     assert "estimate of the state" in fine.notes[0]
     assert "the best for one direction alone" in fine.notes[0]
-    assert "`drake-dae analyze`" in fine.notes[0]
     assert fine.scenario.observer.state_rate > coarse.scenario.observer.state_rate
     differences = chosen(two_link("encoders={resolution: 1.0e-6, velocity_bandwidth: 500}"))
     assert differences.observer.state_rate is None

@@ -340,7 +340,6 @@ def test_parameters_of_another_system_are_taken_by_name(file):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("tolerances={outputs: {tool.z: 0.01}}", "tolerances: "),
         (
             "force_feedback=!ModelForce {}",
             "observer",
