@@ -46,16 +46,16 @@ class RobotModel:
     with J = (dphi/dq) N. With friction, G(q, v) takes the place of J^T; viscous friction is part of
     H. A nonholonomic constraint has its rate in place of phi, and r = 1. With rigid joints tau = u;
     stages of actuation add dynamics between u and tau: E s' = drift(q, v, s) + drive u, tau =
-    tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s); the constraint input
-    is lambda, and the controlled outputs are z = (z_1, z_2), so the number of position outputs is
-    that of actuators minus constraints. If fewer forces are controlled (wheels, mimic joints), or
+    tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s); the constraint input is
+    lambda, and the controlled outputs are z = (z_1, z_2), so the number of position outputs is that
+    of actuators minus constraints. If fewer forces are controlled (wheels, mimic joints), or
     combinations of them (a grasp), `forces` chooses them: z_2 = S(q) lambda, and the number of
-    position outputs is that of actuators minus these. The plant's port always has all of lambda. With fewer outputs than actuators, as in a
-    redundantly actuated parallel robot, `control_weights` w chooses the control with the least sum
-    w_i (u_i - u_0i)^2 among all with the same outputs; see `DaeSystem`. u_0 is the parameter
-    "free_control", zero by default: it affects internal forces and motions that are not outputs.
-    With flexible joints each additional actuator leaves one undamped deflection: rather make the
-    internal force an output.
+    position outputs is that of actuators minus these. The plant's port always has all of lambda.
+    With fewer outputs than actuators, as in a redundantly actuated parallel robot,
+    `control_weights` w chooses the control with the least sum w_i (u_i - u_0i)^2 among all with the
+    same outputs; see `DaeSystem`. u_0 is the parameter "free_control", zero by default: it affects
+    internal forces and motions that are not outputs. With flexible joints each additional actuator
+    leaves one undamped deflection: rather make the internal force an output.
 
     Args:
         links: The links, which provide M, H and the frames.
