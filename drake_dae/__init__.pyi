@@ -68,7 +68,6 @@ from .robots.constraints.loop_joints import PrismaticLoopJoint as PrismaticLoopJ
 from .robots.constraints.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
 from .robots.constraints.points import FixedDistance as FixedDistance
 from .robots.constraints.points import PointOnSurface as PointOnSurface
-from .robots.constraints.presliding import Presliding as Presliding
 from .robots.constraints.rolling import Blade as Blade
 from .robots.constraints.rolling import RollingBall as RollingBall
 from .robots.constraints.rolling import RollingWheel as RollingWheel

@@ -38,7 +38,6 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
         )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
-    check_without_bristles(model)
     for constraint in model.constraints:
         values = own_values(constraint, model.dae, model.dae.parameter_values)
         solids = constraint.solids(values)
@@ -69,20 +68,6 @@ def check_pegs(model: RobotModel, material: PointMaterial) -> None:
     for peg in material.pegs:
         if peg.constraint not in names:
             raise ModelError(f"pegs: {unknown_name('constraint', peg.constraint, names)}")
-
-
-def check_without_bristles(model: RobotModel) -> None:
-    """Refuses friction with bristles, whose states a plant in discrete steps does not have.
-
-    Raises:
-        ModelError: A contact or a joint has presliding.
-    """
-    if model.friction.signals:
-        raise ModelError(
-            f"'{model.friction.owner}' has presliding, and a contact plant with a time_step has no "
-            "bristles: its steps are too long for them. Use `plant: !CompliantContact {time_step: "
-            "0}` or `plant: !IdealConstraints`"
-        )
 
 
 def solids_of(
