@@ -1,6 +1,5 @@
 """Drake's own contact as the plant, against the ideal constraint and Drake's own numbers."""
 
-import re
 from itertools import pairwise
 
 import numpy as np
@@ -246,12 +245,9 @@ def test_a_curved_surface_is_a_mesh_in_hydroelastic_contact(surface):
     In point contact of `CompliantPlant` it is 0.1 mm and 0.5 N.
     """
     settings = ("plant.contact_model=hydroelastic", "plant.modulus=1.0e8", "plant.radius=0.01")
-    loop, _, record = run_scenario(
+    _, _, record = run_scenario(
         two_link(f"constraints.0.surface={surface}", *settings, "plant.piece=0.6", NEAR)
     )
-    (remark,) = loop.plant.remarks
-    assert remark.startswith("wall around [1.")
-    assert re.search(r"off by up to [0-9.]+ um and 0\.[0-9]+ degrees", remark)
     late = record["tracking_error"][record.time > 0.8]
     assert np.abs(late[:, 0]).max() < 1e-3
     assert np.abs(late[:, 1]).max() < 1.0
