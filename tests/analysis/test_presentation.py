@@ -62,7 +62,7 @@ def test_the_dictionary_is_json(name):
 
 
 BAD_ARGUMENTS = {
-    "a list as region": ({"region": [(0, 1)]}, "region must be a dictionary or None"),
+    "a list as region": ({"region": [(0, 1)]}, "region"),
     "text as seed": ({"seed": "a"}, "seed must be a whole number, got 'a'"),
     "no function": ({"reference": [0.0] * 3, "times": [0, 1]}, "reference must be a function"),
     "no value": ({"reference": lambda t: None, "times": [0, 1]}, "must have size 3 .* got None"),

@@ -5,7 +5,6 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive, vector
 from drake_dae.dae.beyond.spring_loop import SpringLoop
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -18,7 +17,6 @@ _HORIZON = 20.0
 """Time constants of the slowest pole for which a response is integrated."""
 
 
-@checked(ModelError)
 def spring_error_bound(
     law: TrackingLaw,
     times: ArrayLike,

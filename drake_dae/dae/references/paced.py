@@ -7,13 +7,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.references.reference import Reference
-from drake_dae.errors import ReferenceSignalError
 
 
-@checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class PacedReference(Reference):
     """The reference r(c t), which passes through the values of r(t) at c times the speed.

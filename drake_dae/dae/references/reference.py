@@ -83,7 +83,6 @@ class Reference(ABC):
         return ""
 
 
-@checked(ReferenceSignalError)
 class FormulaReference(Reference):
     """A reference that is a CasADi expression of time; differentiated exactly."""
 

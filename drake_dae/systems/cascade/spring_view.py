@@ -2,7 +2,6 @@
 
 from pydrake.systems.framework import Context
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
@@ -13,7 +12,6 @@ from drake_dae.systems.blocks.traced import PARAMETERS, Block, Computation
 from drake_dae.trace.functions import TracedFunction
 
 
-@checked(ModelError)
 class SpringView(ParameterizedSystem):
     """State of the links and torque of the springs, from the state of a robot with springs:
 

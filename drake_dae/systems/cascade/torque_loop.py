@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Context, EventStatus, State
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.beyond.spring_loop import SpringLoop
 from drake_dae.dae.structure.structure import Structure
@@ -24,7 +23,6 @@ _EXCESS = 0.01
 limits."""
 
 
-@checked(ModelError)
 class TorqueLoop(ParameterizedSystem):
     """The inner loop of a cascade: the torque tau of the springs follows the desired one, tau_d.
 

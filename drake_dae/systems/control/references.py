@@ -123,6 +123,7 @@ class ReferenceGenerator(DifferentiableSystem):
             )
         return self.function
 
+    @checked(ReferenceSignalError)
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of its references in a context.
 

@@ -184,6 +184,7 @@ class ControlHold(LeafSystem):
 
     def __init__(self, size: int, sampling: Sampling) -> None:
         super().__init__()
+        check_whole_number("size", size, 1)
         self.set_name("control_hold")
         self.sampling = sampling
         self.sample_period = sampling.period

@@ -285,7 +285,6 @@ class DaePlant(ParameterizedSystem, Plant):
             return False
         return self._crossing.happens(state, control, self._values(context))
 
-    @checked(ModelError)
     def explained(
         self,
         error: SimulationError,

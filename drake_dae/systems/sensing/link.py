@@ -7,17 +7,15 @@ import casadi as ca
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, SimulationError
+from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.trace.functions import TracedFunction
 
 
-@checked(ModelError)
 class ControlLink(LeafSystem):
     """Passes the held control of a law to the drives, late or not at all.
 

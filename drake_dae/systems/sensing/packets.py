@@ -7,10 +7,9 @@ import casadi as ca
 import numpy as np
 from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, SimulationError
+from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import HELD, TIME, Block, Computation, Update
 from drake_dae.systems.control.sampling import Packets
@@ -20,7 +19,6 @@ _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""
 
 
-@checked(ModelError)
 class MeasurementLink(LeafSystem):
     """Passes the measurements of each sample t_k = k period to a law, late or not at all.
 

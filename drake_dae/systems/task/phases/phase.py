@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields, replace
 from math import inf
 from typing import ClassVar, Literal, Self
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
@@ -64,7 +63,6 @@ class Moment:
     torque: float = 0.0
 
 
-@checked(ModelError)
 @dataclass(frozen=True, kw_only=True)
 class Phase(ABC):
     """A part of a task, with its own goals for the outputs and its own end.
