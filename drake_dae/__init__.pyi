@@ -13,8 +13,6 @@ from .dae.beyond.disturbance import with_disturbance as with_disturbance
 from .dae.beyond.one_direction import SensorNoise as SensorNoise
 from .dae.beyond.sampled import sampled_poles as sampled_poles
 from .dae.beyond.sampled import sampling_error as sampling_error
-from .dae.beyond.spring_loop import SpringLoop as SpringLoop
-from .dae.beyond.spring_loop import spring_loop as spring_loop
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
 from .dae.extension.extension import Extension as Extension
 from .dae.extension.extension import extend as extend
@@ -49,12 +47,9 @@ from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
 from .dae.tracking.gains import gain_matrices as gain_matrices
 from .dae.tracking.gains import poles as poles
-from .dae.tracking.impedance import impedance_gains as impedance_gains
 from .dae.tracking.tracking import TrackingLaw as TrackingLaw
 from .dae.zero_dynamics.zero_dynamics import ZeroDynamics as ZeroDynamics
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop
-from .diagrams.followed import FollowedLine as FollowedLine
-from .diagrams.followed import followed_lines as followed_lines
 from .diagrams.settings import LoopSettings as LoopSettings
 from .diagrams.wiring import make_closed_loop as make_closed_loop
 from .diagrams.wiring import wire_loop as wire_loop
@@ -77,10 +72,8 @@ from .robots.constraints.presliding import Presliding as Presliding
 from .robots.constraints.rolling import Blade as Blade
 from .robots.constraints.rolling import RollingBall as RollingBall
 from .robots.constraints.rolling import RollingWheel as RollingWheel
-from .robots.constraints.screws import ScrewHead as ScrewHead
 from .robots.constraints.welds import CoincidentPoints as CoincidentPoints
 from .robots.constraints.welds import WeldedFrames as WeldedFrames
-from .robots.force_outputs import FaceForces as FaceForces
 from .robots.force_outputs import ForceCombination as ForceCombination
 from .robots.force_outputs import ForceOutput as ForceOutput
 from .robots.force_outputs import NamedForce as NamedForce
@@ -88,7 +81,6 @@ from .robots.force_outputs import Squeeze as Squeeze
 from .robots.joint_friction import JointFriction as JointFriction
 from .robots.known_forces import KnownForce as KnownForce
 from .robots.known_forces import KnownWrench as KnownWrench
-from .robots.link_side import link_side as link_side
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
 from .robots.model import RobotModel as RobotModel
@@ -131,7 +123,6 @@ from .studies.variations import grid_variations as grid_variations
 from .studies.variations import listed_variations as listed_variations
 from .studies.variations import random_variations as random_variations
 from .symbolic import from_symbolic as from_symbolic
-from .systems.cascade.cascade import SpringCascade as SpringCascade
 from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
@@ -163,23 +154,15 @@ from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor
 from .systems.sensing.force_sensor import ForceSensor as ForceSensor
 from .systems.sensing.tolerances import Tolerances as Tolerances
-from .systems.task.contacts.laws import laws_of_latches as laws_of_latches
 from .systems.task.contacts.open_contact import open_contact as open_contact
 from .systems.task.controller import TaskController as TaskController
 from .systems.task.phases import Approach as Approach
-from .systems.task.phases import Close as Close
+from .systems.task.phases import Condition as Condition
 from .systems.task.phases import Dwell as Dwell
-from .systems.task.phases import Follow as Follow
-from .systems.task.phases import GuardedMove as GuardedMove
-from .systems.task.phases import Insert as Insert
 from .systems.task.phases import Move as Move
-from .systems.task.phases import PhaseGuard as PhaseGuard
 from .systems.task.phases import Press as Press
 from .systems.task.phases import Release as Release
 from .systems.task.phases import Retreat as Retreat
-from .systems.task.phases import Screw as Screw
-from .systems.task.phases import Search as Search
-from .systems.task.phases import Wait as Wait
 from .systems.task.task import Task as Task
 
 __version__: str

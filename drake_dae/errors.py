@@ -108,7 +108,19 @@ class SimulationError(DrakeDaeError):
 
 
 class SingularityError(SimulationError):
-    """A(x) of Assumption (2) or B(x) of Assumption (5) lost its rank during a run."""
+    """A(x) of Assumption (2) or B(x) of Assumption (5) lost its rank during a run.
+
+    Attributes:
+        constraints: The names of the constraints whose gradients become dependent; empty if they
+            are not the cause, or not known.
+    """
+
+    constraints: tuple[str, ...] = ()
+
+    def retold(self, message: str, time: float, state: ArrayLike) -> "SimulationError":
+        error = super().retold(message, time, state)
+        vars(error).update(constraints=self.constraints)
+        return error
 
 
 class PainleveError(SingularityError):

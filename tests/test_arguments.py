@@ -18,7 +18,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, fixed_step, law
-from latches import carts, hand_over
 from numpy.typing import ArrayLike, NDArray
 from polishing import laws, polisher, task_loop
 from pydrake.geometry import SceneGraph
@@ -43,7 +42,7 @@ from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.studies.results import Outcome, RunResult
+from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.systems.plants.contact_events import ContactChange
 
 FOLDER = Path(__file__).parent / "made"
@@ -141,7 +140,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),
     dd.SensedContact: sensed,
-    dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
     dd.SensorNoise: lambda: dd.SensorNoise(),
     dd.NormalForm: normal_form,
     Manifold: lambda: arm("two_link").structure.manifold,
@@ -160,7 +158,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Links: lambda: arm("two_link").model.links,
     MultibodyPlant: lambda: arm("two_link").plant,
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
-    RunResult: lambda: RunResult(0, Outcome.FINISHED, figures={"steps": 1.0}),
+    RunResult: lambda: RunResult(Outcome.FINISHED, figures={"steps": 1.0}),
     Scenario: scenario,
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
     System: lambda: loop().diagram,
@@ -206,8 +204,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "law of TaskController": lambda: laws()[0],
     "free_law": lambda: laws()[1],
     "force of open_contact": lambda: "wall.force",
-    "plan of laws_of_latches": lambda: hand_over().plan,
-    "system of laws_of_latches": lambda: carts().dae,
     "system of open_contact": lambda: arm("two_link").model.dae,
     "plant of wire_loop": lambda: dd.UnilateralRobotPlant(polisher(), {"wall": 0.0}),
     "controller of wire_loop": lambda: dd.TaskController(

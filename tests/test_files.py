@@ -19,7 +19,7 @@ from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.files import read_bytes, read_text
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.scenario import read_scenario, scenario_data
+from drake_dae.scenario.scenario import read_scenario
 
 SIZE = (0.4, 0.3)
 
@@ -368,37 +368,3 @@ def test_plain_data_may_not_hold_it_either(data, key):
 def test_the_length_of_a_path_does_not_matter(tmp_path):
     with pytest.raises(DrakeDaeError):
         load_scenario(Path("a" * 5000))
-
-
-def test_half_a_letter_is_found_also_beside_parts_that_were_read_before():
-    data, known = scenario_data(scenario("two_link_wall")), dict[object, object]()
-    read_scenario(data, known=known)
-    read_scenario(data, known=known)
-    with pytest.raises(ScenarioError, match=r"description: .*half of a letter"):
-        read_scenario({**data, "description": "\ud800"}, known=known)
-
-
-def test_scenarios_that_are_read_one_after_the_other_are_those_that_are_read_alone():
-    """Also of parts on which it depends what a scenario fills in, and after an error."""
-    data, known = scenario_data(scenario("two_link_wall")), dict[object, object]()
-    variations = [
-        {},
-        {"start": {"errors": {"tool.z": 0.1}}},
-        {"start": {"errors": {"tool.z": 0.2}}, "duration": 2.0},
-        {"gains": None, "integral": None},
-        {"description": "other", "gains": None},
-        {"plant": {"_tag": "!MultibodyPlant"}, "gains": None},
-        {"start": {"positions": {"joint1": 1.0}}},
-        {"robot": {**data["robot"], "actuators": ["joint1"]}},
-        {},
-    ]
-    for number, changes in enumerate(variations):
-        varied = {**data, **changes}
-        assert read_scenario(varied, known=known) == read_scenario(varied), changes
-        wrong = {"start": {"errors": {"tool.z": "far"}, "place": number}, "duration": -1.0}
-        texts = []
-        for cache in (known, None):
-            with pytest.raises(ScenarioError) as caught:
-                read_scenario({**varied, **wrong}, known=cache)
-            texts.append(sorted(caught.value.problems))
-        assert texts[0] == texts[1]

@@ -61,6 +61,7 @@ def analyze(
     reference: Callable[[float], FloatArray] | None = None,
     times: ArrayLike | None = None,
     start: ArrayLike | None = None,
+    period: float | None = None,
     exogenous: Sequence[Reference] = (),
     count: int = COUNT,
     seed: int = SEED,
@@ -85,11 +86,12 @@ def analyze(
         states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
             few others close to the first, since an expression may vanish at a single state.
         reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
-            the motion that it commands, and the zero dynamics judged at its first outputs and
-            along the motion.
+            the motion that it commands, and the zero dynamics judged at its first outputs.
         times: Times in s at which the reference is examined, increasing, shape (k,).
         start: State near which the motion along the reference starts, shape (n,); the first
             examined state if None; only with a reference.
+        period: The period of the reference and of the exogenous signals, in s; the zero dynamics
+            are then also judged along the reference.
         exogenous: The references of the exogenous signals; all else is examined with
             these signals at rest at their parameters' values.
         count: The number of random states.
@@ -109,11 +111,9 @@ def analyze(
         raise ModelError(f"{system.name}: give a region or states, not both")
     if (reference is None) != (times is None):
         raise ModelError(f"{system.name}: a reference needs times, and times need a reference")
-    if start is not None and reference is None:
-        raise ModelError(
-            f"{system.name}: start is the state at the beginning of a reference, and no "
-            "reference is given"
-        )
+    for name, value in (("start", start), ("period", period)):
+        if value is not None and reference is None:
+            raise ModelError(f"{system.name}: {name} is that of a reference, and none is given")
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
     random = np.random.default_rng(seed)
@@ -125,7 +125,7 @@ def analyze(
     analysis = examine(system, chosen)
     if reference is None or times is None:
         return _at_rest(analysis)
-    return along(analysis, reference, times, start, exogenous)
+    return along(analysis, reference, times, start, period, exogenous)
 
 
 def examine(system: DaeSystem, chosen: ExaminedStates | None = None) -> Analysis:
@@ -181,13 +181,14 @@ def along(
     reference: Callable[[float], FloatArray],
     times: ArrayLike,
     start: ArrayLike | None,
+    period: float | None,
     exogenous: Sequence[Reference],
 ) -> Analysis:
     """Adds what `analyze` says along a reference, where there is a structure.
 
     Args:
         analysis: The result of `examine`.
-        reference, times, start, exogenous: As for `analyze`.
+        reference, times, start, period, exogenous: As for `analyze`.
 
     Raises:
         ModelError: As for `analyze`.
@@ -208,8 +209,8 @@ def along(
         outputs = structure.layout.values(reference(float(motion.times[0])))
     stability = dynamics.stability(rest, outputs=outputs)
     stability_along = None
-    if dynamics.dimension and motion.times.size > 1:
-        stability_along = dynamics.stability_along(reference, motion, exogenous=exogenous)
+    if dynamics.dimension and period is not None:
+        stability_along = dynamics.stability_along(reference, motion, period, exogenous=exogenous)
     contact_margin_along = None
     if system.frictional_contacts and motion.times.size:
         contacts = ContactMargins(system, structure.elimination.constraint_matrix)
@@ -230,12 +231,11 @@ def _equilibria(
     """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
     if not dynamics.dimension:
         return ()
-    if stability.state is not None:
-        states = np.vstack([stability.state, states])
-    equilibria = dynamics.equilibria(states, outputs=outputs)
-    first = () if stability.state is None else (stability,)
-    others = equilibria[len(first) :]
-    return (*first, *(dynamics.stability(state, outputs=outputs) for state in others))
+    judged: tuple[Stability, ...] = ()
+    if stability.state is not None and len(dynamics.equilibria([stability.state], None, outputs)):
+        judged, states = (stability,), np.vstack([stability.state, states])
+    others = dynamics.equilibria(states, outputs=outputs)[len(judged) :]
+    return (*judged, *(dynamics.stability(state, outputs=outputs) for state in others))
 
 
 def _examine(

@@ -13,7 +13,7 @@ from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.along import StabilityAlong
+from drake_dae.dae.zero_dynamics.floquet import StabilityAlong
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import Stability, Verdict
 
@@ -23,7 +23,7 @@ class Finding(StrEnum):
 
     SATISFIED = "satisfied"
     VIOLATED = "violated"
-    UNDECIDED = "undecided"
+    UNDECIDED = "not decided"
     NOT_EXAMINED = "not examined"
     FAILS = "does not hold"
 
@@ -50,15 +50,6 @@ class Assumption:
     violation: Violation | None = None
 
 
-OF_VERDICT = {
-    Verdict.STABLE: Finding.SATISFIED,
-    Verdict.BOUNDED: Finding.SATISFIED,
-    Verdict.UNSTABLE: Finding.VIOLATED,
-    Verdict.UNDECIDED: Finding.UNDECIDED,
-}
-"""The verdict on Assumption 2.2, which requires bounded states, from that on the zero dynamics."""
-
-
 @dataclass(frozen=True, eq=False)
 class Findings:
     """The statements of the theory on one system, as values.
@@ -78,7 +69,7 @@ class Findings:
         zero_dynamics: Assumption 2.2, by linearization at an equilibrium.
         equilibria: All equilibria of the zero dynamics with the same outputs that were found from
             the examined states.
-        zero_dynamics_along: Assumption 2.2 along the reference; None also without one.
+        zero_dynamics_along: Assumption 2.2 along a periodic reference; None also without one.
         motion: The motion along the reference; None also without one.
         contact_margin: The distance of friction from the Painleve paradox; None without friction.
         contact_margin_along: That distance along the reference; None also without a reference.
@@ -139,20 +130,6 @@ class Findings:
         return None if dimension is None or degrees is None else dimension - sum(degrees)
 
     @property
-    def decisive(self) -> Stability | StabilityAlong | None:
-        """The verdict that decides Assumption 2.2: along the reference, otherwise at rest.
-
-        If the reference is not periodic, an unstable equilibrium decides as well, since the
-        reference ends.
-        """
-        rest, along = self.zero_dynamics, self.zero_dynamics_along
-        if along is None or rest is None or along.verdict is Verdict.UNDECIDED:
-            return rest
-        if not along.period and rest.verdict is Verdict.UNSTABLE:
-            return rest
-        return along
-
-    @property
     def unstable_inside(self) -> tuple[Stability, ...]:
         """Other unstable equilibria inside the requested region."""
         if self.region is None:
@@ -161,17 +138,24 @@ class Findings:
             equilibrium
             for equilibrium in self.equilibria
             if equilibrium.verdict is Verdict.UNSTABLE
-            and equilibrium is not self.decisive
+            and equilibrium is not self.zero_dynamics
             and equilibrium.state is not None
             and self.region.holds(equilibrium.state)
         )
 
     @property
     def zero_dynamics_finding(self) -> Finding:
-        """The verdict on Assumption 2.2; violated if an equilibrium in the region is unstable."""
-        if self.unstable_inside:
+        """The verdict on Assumption 2.2.
+
+        Violated if an eigenvalue at rest, or a multiplier, is unstable; otherwise decided along the
+        reference if it is periodic, and at rest if not.
+        """
+        judged = [one.verdict for one in (self.zero_dynamics_along, self.zero_dynamics) if one]
+        if not judged:
+            return Finding.NOT_EXAMINED
+        if Verdict.UNSTABLE in judged or self.unstable_inside:
             return Finding.VIOLATED
-        return Finding.NOT_EXAMINED if self.decisive is None else OF_VERDICT[self.decisive.verdict]
+        return Finding.SATISFIED if judged[0] is Verdict.STABLE else Finding.UNDECIDED
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -196,10 +180,12 @@ class Findings:
                 f"{critical} is critical there. Lower the friction, slide the other way, or hold "
                 "the robot less steeply to the surface"
             )
-        decisive = self.decisive
-        if decisive is not None and decisive.verdict is Verdict.UNSTABLE:
-            place = "along the reference " if decisive is self.zero_dynamics_along else ""
-            sentences.append(f"Assumption 2.2: {place}{decisive.reason}")
+        for place, judged in (
+            ("", self.zero_dynamics),
+            ("along the reference ", self.zero_dynamics_along),
+        ):
+            if judged is not None and judged.verdict is Verdict.UNSTABLE:
+                sentences.append(f"Assumption 2.2: {place}{judged.reason}")
         for equilibrium in self.unstable_inside:
             if equilibrium.state is not None:
                 place = named_values(self.system.state_signals, equilibrium.state)

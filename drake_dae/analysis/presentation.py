@@ -65,7 +65,6 @@ def as_dict(findings: Findings) -> dict[str, Any]:
             "verdict": str(along.verdict),
             "period": along.period,
             "multipliers": _pairs(along.multipliers),
-            "exponents": along.exponents.tolist(),
             "reason": along.reason,
         },
         "contact_margin": contact_margin_as_dict(findings.contact_margin),
@@ -211,7 +210,7 @@ def _places(findings: Findings) -> list[Part]:
     if along is not None:
         if along.multipliers.size:
             lines.append(f"Along the reference: Floquet multipliers {_complex(along.multipliers)}.")
-        if along.verdict != Verdict.UNSTABLE or along is not findings.decisive:
+        if along.verdict != Verdict.UNSTABLE:
             lines.append(f"Zero dynamics along the reference {along.verdict}: {along.reason}.")
     return [lines] if lines else []
 

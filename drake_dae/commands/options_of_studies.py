@@ -44,7 +44,7 @@ def add_sweep(commands: Any, scenario: CommandParser) -> None:
         parents=[scenario],
         help="run a scenario many times with other values",
         description="Runs a scenario once for every combination of the values of some keys, on all "
-        "cores, and writes a table with figures of each run, a summary and plots. If it is killed, "
+        "cores, and writes a table and a plot with figures of each run. If it is killed, "
         "the same command continues it.",
         epilog="exit code: 0, or 1 for an error, also where the process of a run died or was too "
         "slow: the same command tries that run again; with --check 2 if a run did not finish",
@@ -86,15 +86,12 @@ def add_sweep(commands: Any, scenario: CommandParser) -> None:
         help="how many processes (default: one per core)",
     )
     study.add_argument(
-        "--cluster", metavar="ADDRESS", help="run on the Dask cluster with this scheduler instead"
-    )
-    study.add_argument(
         "--time-limit",
         type=seconds_option,
         default=TIME_LIMIT,
         metavar="SECONDS",
         help="how long a run may take by the clock, building included, until its process is ended "
-        f"and it counts as timed out (default: {TIME_LIMIT:g}; on a cluster there is none)",
+        f"and it counts as timed out (default: {TIME_LIMIT:g})",
     )
     study.flag("--check", "exit code 2 if a run did not finish")
     study.json("print outcomes and figures as JSON, and all else on stderr")

@@ -12,11 +12,13 @@ from drake_dae.analysis.tables import count_of
 from drake_dae.errors import ModelError
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.studies.results import Outcome
-from drake_dae.studies.run_names import rerun_commands
+from drake_dae.studies.runs import Outcome
 from drake_dae.studies.study import FILES
 from drake_dae.studies.sweep import sweep
 from drake_dae.studies.variations import parse_variations
+
+JOURNAL = "runs.db"
+"""The name of the file with the results, from which the command continues."""
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -33,11 +35,9 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Runs the study; returns the exit code, and the results for JSON."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
-    variations = parse_variations(
-        options.vary, scenario, options.random, options.seed, options.together
-    )
+    variations = parse_variations(options.vary, options.random, options.seed, options.together)
     folder = options.out or Path("runs") / f"{path.stem}-sweep"
-    file = folder / "runs.jsonl"
+    file = folder / JOURNAL
     others = [name for name in FILES if (folder / name).exists()]
     if others and not file.exists():
         raise ModelError(
@@ -49,7 +49,6 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
             variations,
             file,
             workers=options.workers,
-            cluster=options.cluster,
             progress=True,
             rollout=options.rollout,
             time_limit=options.time_limit,
@@ -57,30 +56,27 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     except KeyboardInterrupt:
         print(f"runs that have ended are in {file}; the same command continues", file=sys.stderr)
         raise
-    title = f"{path.stem}: {scenario.description}" if scenario.description else path.stem
-    made = ["drake-dae", "simulate", str(options.scenario)]
-    made += ["--rollout"] if options.rollout else []
-    made += [part for text in options.settings for part in ("--set", text)]
-    again = rerun_commands(made, variations, folder)
-    files = study.save(folder, title, again, scenario.duration)
-    names = ", ".join([file.name, *(written.name for written in files)])
-    print(f"{study}\nwritten to {folder}/: {names}", flush=True)
-    unfinished = [result for result in study.results if result.outcome is not Outcome.FINISHED]
+    files = [file.name, *(written.name for written in study.save(folder))]
+    print(f"{study}\nwritten to {folder}/: {', '.join(files)}", flush=True)
+    unfinished = {
+        run: result
+        for run, result in enumerate(study.results)
+        if result.outcome is not Outcome.FINISHED
+    }
     report = {
         "scenario": path.stem,
         "folder": str(folder),
         "runs": len(study.results),
         "outcomes": Counter(str(result.outcome) for result in study.results),
         "not_finished": [
-            {"run": result.run, "outcome": str(result.outcome), "reason": result.reason}
-            for result in unfinished
+            {"run": run, "outcome": str(result.outcome), "reason": result.reason}
+            for run, result in unfinished.items()
         ],
         "figures": study.extent(),
-        "files": names.split(", "),
+        "files": files,
     }
-    if repeated := [str(result.run) for result in unfinished if not result.outcome.is_final]:
-        count = count_of(len(repeated), "run")
-        text = f"{count} died or took too long; the same command tries again"
-        print(f"error: {text}: {', '.join(repeated[:10])}", file=sys.stderr)
+    if again := [str(run) for run, result in unfinished.items() if not result.outcome.is_final]:
+        text = f"{count_of(len(again), 'run')} died or took too long; the same command tries again"
+        print(f"error: {text}: {', '.join(again[:10])}", file=sys.stderr)
         return 1, report
     return 2 if unfinished and options.check else 0, report

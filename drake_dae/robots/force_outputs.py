@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import check_axes, unknown_name
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
@@ -136,60 +135,6 @@ class Squeeze(ForceOutput):
 
     def signals(self, constraints: ConstraintSet) -> tuple[Signal, ...]:
         return (Signal(self.name or f"{self.first}.{self.second}.squeeze", "N"),)
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class FaceForces(ForceOutput):
-    """The force on a face that several points form, and its moments about two axes of a frame:
-
-        F = sum_i lambda_i,    M = sum_i lambda_i (r_i x n_i),
-
-    with the normal forces lambda_i in N, and in the axes of the frame the points r_i, from its
-    origin, and the unit normals n_i of the surface. If the third axis, z, is parallel to n, the
-    center of pressure is (r_x, r_y) = (-M_y, M_x) / (n_z F). Friction is not part of M.
-
-    With as many rows as points each lambda_i follows from F and M; three points need both axes.
-
-    Attributes:
-        frame: The name of the frame, on the body of the points.
-        points: The names of the constraints, each with one unilateral force.
-        axes: The axes of the moments, letters of "xyz"; empty for F alone.
-        name: The prefix of the names of the outputs: "<name>.force", "<name>.mx".
-    """
-
-    frame: str
-    points: Sequence[str]
-    axes: str = "xy"
-    name: str = "face"
-
-    def __post_init__(self) -> None:
-        if self.axes:
-            check_axes("axes", self.axes)
-        if len(set(self.points)) < 2:
-            raise ModelError(f"'{self.name}' needs two points or more, got {list(self.points)}")
-
-    def expression(
-        self, constraints: ConstraintSet, kinematics: Kinematics, constraint_force: ca.SX
-    ) -> ca.SX:
-        parts = {constraint.name: (constraint, part) for constraint, part in constraints.parts()}
-        rotation, force, moment = kinematics.rotation(self.frame), ca.SX(0), ca.SX(3, 1)
-        for name in self.points:
-            if name not in parts:
-                raise ModelError(unknown_name("constraint", name, parts))
-            constraint, part = parts[name]
-            touch = constraint.touch(kinematics)
-            if touch is None or constraint.is_unilateral != (True,):
-                raise ModelError(f"'{self.name}': '{name}' is no point with one unilateral force")
-            lever = kinematics.position(touch.frame, touch.point) - kinematics.position(self.frame)
-            force += constraint_force[part]
-            moment += constraint_force[part] * ca.cross(lever, touch.normal)
-        rows = ["xyz".index(axis) for axis in self.axes]
-        return ca.vertcat(force, ca.mtimes(rotation.T, moment)[rows])
-
-    def signals(self, constraints: ConstraintSet) -> tuple[Signal, ...]:
-        moments = (Signal(f"{self.name}.m{axis}", "N m") for axis in self.axes)
-        return (Signal(f"{self.name}.force", "N"), *moments)
 
 
 def force_outputs(

@@ -14,8 +14,6 @@ from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.controllers.task_controller import check_task
-from drake_dae.scenario.feasibility.holes import misfit
-from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.forms.keys import violated
 from drake_dae.scenario.loop import build_loop
 from drake_dae.scenario.model import completed_model, scenario_structure
@@ -40,14 +38,6 @@ def build_scenario(
     return loop, start_scenario(completed.scenario, loop)
 
 
-def complete_with_law(scenario: Scenario) -> Completed:
-    """Completes a scenario, also by gains, without building its loop.
-
-    Errors are as for `build_scenario`.
-    """
-    return _prepared(scenario, SceneGraph(), drawn=False).completed
-
-
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:
@@ -66,8 +56,8 @@ def build_completed(
         meshcat,
         commanded=commanded,
     )
-    told = sticking_before(scenario, model, structure), misfit(scenario, model)
-    return Completed(scenario, (*prepared.completed.notes, *filter(None, told))), loop
+    told = filter(None, [sticking_before(scenario, model, structure)])
+    return Completed(scenario, (*prepared.completed.notes, *told)), loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,15 +69,14 @@ class _Prepared:
     structure: Structure
 
 
-def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
+def _prepared(scenario: Scenario, scene_graph: SceneGraph) -> _Prepared:
     if scenario.task is not None:
         check_task(scenario)
-    completed, model = completed_model(scenario, scene_graph, drawn=drawn)
+    completed, model = completed_model(scenario, scene_graph)
     try:
-        structure = scenario_structure(model, scenario.task)
+        structure = scenario_structure(model)
     except AssumptionError as error:
         raise violated(error) from error
     chosen = advised(completed.scenario, model, structure)
-    slowed = paced(chosen.scenario, model, structure)
-    notes = (*completed.notes, *chosen.notes, *slowed.notes)
-    return _Prepared(Completed(slowed.scenario, notes), model, structure)
+    notes = (*completed.notes, *chosen.notes)
+    return _Prepared(Completed(chosen.scenario, notes), model, structure)

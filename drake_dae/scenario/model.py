@@ -32,12 +32,10 @@ from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
 from drake_dae.scenario.completion.of_task import complete_task
 from drake_dae.scenario.forms.keys import at, each
-from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.parts.written import WrittenForm, make
 from drake_dae.scenario.robot_file.links import RobotLinks, robot_links
 from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.task.contacts.laws import latched_system
 
 _LARGE = 30.0
 """The ratio of the size of a surface to that of the robot above which its unit is doubtful."""
@@ -172,20 +170,16 @@ def _build(
     return _BuiltRobot(name, links, constraints, stages, known_forces, completed)
 
 
-def scenario_structure(model: RobotModel, task: ScenarioTask | None = None) -> Structure:
-    """The structure of a scenario's robot, of a task with latches in its first closed mode.
+def scenario_structure(model: RobotModel) -> Structure:
+    """The structure of a scenario's robot.
 
     Raises:
         AssumptionError: The robot violates an assumption of the theory.
         ScenarioError: The robot's start is not near its constraints.
     """
     _check_outputs(model)
-    with at("task"):
-        plan = None if task is None else task.make().plan
-        latched = plan is not None and bool(plan.latches)
-        system = latched_system(plan, model.dae, 0) if plan is not None and latched else model.dae
     with _near_constraints():
-        return find_structure(system)
+        return find_structure(model.dae)
 
 
 def examine_scenario(model: RobotModel) -> Analysis:

@@ -69,7 +69,7 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     )
     scene_graph = SceneGraph()
     model = completed_model(of_plant, scene_graph, payloads)[1]
-    return OwnModel(of_plant, model, scenario_structure(model, of_plant.task), scene_graph)
+    return OwnModel(of_plant, model, scenario_structure(model), scene_graph)
 
 
 def _name(index: int) -> str:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
@@ -17,7 +17,6 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, Peg, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
@@ -34,7 +33,6 @@ class RobotToSimulate:
 
     Attributes:
         model, structure: The robot, and the structure of its system.
-        feedback: Whether the plant may evaluate the law itself.
         opens: The contacts that a task opens and closes; empty without a task.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
@@ -43,7 +41,6 @@ class RobotToSimulate:
 
     model: RobotModel
     structure: Structure
-    feedback: bool
     opens: Sequence[str]
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
@@ -124,7 +121,7 @@ class IdealConstraints(ScenarioPlant):
         if self.pegs:
             text = "a peg is for a contact that opens: give a task, or take !Unilateral"
             raise ScenarioError(("plant.pegs", text))
-        return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
+        return RobotPlant(robot.model, structure=robot.structure)
 
 
 @checked(ModelError)
@@ -282,13 +279,3 @@ class OwnPlant(ScenarioPlant):
                     f"'{self.maker}' is no class that keeps the contract of drake_dae.Plant"
                 )
             return kind(robot.model, robot.structure)
-
-
-def plant_kind(data: Mapping[str, Any]) -> type[ScenarioPlant]:
-    """The member that plain data choose by their tag; by default `IdealConstraints`.
-
-    Args:
-        data: The value of the key `plant`.
-    """
-    kinds = {f"!{kind.__name__}": kind for kind in ScenarioPlant.__subclasses__()}
-    return kinds.get(data.get(TAG, ""), IdealConstraints)

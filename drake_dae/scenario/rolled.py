@@ -1,11 +1,9 @@
 """Runs of a scenario by `rollout`, for the command and for studies."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from math import ceil
-from typing import Any, cast
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -19,15 +17,12 @@ from drake_dae.diagrams.state_feedback import (
     encoder_seed,
     packet_seed,
 )
-from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
-from drake_dae.running.rollout.rollout import Rollout, run_loop, run_together
-from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.plants import ScenarioPlant, plant_kind
+from drake_dae.running.rollout.rollout import Rollout, run_loop
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.divergence import RecordWatch, cannot_diverge
+from drake_dae.simulation.divergence import RecordWatch
 from drake_dae.simulation.records.record import Record, RecordAfter
-from drake_dae.simulation.records.together import RunsTogether, indexed_record
 
 ROWS = 1000
 """The number of rows of a record of a rollout under error control, after the first."""
@@ -56,28 +51,6 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
         "Drake's solver stops at a relative residual of 1e-6, and joints stop at their limits in "
         "Drake's plant alone"
     )
-
-
-def rolled_data(data: dict[str, Any]) -> dict[str, Any]:
-    """The plain data of a scenario with a plant that rollouts support, as for `for_rollout`."""
-    kind = plant_kind(data["plant"])
-    if kind.rolled is ScenarioPlant.rolled:
-        return data  # As most: rollouts support it.
-    own = {key: value for key, value in data["plant"].items() if key != TAG}
-    pegs = own.pop("pegs", ())  # Still data.
-    try:
-        plant = kind(**own)
-    except (ModelError, TypeError):
-        return data  # The reader of the data reports it.
-    if (rolled := plant.rolled) is plant:
-        return data
-    numbers = {f.name: getattr(rolled, f.name) for f in fields(cast(Any, rolled))}
-    viscous = _without_viscous(c["name"] for c in data["constraints"] if c.get("viscous_friction"))
-    return {
-        **data,
-        "plant": {TAG: f"!{type(rolled).__name__}", **numbers, "pegs": pegs},
-        "plant_parameters": {**data["plant_parameters"], **viscous},
-    }
 
 
 def _without_viscous(names: Iterable[str]) -> dict[str, float]:
@@ -153,69 +126,6 @@ def roll_scenario(
         look=watched,
     )
     return watched.judged(rollout)
-
-
-def roll_together(
-    scenarios: Sequence[Scenario], loop: ClosedLoop, contexts: Sequence[Context], lasting: float
-) -> list[RunsTogether]:
-    """`roll_scenario` of several scenarios of one loop, those with the same times side by side.
-
-    Args:
-        scenarios: The scenarios.
-        loop: The closed loop of all.
-        contexts: Their starts, by `start_scenario`.
-        lasting: As for `roll_scenario`.
-
-    Returns:
-        The runs, as of `run_together`; one that diverges by itself, up to that time.
-
-    Raises:
-        ModelError: The loop cannot be rolled out.
-    """
-    groups: dict[str, list[int]] = {}
-    for index, scenario in enumerate(scenarios):
-        groups.setdefault(repr((scenario.duration, scenario.integrator)), []).append(index)
-    together: list[RunsTogether] = []
-    for places in groups.values():
-        first = scenarios[places[0]]
-        starts, parameters = zip(*(start_values(loop, contexts[i]) for i in places), strict=True)
-        with suppress(InconsistentStateError):  # That run says so itself.
-            runs = run_together(
-                loop,
-                np.array(starts),
-                np.array(parameters),
-                rollout_times(first, loop.plant.time_step),
-                config=first.integrator,
-                seeds=[_seeds(scenarios[i]) for i in places],
-                lasting=lasting,
-            )
-            for some in runs:
-                chosen = replace(some, places=[places[i] for i in some.places])
-                together += _judged(chosen, scenarios, loop)
-    return together
-
-
-def _judged(
-    runs: RunsTogether, scenarios: Sequence[Scenario], loop: ClosedLoop
-) -> list[RunsTogether]:
-    """The runs; those that diverge by themselves, up to that time."""
-    failures: dict[int, SimulationError] = {}
-    for index in np.flatnonzero(~cannot_diverge(loop.plant, runs.record)).tolist():
-        scenario = scenarios[runs.places[index]]
-        if scenario.may_diverge:
-            continue
-        try:
-            watch = RecordWatch(loop.plant, scenario.duration)
-            watch.look(indexed_record(runs.record, index), is_last=True)
-        except SimulationError as error:
-            failures[index] = error
-    if not failures:
-        return [runs]
-    times = runs.record.time
-    ends = {i: int(np.searchsorted(times, e.time, side="right")) for i, e in failures.items()}
-    others = [index for index in range(len(runs.places)) if index not in failures]
-    failed = [runs.chosen([i], ends[i], failure) for i, failure in failures.items()]
-    return [runs.chosen(others, None, None), *failed] if others else failed
 
 
 def _seeds(scenario: Scenario) -> dict[str, int]:

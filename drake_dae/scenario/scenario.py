@@ -5,7 +5,6 @@ between several classes is written with the name as a tag, for example `surface:
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -16,8 +15,7 @@ from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import listed
-from drake_dae.dae.beyond.spring_loop import SpringLoop
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.errors import ModelError
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -26,7 +24,6 @@ from drake_dae.scenario.forms.values import Interval
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.families import (
     Constraint,
-    Damping,
     DisturbanceForce,
     Encoders,
     Force,
@@ -34,7 +31,6 @@ from drake_dae.scenario.parts.families import (
     FrictionCone,
     Gains,
     LargestErrors,
-    Law,
     Load,
     Observer,
     Output,
@@ -119,14 +115,13 @@ class Scenario:
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
-        law: The tracking law (28) of the whole robot, or a cascade for springs in the joints. By
-            default the tracking law; with springs in Drake's own contact and without `gains` the
-            cascade.
+        contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
+            of forces change within periods of the contact: its deflection is then fed ahead. It
+            needs rigid joints, and references, no task.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
             constraints. With Drake's own contact gains are computed, see `advised`, together with
             `integral`, `constraint_damping`, `observer` and measured force if these are left out;
-            the scenario in the folder of the run contains them. With `actuation` the law must be
-            the cascade.
+            the scenario in the folder of the run contains them; not with `actuation`.
         integral: Names of outputs whose errors are integrated as well, with one more pole:
             positions, and forces if `force_feedback` is measured; none if left out while `gains`
             are given.
@@ -181,10 +176,10 @@ class Scenario:
     bounds: dict[str, Interval] = field(default_factory=dict)
     friction_cones: list[FrictionCone] = field(default_factory=list)
     compliances: dict[str, float] | None = None
-    law: Law | None = None
+    contact_stiffness: float | None = None
     gains: Gains | None = None
     integral: list[str] | None = None
-    constraint_damping: Damping | None = None
+    constraint_damping: Gains | None = None
     observer: Observer | None = None
     identified: list[str] = field(default_factory=list)
     largest_roughness: float | None = None
@@ -216,18 +211,6 @@ class Scenario:
             object.__setattr__(self, "integral", [])
 
     @property
-    def is_cascade(self) -> bool:
-        """Whether the law is a cascade for springs."""
-        if self.law is not None:
-            return self.law.is_cascade
-        return self.is_advised and any(stage.is_spring for stage in self.actuation)
-
-    @property
-    def spring_loop(self) -> SpringLoop | None:
-        """The loop around the springs of a cascade, if all of its numbers are known; else None."""
-        return None if self.law is None else self.law.loop()
-
-    @property
     def is_advised(self) -> bool:
         """Whether the gains are left out and will be computed."""
         return self.gains is None and self.plant.material is not None
@@ -245,13 +228,6 @@ class Scenario:
         return isinstance(other, Scenario) and scenario_reader().write(
             self
         ) == scenario_reader().write(other)
-
-
-_FILLED_IN = ("law", "gains", "integral", "plant")
-"""The keys on which it depends what a scenario fills in."""
-
-_NEW = object()
-"""No part of a scenario."""
 
 
 @cache
@@ -282,33 +258,15 @@ def scenario_data(scenario: Scenario, keys: tuple[str, ...] = ()) -> dict[str, A
     return dict(scenario_reader(keys).write(scenario))
 
 
-def read_scenario(
-    data: Mapping[str, Any], folder: Path | None = None, known: dict[Any, Any] | None = None
-) -> Scenario:
+def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
     """Makes a scenario from plain data, with the paths of its robot unchanged.
 
     Args:
         data: Plain data.
         folder: The folder of relative file names; None for the working directory.
-        known: A cache for many scenarios with most parts in common. Parts that are the same objects
-            as in the data before are not read again; the parts of this scenario are added.
 
     Raises:
         ScenarioError: Keys are unknown or missing, or values are not valid; all problems are
             listed.
     """
-    if known is None:
-        return scenario_reader().read(data, folder)
-    last, before = known.get("last", ({}, None))
-    changed = {key: part for key, part in data.items() if last.get(key, _NEW) is not part}
-    scenario = None
-    if last.keys() == data.keys() and changed.keys().isdisjoint(_FILLED_IN):
-        with suppress(ScenarioError):  # The whole reader lists all problems.
-            read = scenario_reader().read_part
-            parts = {key: read(key, part, folder, known) for key, part in changed.items()}
-            scenario = object.__new__(Scenario)  # Nothing else is to be checked or filled in.
-            vars(scenario).update(vars(before) | parts)
-    if scenario is None:
-        scenario = scenario_reader().read(data, folder, known)
-    known["last"] = data, scenario
-    return scenario
+    return scenario_reader().read(data, folder)

@@ -29,25 +29,32 @@ _TURNS = np.array([0.0, -1.0, 1.0])
 
 
 def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
-    """A context of a closed loop at a scenario's start: `prepare`, and then `begin`."""
-    context = loop.diagram.CreateDefaultContext()
-    prepare(scenario, loop, context)
-    begin(scenario, loop, context)
-    return context
+    """A context of a closed loop at a scenario's start.
 
-
-def prepare(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
-    """Sets all numbers of a context of a closed loop but those that `start` gives.
+    The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
+    references plus the errors, with outputs as in its model, where `plant_parameters` may differ,
+    and on the plant's constraints; a task at start.positions, in contact if its first phase needs
+    it.
 
     Args:
         scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
             uncoupled gains, and the seed of the sensor may be others than those it was built with.
         loop: What `build_completed` made.
-        context: A context of the loop with its defaults.
 
     Raises:
-        ScenarioError: Something does not fit; the message names its key.
+        ScenarioError: There is no such start, or something does not fit; the message names the key.
     """
+    context = loop.diagram.CreateDefaultContext()
+    _set_numbers(scenario, loop, context)
+    if loop.controller.takes_over:
+        _begin_at_rest(scenario, loop, context)
+    else:
+        _begin_with_references(scenario, loop, context)
+    return context
+
+
+def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
+    """Sets all numbers of a context of a closed loop but those that `start` gives."""
     if scenario.integrator.start_time < 0.0 and (loop.plant.time_step or scenario.sampling):
         with at("integrator.start_time"):
             raise ModelError(
@@ -78,23 +85,6 @@ def prepare(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
     for link in (loop.link, loop.packets):
         if link is not None and scenario.sampling is not None:
             link.set_seed(context, scenario.sampling.seed)
-
-
-def begin(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
-    """Sets the start of a run in a context that is prepared for its scenario.
-
-    The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
-    references plus the errors, with outputs as in its model, where `plant_parameters` may differ,
-    and on the plant's constraints; a task at start.positions, in contact if its first phase needs
-    it.
-
-    Raises:
-        ScenarioError: There is no such start; the message names the key.
-    """
-    if loop.controller.takes_over:
-        _begin_at_rest(scenario, loop, context)
-    else:
-        _begin_with_references(scenario, loop, context)
 
 
 def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
@@ -129,7 +119,7 @@ def _check_outside(
     On a contact that gives way it may be as deep as the force that counts as none presses it.
     """
     task, material = scenario.task, scenario.plant.material
-    if task is None or (plan := task.make().plan).latches or plan.contacts[0]:
+    if task is None or (plan := task.make().plan).contacts[0]:
         return
     for contact in opening_contact(scenario, model):
         if (touch := contact.touch(model.links)) is None:
@@ -181,30 +171,22 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
 
     Exogenous ones are measured: law and plant have the same.
     """
-    if "of law" not in loop.memory:  # They are the same in all runs.
-        dae, system = loop.plant.dae, loop.controller.law.system
-        moving = {p.name for p in dae.exogenous.moving}
-        sizes = {p.name: p.value.size for p in system.parameters}
-        known, assumed = np.full(parameters.size, np.nan), system.parameter_values
-        for p in dae.parameters:
-            if p.name not in moving and sizes.get(p.name) == p.value.size:
-                known[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
-        places = np.flatnonzero(~np.isnan(known))
-        loop.memory["of law"] = places, known[places]
-    places, known = loop.memory["of law"]
+    dae, system = loop.plant.dae, loop.controller.law.system
+    moving = {p.name for p in dae.exogenous.moving}
+    sizes, assumed = {p.name: p.value.size for p in system.parameters}, system.parameter_values
     of_law = parameters.copy()
-    of_law[places] = known
+    for p in dae.parameters:
+        if p.name not in moving and sizes.get(p.name) == p.value.size:
+            of_law[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
     return of_law
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
     """The gains of a scenario; those of the last run are reused if the design is the same."""
-    last, last_key, design = loop.memory.get("gains", (None, "", None))
-    if last is not gains:
-        if last_key != (key := repr(gains)):
-            law = loop.controller.law
-            design = law.design(gains.design(law.structure))
-        loop.memory["gains"] = gains, key, design
+    key, design = loop.memory.get("gains", ("", None))
+    if key != repr(gains):
+        design = loop.controller.law.design(gains.design())
+        loop.memory["gains"] = repr(gains), design
     return cast(FeedbackGains, design)
 
 

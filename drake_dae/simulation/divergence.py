@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
-from drake_dae.arrays import FloatArray, by_columns
+from drake_dae.arrays import FloatArray
 from drake_dae.errors import SimulationError
 from drake_dae.simulation.growth import WINDOW, ErrorGrowth, Sizes, StateGrowth, with_sizes
 from drake_dae.simulation.records.record import Record
@@ -159,31 +159,14 @@ class RecordWatch:
         _raise_first([*errors, controls] if is_last else errors)
 
 
-def cannot_diverge(plant: Plant, record: Record) -> np.ndarray:
-    """Whether numbers stay so small that `RecordWatch` finds no error, for each of several runs.
-
-    Args:
-        plant: The plant.
-        record: The whole record of runs with the same times, see `computed_record`.
-    """
-    of_states, of_controls, of_errors = _growths(plant, record, 0.0)
-    errors = by_columns(record["controlled_output"] - record["desired_output"])
-    are_small: np.ndarray = (
-        of_states.are_small(record.signals["state"].sizes)
-        & of_controls.are_small(record.signals["control"].sizes)
-        & of_errors.are_small(np.abs(errors).max(axis=-1))
-    )
-    return are_small
-
-
 def _growths(
     plant: Plant, record: Record, duration: float
 ) -> tuple[StateGrowth, StateGrowth, ErrorGrowth]:
     """The growth of states, controls and errors, from the first row of a record on."""
     signals, time = record.signals["controlled_output"].signals, float(record.time[0])
-    start = _sizes(plant, lambda name: record[name][..., 0, :])
+    start = _sizes(plant, lambda name: record[name][0])
     return (
-        StateGrowth.states(plant, time, record["state"][..., 0, :]),
+        StateGrowth.states(plant, time, record["state"][0]),
         StateGrowth.controls(plant, time, start),
         ErrorGrowth(signals, time, WINDOW * duration, start, _least(plant)),
     )

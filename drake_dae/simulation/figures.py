@@ -1,7 +1,4 @@
-"""The figures of runs as numbers, with names for tables of many runs.
-
-A record is that of several runs with the same times, see `computed_record`.
-"""
+"""The figures of a run as numbers, with names for tables of many runs."""
 
 from collections.abc import Sequence
 from math import isfinite
@@ -21,68 +18,54 @@ class Margins(NamedTuple):
 
     Attributes:
         signals: The signals that have limits.
-        values: For each run, the least distance of each signal from its limits.
+        values: The least distance of each signal from its limits.
     """
 
     signals: Sequence[Signal]
-    values: list[list[float]]
+    values: Sequence[float]
 
-    def exceeded(self) -> list[tuple[str, ...]]:
-        """For each run, the names of the signals beyond their limits."""
-        return [
-            tuple(s.name for s, margin in zip(self.signals, of_run, strict=True) if margin < 0.0)
-            for of_run in self.values
-        ]
+    @property
+    def exceeded(self) -> tuple[str, ...]:
+        """The names of the signals beyond their limits."""
+        pairs = zip(self.signals, self.values, strict=True)
+        return tuple(signal.name for signal, margin in pairs if margin < 0.0)
 
 
-def figures_of(record: Record, found: Margins) -> list[dict[str, float]]:
-    """The figures of each run: name with unit, such as "largest error of tool.z [m]" -> number.
+def figures_of(record: Record, found: Margins) -> dict[str, float]:
+    """The figures of a run: name with unit, such as "largest error of tool.z [m]" -> number.
 
     For each output: the largest |z - r|, the last z - r, and the "late" error, the root mean square
     of z - r over the second half of the time. For each constraint force: its least and largest
     value. For each control: the largest |u|. Then the `margins`, the largest constraint residual
-    before a projection, and the time at which the record ends.
+    before a projection, and the time at which the record ends. An empty record has none.
 
     Args:
-        record: A record of runs, with tracking_error, constraint_force, control,
-            constraint_residual and state; runs with an empty one have no figures.
+        record: The record of a closed loop.
         found: Its `margins`.
     """
     if not record.time.size:
-        return [{} for _ in found.values]
+        return {}
     names = ("tracking_error", "constraint_force", "control")
     errors, forces, controls = (record.signals[name] for name in names)
-    late = late_rms(record.time, errors.values)
-    groups: list[tuple[tuple[str, ...], Sequence[Signal], tuple[FloatArray, ...]]] = [
-        (
-            ("largest error of", "final error of", "late error of"),
-            errors.signals,
-            (errors.sizes, errors.values[:, -1], late),
-        ),
-        (("least", "largest"), forces.signals, forces.extremes),
-        (("largest",), controls.signals, (controls.sizes,)),
-    ]
-    labels = [_label(what, s) for whats, signals, _ in groups for s in signals for what in whats]
-    columns = [np.stack(each, axis=-1).reshape(len(late), -1) for *_, each in groups]
-    known = set(labels)  # The margin of a force that may not pull is its least value.
-    margin_labels = [
-        _label("margin of", s) if _label("least", s) not in known else "" for s in found.signals
-    ]
-    residuals = np.max(record.signals["constraint_residual"].sizes, axis=-1, initial=0.0)
-    rows = zip(np.hstack(columns).tolist(), found.values, residuals.tolist(), strict=True)
-    return [
-        {
-            **dict(zip(labels, row, strict=True)),
-            **{
-                label: room
-                for label, room in zip(margin_labels, margins, strict=True)
-                if label and isfinite(room)
-            },
-            "largest residual": residual,
-            "end [s]": float(record.time[-1]),
-        }
-        for row, margins, residual in rows
-    ]
+    late, figures = late_rms(record.time, errors.values), dict[str, float]()
+    for i, signal in enumerate(errors.signals):
+        values = errors.values[:, i]
+        figures[_label("largest error of", signal)] = float(np.max(np.abs(values)))
+        figures[_label("final error of", signal)] = float(values[-1])
+        figures[_label("late error of", signal)] = float(late[i])
+    for i, signal in enumerate(forces.signals):
+        figures[_label("least", signal)] = float(np.min(forces.values[:, i]))
+        figures[_label("largest", signal)] = float(np.max(forces.values[:, i]))
+    for i, signal in enumerate(controls.signals):
+        figures[_label("largest", signal)] = float(np.max(np.abs(controls.values[:, i])))
+    for signal, room in zip(found.signals, found.values, strict=True):
+        # The margin of a force that may not pull is its least value.
+        if isfinite(room) and _label("least", signal) not in figures:
+            figures[_label("margin of", signal)] = room
+    residuals = np.abs(record["constraint_residual"])
+    figures["largest residual"] = float(np.max(residuals, initial=0.0))
+    figures["end [s]"] = float(record.time[-1])
+    return figures
 
 
 def margins(record: Record, limits: Limits) -> Margins:
@@ -93,26 +76,26 @@ def margins(record: Record, limits: Limits) -> Margins:
     The distance of a signal without limits is infinite. There is none in an empty record.
 
     Args:
-        record: A record of runs.
-        limits: The limits of their robot.
+        record: The record of a closed loop.
+        limits: The limits of its robot.
     """
-    runs = len(record["control"])
     if not record.time.size:
-        return Margins([], [[] for _ in range(runs)])
+        return Margins([], [])
     forces, controls = record.signals["constraint_force"], record.signals["control"]
-    signals, distances = list(controls.signals), []
-    distances.append((np.inf if limits.control is None else limits.control) - controls.sizes)
+    largest = np.max(np.abs(controls.values), axis=0)
+    signals, distances = list(controls.signals), list[FloatArray]()
+    distances.append((np.inf if limits.control is None else limits.control) - largest)
     pushing = [i for i, signal in enumerate(forces.signals) if not limits.can_pull(signal)]
     signals += [forces.signals[i] for i in pushing]
-    distances.append(forces.extremes[0][:, pushing])
+    distances.append(np.min(forces.values[:, pushing], axis=0))
     for name, bounds in (("state", limits.state), ("loop_state", limits.loops)):
         if bounds is not None and name in record.signals:
             (low, high), recorded = bounds, record.signals[name]
-            least, largest = (values[:, : low.size] for values in recorded.extremes)
-            room = np.minimum(least - low, high - largest)
+            values = recorded.values[:, : low.size]
+            room = np.minimum(values.min(axis=0) - low, high - values.max(axis=0))
             signals += recorded.signals[: low.size]
             distances.append(np.where((room >= -SLACK) & (room < 0.0), 0.0, room))
-    return Margins(signals, np.hstack(distances).tolist())
+    return Margins(signals, np.concatenate(distances).tolist())
 
 
 def _label(what: str, signal: Signal) -> str:

@@ -1,8 +1,7 @@
 """States, controls and errors beside their sizes: whether they leave all measure."""
 
 from collections.abc import Sequence
-from functools import reduce
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -29,34 +28,30 @@ MEANINGFUL = 1e-6
 """Outputs and controls whose size is below this fraction of the largest number at the start are not
 judged: their size may be round-off."""
 
-Sizes = dict[str, Any]
-"""Unit -> the largest number in it; of several runs, shape (runs,)."""
+Sizes = dict[str, float]
+"""Unit -> the largest number in it."""
 
 
 def with_sizes(sizes: Sizes, signals: Sequence[Signal], values: FloatArray) -> Sizes:
-    """The largest numbers in each unit, of these sizes and of further values, shape (..., n)."""
+    """The largest numbers in each unit, of these sizes and of further values, shape (n,)."""
     merged, amounts = dict(sizes), np.where(np.isfinite(values), np.abs(values), 0.0)
-    for index, signal in enumerate(signals[: amounts.shape[-1]]):
-        merged[signal.unit] = np.maximum(merged.get(signal.unit, 0.0), amounts[..., index])
+    for index, signal in enumerate(signals[: amounts.size]):
+        merged[signal.unit] = max(merged.get(signal.unit, 0.0), float(amounts[index]))
     return merged
 
 
 def _in_units(sizes: Sizes, signals: Sequence[Signal]) -> FloatArray:
-    """The size in the unit of each signal, 0 in a unit without a size; shape (..., n)."""
-    each = [sizes.get(signal.unit, 0.0) for signal in signals]
-    return np.stack(np.broadcast_arrays(*each), axis=-1) if each else np.zeros(0)
+    """The size in the unit of each signal, 0 in a unit without a size; shape (n,)."""
+    return np.array([sizes.get(signal.unit, 0.0) for signal in signals], dtype=float)
 
 
-def _largest(sizes: Sizes) -> FloatArray:
-    """The largest of all sizes, shape (..., 1)."""
-    return np.expand_dims(reduce(np.maximum, sizes.values(), 0.0), -1)
+def _largest(sizes: Sizes) -> float:
+    """The largest of all sizes."""
+    return max(sizes.values(), default=0.0)
 
 
 class StateGrowth:
-    """The ratios of the states, or of the controls, of a plant to their sizes.
-
-    Sizes are those of one run, shape (n,), or for `are_small` of several, shape (runs, n).
-    """
+    """The ratios of the states, or of the controls, of a plant to their sizes, shape (n,)."""
 
     def __init__(self, signals: Sequence[Signal], time: float, size: FloatArray) -> None:
         self._signals, self._since, self._size = signals, time, size
@@ -73,15 +68,15 @@ class StateGrowth:
         is_judged = size > MEANINGFUL * _largest(sizes)
         return cls(plant.dae.control_signals, time, np.where(is_judged, size, np.inf))
 
-    def are_small(self, largest: FloatArray) -> Any:
-        """Whether values up to these sizes, shape (..., n), have not even begun to diverge."""
-        return (largest <= 10.0 * self._size).all(axis=-1)
+    def _are_small(self, largest: FloatArray) -> bool:
+        """Whether values up to these sizes, shape (n,), have not even begun to diverge."""
+        return bool((largest <= 10.0 * self._size).all())
 
     def look(
         self, times: FloatArray, values: FloatArray, states: FloatArray
     ) -> SimulationError | None:
         """The error of the first row in which a value diverges; None if none does."""
-        if self.are_small(np.abs(by_columns(values)).max(axis=1)):
+        if self._are_small(np.abs(by_columns(values)).max(axis=1)):
             self._since = times[-1]
             return None
         shares = np.abs(values) / self._size
@@ -113,7 +108,7 @@ class ErrorGrowth:
     ) -> None:
         self._signals, self._time, self._window = signals, time, window
         self._largest = _largest(sizes)
-        self._sizes = sizes | {u: np.maximum(size, sizes.get(u, 0.0)) for u, size in least.items()}
+        self._sizes = sizes | {u: max(size, sizes.get(u, 0.0)) for u, size in least.items()}
         self._mean, self._since = np.zeros(len(signals)), np.full(len(signals), time)
 
     def look(
@@ -168,17 +163,14 @@ class ErrorGrowth:
         self._mean *= np.exp((self._time - time) / self._window)
         self._since[:] = self._time = time
 
-    def are_small(self, largest: FloatArray) -> Any:
-        """Whether errors up to these sizes, shape (..., p), do not exceed those of the outputs."""
-        return (largest <= _in_units(self._sizes, self._signals)).all(axis=-1)
-
     def _is_small(self, errors: FloatArray, desired: FloatArray) -> bool:
         """Whether no error exceeds its size before these rows; if so, updates the sizes."""
-        if not self.are_small(by_columns(errors).max(axis=1)):
+        largest = by_columns(errors).max(axis=1)
+        if not (largest <= _in_units(self._sizes, self._signals)).all():
             return False
         largest_now = np.abs(by_columns(desired)).max(axis=1)
-        for signal, largest in zip(self._signals, largest_now.tolist(), strict=True):
-            self._sizes[signal.unit] = max(self._sizes.get(signal.unit, 0.0), largest)
+        for signal, size in zip(self._signals, largest_now.tolist(), strict=True):
+            self._sizes[signal.unit] = max(self._sizes.get(signal.unit, 0.0), size)
         return True
 
     def _along(self, desired: FloatArray) -> FloatArray:

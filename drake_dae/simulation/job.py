@@ -295,11 +295,11 @@ def _within_since(times: FloatArray, error: FloatArray, tolerance: float) -> flo
 
 
 def late_rms(times: FloatArray, errors: FloatArray) -> FloatArray:
-    """Root mean squares over the second half of the time, shape (..., p).
+    """Root mean squares over the second half of the time, shape (p,).
 
     Args:
         times: The times in s, shape (k,), k >= 1.
-        errors: The errors at these times, shape (..., k, p); linear between them.
+        errors: The errors at these times, shape (k, p); linear between them.
     """
     values = by_columns(errors)
     middle = 0.5 * (times[0] + times[-1])

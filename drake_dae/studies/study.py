@@ -1,50 +1,45 @@
-"""The results of a study, as a table and in words."""
+"""The results of a sweep, as a table, a plot, and in words."""
 
 import csv
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from drake_dae.analysis.tables import Part, Table, count_of, to_text
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.pictures.inline import InlinePage
-from drake_dae.scenario.files import save_scenario
-from drake_dae.scenario.scenario import Scenario
-from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.run_names import rerun_commands, run_name
+from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.studies.variations import Variation
 
-FILES = ("runs.csv", "summary.txt", "study.html", "histograms.png", "map.png")
+FILES = ("runs.csv", "runs.png")
 """The names of the files that `Study.save` writes."""
 
 MOST_REASONS = 5
 """The largest number of unfinished runs that are listed with their reasons."""
 
+MOST_AXES = 24
+"""The largest number of figures in the plot."""
+
 
 @checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A study: its variations and their results.
+    """The results of a sweep.
 
     Attributes:
         variations: For each run, dotted key of the scenario -> value.
         results: The result of each run.
-        scenario: The scenario of the study, from which `save` derives the commands that repeat a
-            run; None if unknown.
-        rollout: Whether the runs were rollouts.
     """
 
     variations: tuple[Variation, ...]
     results: tuple[RunResult, ...]
-    scenario: Scenario | None = field(default=None, repr=False)
-    rollout: bool = False
 
     def __post_init__(self) -> None:
         if len(self.variations) != len(self.results):
@@ -88,7 +83,7 @@ class Study:
         or on interruptions.
         """
         return {
-            "run": [result.run for result in self.results],
+            "run": list(range(len(self.results))),
             **{key: [changes.get(key) for changes in self.variations] for key in self.keys},
             "outcome": [str(result.outcome) for result in self.results],
             "reason": [result.reason for result in self.results],
@@ -108,68 +103,49 @@ class Study:
             for values in [self.values(name)]
         }
 
-    @checked(ModelError)
-    def save(
-        self,
-        folder: str | Path,
-        title: str = "",
-        again: Sequence[str] = (),
-        duration: float | None = None,
-    ) -> list[Path]:
-        """Writes `runs.csv`, `summary.txt`, `study.html`, and one plot for each available figure.
+    def plot(self) -> Figure:
+        """Each figure that varies over the first key with numbers that vary, or over the runs.
 
-        `study.html` is a self-contained page with a sortable table, parallel coordinates, and a
-        comparison of runs. If a folder "run<number>" exists beside the page, the page shows the
-        plots and the animation of this run, and otherwise the command that creates the folder.
-        Without `again` a study of a scenario writes it to `scenario.yaml` for these commands.
+        A red cross is a run that did not finish.
+        """
+        table = self.table()
+        columns = {key: _numbers(table[key]) for key in self.keys}
+        name, x = next(
+            ((key, column) for key, column in columns.items() if _varies(column)),
+            ("run", np.arange(len(self.results), dtype=float)),
+        )
+        drawn = [each for each in self.figures if _varies(self.values(each))][:MOST_AXES]
+        unfinished = np.array([r.outcome is not Outcome.FINISHED for r in self.results])
+        rows = -(-max(len(drawn), 1) // 3)
+        figure = Figure(figsize=(12.0, 3.0 * rows), layout="constrained")
+        for index, each in enumerate(drawn):
+            axis, y = figure.add_subplot(rows, 3, index + 1), self.values(each)
+            axis.plot(x, y, ".", color="C0")
+            axis.plot(x[unfinished], y[unfinished], "x", color="C3")
+            axis.set_title(_text(each), fontsize=9)
+            axis.set_xlabel(_text(name), fontsize=8)
+            axis.tick_params(labelsize=8)
+        return figure
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Writes the table as `runs.csv`, and the plot as `runs.png`.
 
         Args:
             folder: The folder to write to; created if it does not exist.
-            title: The title of the page; the name of the folder if empty.
-            again: For each run a command that creates its folder, instead of the default one.
-            duration: The duration of the runs, in s; None for that of the scenario, or 1 without a
-                scenario.
 
         Returns:
-            The paths of `runs.csv`, `summary.txt`, `study.html` and the plots.
+            The paths of both files.
         """
-        from drake_dae.studies.study_plots import save_study_plots
-
-        if again and len(again) != len(self.results):
-            raise ModelError(f"{len(self.results)} runs need as many commands, got {len(again)}")
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        if self.scenario is not None and not again:
-            base = folder / "scenario.yaml"
-            save_scenario(self.scenario, base)
-            made = ["drake-dae", "simulate", str(base), *(["--rollout"] if self.rollout else [])]
-            again = rerun_commands(made, self.variations, folder)
-            duration = self.scenario.duration if duration is None else duration
-        table, summary, page = (folder / name for name in FILES[:3])
+        table, plot = (folder / name for name in FILES)
         columns = self.table()
         with open(table, "w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
-            writer.writerows(
-                [_cell(entry) for entry in row] for row in zip(*columns.values(), strict=True)
-            )
-        summary.write_text(f"{self}\n", encoding="utf-8")
-        title = title or folder.resolve().name
-        seconds = 1.0 if duration is None else duration
-        page.write_text(self._page(title, again, seconds), encoding="utf-8")
-        plots = save_study_plots(columns, self.keys, self.figures, folder)
-        return [table, summary, page, *plots]
-
-    def _repr_html_(self) -> str:
-        """The page of `save`, for a notebook."""
-        return self._page(repr(self), (), 1.0)._repr_html_()
-
-    def _page(self, title: str, again: Sequence[str], duration: float) -> InlinePage:
-        from drake_dae.studies.study_page import PageText, study_page
-
-        names = [run_name(changes) for changes in self.variations]
-        text = PageText(title, self._outcomes(), names, again, duration)
-        return InlinePage(study_page(self.table(), self.keys, self.figures, text))
+            writer.writerows(map(_cell, row) for row in zip(*columns.values(), strict=True))
+        self.plot().savefig(plot, dpi=100)
+        return [table, plot]
 
     def _outcomes(self) -> str:
         """The number of runs, and of each outcome, in words."""
@@ -179,15 +155,15 @@ class Study:
 
     def _parts(self) -> list[Part]:
         parts: list[Part] = [[self._outcomes()]]
-        others = [result for result in self.results if result.outcome is not Outcome.FINISHED]
+        others = [
+            f"run {run}, {_name(self.variations[run])}: {result.outcome}: {result.reason}"
+            for run, result in enumerate(self.results)
+            if result.outcome is not Outcome.FINISHED
+        ]
+        if len(others) > MOST_REASONS:
+            others = [*others[:MOST_REASONS], f"and {len(others) - MOST_REASONS} more"]
         if others:
-            lines = [
-                f"run {r.run}, {run_name(self.variations[r.run])}, {r.outcome}: {r.reason}"
-                for r in others[:MOST_REASONS]
-            ]
-            if len(others) > MOST_REASONS:
-                lines.append(f"and {len(others) - MOST_REASONS} more, see runs.csv")
-            parts.append(lines)
+            parts.append(others)
         beyond = Counter(name for result in self.results for name in result.exceeded)
         if beyond:
             counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
@@ -200,16 +176,32 @@ class Study:
     def _row(self, figure: str) -> list[str]:
         values = self.values(figure)
         least, largest = int(np.nanargmin(values)), int(np.nanargmax(values))
-        return [
-            figure,
-            f"{values[least]:.4g}",
-            f"{least}",
-            f"{np.nanmedian(values):.4g}",
-            f"{values[largest]:.4g}",
-            f"{largest}",
-        ]
+        numbers = values[least], np.nanmedian(values), values[largest]
+        low, median, high = (f"{number:.4g}" for number in numbers)
+        return [figure, low, f"{least}", median, high, f"{largest}"]
+
+
+def _name(changes: Variation) -> str:
+    return ", ".join(f"{key}={_cell(value)}" for key, value in changes.items())
 
 
 def _cell(entry: Any) -> Any:
-    """Returns lists and mappings as JSON, and other values unchanged."""
+    """Lists and mappings as JSON, and other values unchanged."""
     return json.dumps(entry) if isinstance(entry, (dict, list)) else entry
+
+
+def _text(name: str) -> str:
+    return name.replace("$", r"\$")  # Matplotlib would read mathematics.
+
+
+def _numbers(column: Sequence[Any]) -> FloatArray:
+    """A column as numbers, from numbers or lists of one number; nan for other entries."""
+    flat = [entry[0] if isinstance(entry, list) and len(entry) == 1 else entry for entry in column]
+    is_number = [isinstance(e, (int, float)) and not isinstance(e, bool) for e in flat]
+    return np.array([e if yes else np.nan for e, yes in zip(flat, is_number, strict=True)], float)
+
+
+def _varies(values: FloatArray) -> bool:
+    """Whether the numbers of a column differ by more than round-off."""
+    finite = values[np.isfinite(values)]
+    return finite.size > 1 and bool(np.ptp(finite) > 1e-9 * np.max(np.abs(finite)))

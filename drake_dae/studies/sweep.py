@@ -1,36 +1,48 @@
-"""Studies: a scenario run many times with other values of some of its keys."""
+"""Sweeps: a scenario run many times with other values of some of its keys."""
 
+import json
+import multiprocessing.context
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
-from functools import cache
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from contextlib import contextmanager, suppress
+from functools import partial
 from importlib.metadata import version
-from math import isfinite
 from pathlib import Path
+from queue import SimpleQueue
+from types import ModuleType
 from typing import Any
 
+from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import check_whole_number, positive
-from drake_dae.errors import ScenarioError
+from drake_dae.arrays import brief, check_whole_number, positive
+from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.running.rollout.run import num_cores
 from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.model import complete_scenario
+from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data
 from drake_dae.simulation.records.interruption import end_at_once, ending_signals
 from drake_dae.simulation.simulate import default_size
-from drake_dae.studies.cluster import Cluster
-from drake_dae.studies.journal import Journal, open_journal, study_head
-from drake_dae.studies.processes import cores, run_in_processes
-from drake_dae.studies.results import Outcome, RunResult
-from drake_dae.studies.runs import Runner
-from drake_dae.studies.structures import batches, lasting, structures_of
+from drake_dae.studies.journal import Journal, open_journal
+from drake_dae.studies.runs import Outcome, Runner, RunResult, run_one, structure_of
 from drake_dae.studies.study import Study
-from drake_dae.studies.variations import MOST_RUNS, Variation, plain
+from drake_dae.studies.variations import Variation, plain
 
-MOST_PROBLEMS = 10
-"""The largest number of invalid values that are reported together."""
+CHECKED = 20
+"""The largest number of variations whose keys and values are checked before the first run."""
+
+BUILDS = 200
+"""The number of runs after which a process is replaced if each has a loop of its own, since Drake
+does not free all memory."""
+
+AHEAD = 1000
+"""The largest number of runs that an executor has at a time."""
+
+Submit = Callable[[str, Variation], "Future[RunResult]"]
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -40,189 +52,201 @@ def sweep(
     file: str | Path,
     *,
     workers: int | None = None,
-    cluster: str | None = None,
+    executor: Executor | None = None,
     progress: bool = False,
     rollout: bool = False,
     time_limit: float = 3600.0,
 ) -> Study:
     """Runs a scenario once for each variation, and stores each result in a file at once.
 
-    A study that was interrupted continues when the same call is made again: it skips runs with a
-    result in the file, and its table is the same as without the interruption. A failed run is an
-    outcome with a reason. The next call repeats runs whose process died or exceeded the time limit.
-    Before the first run, all keys and values are checked (of numbers, the least and the largest),
-    and up to three variations are built until one starts.
+    A sweep that was interrupted continues when the same call is made again: it skips runs with a
+    result in the file. A failed run is an outcome with a reason. A run whose process dies, or that
+    exceeds the time limit, is lost alone, and the next call repeats it. Keys and values of up to
+    twenty variations are checked before the first run, and up to three are built until one is
+    valid.
 
-    Runs that differ only in start, plant_parameters, seed of the sensor, gains that couple no
-    outputs, or integrator share one closed loop in each process.
+    Runs that differ only in start, duration, integrator, plant_parameters, seeds, or gains that
+    couple no outputs, share one closed loop in each process.
 
     Args:
         scenario: A scenario from `load_scenario`.
         variations: For each run, dotted key of the scenario -> value; for example from
             `grid_variations`, `random_variations` or `listed_variations`.
-        file: The file, in JSON Lines: a line for the study, then a line for each run.
+        file: The file, an SQLite database: a row for each run that has ended. Several processes
+            may continue one sweep in it at the same time.
         workers: The number of processes of this machine; None for the number of its cores.
-        cluster: The address of a Dask scheduler, whose workers simulate the runs instead. Their
-            machines need drake_dae and the files of the robot.
+        executor: Where to run instead, such as `dask.distributed.Client(...).get_executor()`. Its
+            machines need drake_dae and the files of the robot. Time limits are then those of the
+            executor.
         progress: Shows a bar with the remaining time, if stderr is a terminal.
         rollout: Simulates by `rollout` instead of Drake's Simulator, which is many times as fast.
-            Machine code is compiled if this saves time in the whole study. Figures are computed
+            Machine code is compiled if this saves time in the whole sweep. Figures are computed
             from 1,000 equally spaced rows of each run, or from all steps if steps are fixed.
         time_limit: The longest elapsed time of a run on this machine, in s, including the time to
             build its loop. A process that exceeds it is killed.
 
     Raises:
-        ScenarioError: A key or a value is not valid, or none of the variations that were tried
-            starts, or a rollout does not support the loop.
-        ModelError: The file belongs to another study or cannot be written, or processes or cluster
-            cannot be used.
+        ScenarioError: A key or a value is not valid, or a rollout does not support the loop.
+        ModelError: The file belongs to another sweep or cannot be written, or no process starts.
     """
+    if workers is not None:
+        check_whole_number("workers", workers, 1)
+    positive("time_limit", time_limit)
     with suppress(ScenarioError):  # Each run reports it; a run may have other values.
         scenario = complete_scenario(scenario).scenario
     base = scenario_data(scenario)
     chosen = [{key: plain(key, value) for key, value in changes.items()} for changes in variations]
     _check(base, chosen)
-    if workers is not None:
-        check_whole_number("workers", workers, 1)
-    positive("time_limit", time_limit)
-    path, head = Path(file), study_head(version("drake_dae"), base, chosen, rollout)
-    structures = cache(lambda: structures_of(base, chosen, rollout))
-    settings = base, lasting(structures()) if rollout else None
+    simulated = for_rollout(scenario)[0] if rollout else scenario
+    structures = [json.dumps(structure_of(each, simulated), sort_keys=True) for each in chosen]
+    count, lasting = len(set(structures)), None
+    if rollout:
+        lasting = sum(each.get("duration", scenario.duration) for each in chosen) / count
+    head = {"drake_dae": version("drake_dae"), "rollout": json.dumps(rollout)}
+    head |= {key: json.dumps(part) for key, part in base.items()}
+    head["variations"] = json.dumps(chosen)
+    path, settings = Path(file), json.dumps([base, lasting])
     with ending_signals(end_at_once):
         if not os.path.lexists(path):
-            _try(Runner(*settings), chosen)
+            _try(Runner(base, lasting), chosen)
         with open_journal(path, head) as journal:
-            _run(settings, chosen, structures, journal, workers, cluster, progress, time_limit)
-    found = tuple(journal.results[run] for run in range(len(chosen)))
-    return Study(tuple(chosen), found, scenario, rollout)
+            # Runs of one structure follow each other, so that a process keeps its loop.
+            order = sorted(range(len(chosen)), key=structures.__getitem__)
+            missing = [run for run in order if not journal.is_done(run)]
+            results: dict[int, RunResult] = {}
+            if missing:
+                count = min(workers or num_cores(), len(missing))
+                running, ahead = _processes(count, time_limit, len(set(structures))), 4 * count
+                if executor is not None:
+                    running, ahead = _submitted_to(executor), AHEAD
+                with running as submit, _bar(len(chosen), len(missing), progress) as bar:
+                    todo = {run: chosen[run] for run in missing}
+                    for some in _ended(todo, settings, submit, ahead, journal):
+                        journal.add(some)
+                        results |= some
+                        bar.update(len(some))
+            results |= journal.results()
+    return Study(tuple(chosen), tuple(results[run] for run in range(len(chosen))))
 
 
-def _run(
-    settings: Sequence[Any],
-    variations: Sequence[Variation],
-    structures: Callable[[], Sequence[tuple[str, float]]],
-    journal: Journal,
-    workers: int | None,
-    cluster: str | None,
-    progress: bool,
-    time_limit: float,
-) -> None:
-    """Simulates the runs that have no final result in the journal, and appends their results."""
-    final = {run for run, result in journal.results.items() if result.outcome.is_final}
-    missing = [pair for pair in enumerate(variations) if pair[0] not in final]
-    if not missing:
-        return
-    total = len(variations)
-    with _bar(total, total - len(missing), progress) as show, ExitStack() as stack:
-        connected = None if cluster is None else stack.enter_context(Cluster(cluster))
-        count = connected.workers if connected else workers or cores()
-        groups = batches(structures(), missing, count, settings[1] is not None)
-        results = (
-            connected.run(settings, groups)
-            if connected
-            else run_in_processes(settings, groups, count, time_limit)
-        )
-        for some in stack.enter_context(closing(results)):
-            journal.append(some)
-            show(some)
+def _ended(
+    runs: Mapping[int, Variation], settings: str, submit: Submit, ahead: int, journal: Journal
+) -> Iterator[dict[int, RunResult]]:
+    """Makes runs; yields the results of those that have ended, by their numbers."""
+    ended: SimpleQueue[tuple[int, Future[RunResult]]] = SimpleQueue()
+    waiting, running = list(runs.items())[::-1], 0
+    while waiting or running:
+        while waiting and running < ahead:
+            run, variation = waiting.pop()
+            if journal.is_done(run):  # By another process meanwhile.
+                continue
+            put = partial(lambda run, future: ended.put((run, future)), run)
+            submit(settings, variation).add_done_callback(put)
+            running += 1
+        results = dict[int, RunResult]()
+        while running and (not results or not ended.empty()):
+            run, future = ended.get()
+            results[run] = _result(future)
+            running -= 1
+        yield results
+
+
+def _result(future: "Future[RunResult]") -> RunResult:
+    """The result of a run that has ended, or been lost."""
+    try:
+        return future.result()
+    except TimeoutError as error:
+        return RunResult(Outcome.TIMED_OUT, f"no end within {error.args[-1]:g} s")
+    except BrokenExecutor as error:
+        raise ModelError(f"the processes of the sweep have ended: {error}") from error
+    except ProcessExpired as error:
+        return RunResult(Outcome.CRASHED, f"its process ended with exit code {error.exitcode}")
+    except (Exception, CancelledError) as error:
+        return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
 
 
 @contextmanager
-def _bar(total: int, done: int, progress: bool) -> Iterator[Callable[[list[RunResult]], None]]:
-    """Shows a progress bar on a terminal; yields a function that counts new results."""
-    form = "{percentage:3.0f}%|{bar}| {n}/{total} runs, {remaining} left{postfix}"
-    bar = tqdm(
-        total=total,
-        initial=done,
-        disable=not (progress and sys.stderr.isatty()),
-        file=sys.stderr,
-        bar_format=form,
-        smoothing=0.05,
-        **default_size(),
-    )
-    unfinished = 0
+def _processes(count: int, time_limit: float, num_structures: int) -> Iterator[Submit]:
+    """Processes of this machine. One that dies, or is too slow, is replaced, and loses its run."""
+    most = BUILDS if num_structures > BUILDS else 0
+    pool = ProcessPool(count, max_tasks=most, context=_WithoutMain())
+    try:
+        yield lambda *args: pool.schedule(run_one, args, timeout=time_limit)
+    finally:
+        pool.stop()  # type: ignore[no-untyped-call]
+        pool.join()
 
-    def show(results: list[RunResult]) -> None:
-        nonlocal unfinished
-        unfinished += sum(result.outcome is not Outcome.FINISHED for result in results)
-        with suppress(OSError):  # The study continues after its terminal was closed.
-            if unfinished:
-                bar.set_postfix_str(f"{unfinished} not finished", refresh=False)
-            bar.update(len(results))
+
+@contextmanager
+def _submitted_to(executor: Executor) -> Iterator[Submit]:
+    """An executor of the caller, whose runs without a result are cancelled at the end."""
+    futures = list["Future[RunResult]"]()
+
+    def submit(settings: str, variation: Variation) -> "Future[RunResult]":
+        futures.append(executor.submit(run_one, settings, variation))
+        return futures[-1]
 
     try:
-        yield show
+        yield submit
     finally:
-        with suppress(OSError):
-            bar.close()
+        for future in futures:
+            future.cancel()
+
+
+class _Process(multiprocessing.context.SpawnProcess):
+    """A new interpreter that does not import the caller's script, which so needs no guard."""
+
+    def start(self) -> None:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            super().start()
+        finally:
+            sys.modules["__main__"] = main
+
+
+class _WithoutMain(multiprocessing.context.SpawnContext):
+    Process = _Process
+
+
+def _bar(total: int, missing: int, progress: bool) -> Any:
+    """A bar on a terminal."""
+    return tqdm(
+        total=total,
+        initial=total - missing,
+        unit="run",
+        disable=not (progress and sys.stderr.isatty()),
+        **default_size(),
+    )
 
 
 def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
-    """Checks that a scenario accepts all keys and values."""
+    """Checks that a scenario accepts keys and values, of some variations if there are many."""
     if not variations:
-        raise ScenarioError(("", "a study needs at least one variation"))
-    if len(variations) > MOST_RUNS:
-        raise ScenarioError(("", f"a study has at most {MOST_RUNS} runs, got {len(variations)}"))
+        raise ScenarioError(("", "a sweep needs at least one variation"))
     problems: dict[tuple[str, str], None] = {}
-    for changes in _representatives(variations):
+    for changes in variations[:: -(-len(variations) // CHECKED)]:
         try:
-            robot = read_scenario(varied_data(base, changes)).robot
-            for path in (robot.file, *robot.packages.values()):
-                if path and not path.startswith("package://") and not Path(path).is_absolute():
-                    text = f"a path that varies is absolute or begins with package://, got '{path}'"
-                    raise ScenarioError(("robot", text))
+            read_scenario(varied_data(base, changes))
         except ScenarioError as error:
             problems.update(dict.fromkeys(error.problems))
-            if len(problems) >= MOST_PROBLEMS:
-                break
     if problems:
         raise ScenarioError(*problems)
-
-
-def _representatives(variations: Sequence[Variation]) -> Iterator[Variation]:
-    """Variations with each value of each key; of a key's numbers, the least and the largest."""
-    for group in _same_keys(variations):
-        first = group[0]
-        yield first
-        for key in first:
-            for value in _extremes([changes[key] for changes in group]):
-                yield {**first, key: value}
-
-
-def _same_keys(variations: Sequence[Variation]) -> list[list[Variation]]:
-    """Groups of variations that change the same keys."""
-    groups: dict[tuple[str, ...], list[Variation]] = {}
-    for changes in variations:
-        groups.setdefault(tuple(changes), []).append(changes)
-    return list(groups.values())
-
-
-def _extremes(values: Sequence[Any]) -> list[Any]:
-    """The different values; of finite numbers, the least and the largest of each type."""
-    numbers: dict[type, list[float]] = {int: [], float: []}
-    others = {}
-    for value in values:
-        if type(value) is int or (type(value) is float and isfinite(value)):
-            numbers[type(value)].append(value)
-        else:
-            others[repr(value)] = value
-    ends = [end for same in numbers.values() if same for end in (min(same), max(same))]
-    return [*others.values(), *ends]
 
 
 def _try(runner: Runner, variations: Sequence[Variation]) -> None:
     """Checks that runs can be built, for example that the names of parameters exist.
 
     Raises:
-        ScenarioError: The first, the middle and the last run of a group with the same keys all have
-            an error in keys or values; it is the error of the first run.
+        ScenarioError: The first, the middle and the last run all have an error in keys or values;
+            it is that of the first.
     """
-    for group in _same_keys(variations):
-        errors = []
-        for index in dict.fromkeys((0, len(group) // 2, len(group) - 1)):
-            error = runner.why_not(group[index])
-            if error is None:
-                break
+    errors = []
+    for index in dict.fromkeys((0, len(variations) // 2, len(variations) - 1)):
+        try:
+            runner.check(variations[index])
+        except ScenarioError as error:
             errors.append(error)
         else:
-            raise errors[0]
+            return
+    raise errors[0]

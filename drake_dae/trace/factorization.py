@@ -203,23 +203,3 @@ def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:
         if right[:, j].nnz():
             result[:, j] = ca.solve(triangle, right[:, j])
     return ca.sparsify(result)
-
-
-def smallest_sine(rows: ca.SX, usual: Sequence[float]) -> ca.SX:
-    """Returns the smallest sine of the angle between a row and the span of earlier rows.
-
-    Args:
-        rows: The matrix, shape (k, n).
-        usual: The usual lengths of rows; for a shorter row the sine is reduced in proportion.
-    """
-    smallest = ca.SX(1)
-    basis: list[ca.SX] = []
-    for i, length in enumerate(usual):
-        row = rest = ca.densify(rows[i, :])
-        for direction in basis:
-            rest -= ca.dot(direction, rest) * direction
-        length_left = ca.norm_2(rest)
-        basis.append(rest / length_left)
-        whole = ca.fmax(ca.norm_2(row), length)
-        smallest = ca.fmin(smallest, ca.if_else(whole > 0, length_left / whole, 0))
-    return smallest

@@ -17,6 +17,7 @@ from problems.found import NO, OPEN, YES, findings
 from runs import some
 
 from drake_dae.analysis.analyze import analyze
+from drake_dae.analysis.findings import Finding
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.stability import Verdict
@@ -96,7 +97,7 @@ def test_zero_dynamics_that_are_undecided_are_none():
     """A pendulum held by its tension swings for ever."""
     analysis = analyze(PROBLEMS["pendulum_tension"]().system)
     assert analysis.problems == ()
-    assert re.search(r"2\.2  zero dynamics are stable +undecided", str(analysis))
+    assert analysis.zero_dynamics_finding is Finding.UNDECIDED
     assert re.search(r"eigenvalues 0 ± 3\.8\d+i 1/s", str(analysis))
 
 

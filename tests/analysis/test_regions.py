@@ -67,7 +67,7 @@ def test_a_region_without_consistent_states(region):
         ({"states": "all"}, "states must be finite real numbers"),
         ({"states": [[0.48, -0.64, 0, 0]], "region": {}}, "give a region or states, not both"),
         ({"times": [0, 1]}, "a reference needs times"),
-        ({"start": [0.48, -0.64, 0, 0]}, "start is the state"),
+        ({"start": [0.48, -0.64, 0, 0]}, "start"),
         ({"reference": lambda t: np.zeros(3)}, "a reference needs times"),
         ({"count": -1}, "count must be a whole number from 1, got -1"),
         ({"count": 2.5}, r"count must be a whole number, got 2\.5"),

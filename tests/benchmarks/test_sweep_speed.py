@@ -8,7 +8,7 @@ import pytest
 from runs import scenario
 
 from drake_dae import grid_variations, sweep
-from drake_dae.studies.processes import cores
+from drake_dae.running.rollout.run import num_cores
 
 
 def starts(count):
@@ -25,11 +25,11 @@ def children():
 def test_two_processes(runs, rollout, report, tmp_path):
     chosen = scenario("two_link_wall")
     # Machine code is kept.
-    sweep(chosen, starts(60), tmp_path / "first.jsonl", workers=1, rollout=rollout)
+    sweep(chosen, starts(60), tmp_path / "first.db", workers=1, rollout=rollout)
     wall, used = {}, {}
     for workers in (1, 2):
         began, before = time.perf_counter(), children()
-        file = tmp_path / f"{workers}.jsonl"
+        file = tmp_path / f"{workers}.db"
         sweep(chosen, starts(runs), file, workers=workers, rollout=rollout)
         wall[workers], used[workers] = time.perf_counter() - began, children() - before
     report(
@@ -37,7 +37,7 @@ def test_two_processes(runs, rollout, report, tmp_path):
         {
             "1 process [s]": f"{wall[1]:.1f}",
             "2 processes [s]": f"{wall[2]:.1f}",
-            f"ratio on {cores()} cores": f"{wall[1] / wall[2]:.2f} (>1.8)",
+            f"ratio on {num_cores()} cores": f"{wall[1] / wall[2]:.2f} (>1.8)",
             "processor time a run, 2 over 1": f"{used[2] / used[1]:.2f}",
         },
     )
@@ -46,8 +46,8 @@ def test_two_processes(runs, rollout, report, tmp_path):
 def test_ten_thousand_rollouts(report, tmp_path):
     """10 s of the 2-link wall each, from its building to the table, on all cores."""
     began = time.perf_counter()
-    file = tmp_path / "runs.jsonl"
+    file = tmp_path / "runs.db"
     study = sweep(scenario("two_link_wall"), starts(10_000), file, rollout=True)
     wall = time.perf_counter() - began
     assert study.table()["outcome"] == ["finished"] * 10_000
-    report("two_link_wall: 10,000 rollouts", {f"on {cores()} cores [s]": f"{wall:.1f} (<60)"})
+    report("two_link_wall: 10,000 rollouts", {f"on {num_cores()} cores [s]": f"{wall:.1f} (<60)"})

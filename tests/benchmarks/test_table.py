@@ -7,12 +7,9 @@ imports. What is compared computes the same, which is checked first. Peers stand
 import subprocess
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from arms import error_controlled
-from parallel_bars import bars, parallelogram, swung
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
@@ -23,7 +20,6 @@ from timing import calls, has_compiler, race, times
 from two_arms import two_arms
 
 from drake_dae import (
-    DaePlant,
     JointPositions,
     Plane,
     PointOnSurface,
@@ -163,28 +159,6 @@ def test_projection(compare):
     took = race(found)
     if "machine code" in took:
         figure = "projection of a state, 14 joints in a loop: machine code"
-        compare(figure, took["machine code"], "interpreted", took["interpreted"])
-
-
-def test_four_bars(compare):
-    """The double four-bar of the IFToMM benchmark, 10 s, through its singular configurations."""
-    model, _ = bars(2, 9.81)
-    start, found = parallelogram(model.links.plant, np.pi / 2, -1.0), {}
-    for how, text in choices().items():
-        plant = DaePlant(replace(model.dae, compiled=text == "true"))
-
-        def run(plant=plant):
-            context = plant.CreateDefaultContext()
-            plant.set_state(context, start)
-            simulate(plant, context, 10.0, error_controlled(1e-9))
-            return plant.state(context)
-
-        off = abs(run()[0] - swung(2, 9.81, np.pi / 2, -1.0, 10.0)[0])
-        assert off < 1e-6
-        found[how] = run
-    took = race(found, rounds=3, number=1)
-    if "machine code" in took:
-        figure = "double four-bar, 10 s, angle to 1e-6 rad: machine code"
         compare(figure, took["machine code"], "interpreted", took["interpreted"])
 
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 import os
 import random
 import struct
@@ -29,7 +28,6 @@ from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.shipped import FOLDER, find_scenario
-from drake_dae.studies.journal import open_journal, study_head
 
 ROBOTS = Path(__file__).parents[1] / "scenario" / "robots"
 
@@ -59,9 +57,7 @@ KINDS = ("<f8", "<f4", "<i2", "<c16", "|b1", "<U4", "|O", "<M8[s]", "nonsense", 
 def attempt(seed: int, folder: Path) -> Outcome:
     """Reads something bad."""
     choice = random.Random(seed)
-    kind = choice.choices(
-        (_data, _special, _robot, _record, _journal, _command), (6, 1, 4, 2, 2, 5)
-    )[0]
+    kind = choice.choices((_data, _special, _robot, _record, _command), (6, 1, 4, 2, 5))[0]
     return kind(choice, folder)
 
 
@@ -235,7 +231,7 @@ def _robot(choice: random.Random, folder: Path) -> Outcome:
     return _outcome(f"{file.name}: {how}", read, "what is left is a robot")
 
 
-# Records and journals.
+# Records.
 
 
 def _record(choice: random.Random, folder: Path) -> Outcome:
@@ -254,31 +250,6 @@ def _record(choice: random.Random, folder: Path) -> Outcome:
         how, data = _damaged(file.read_bytes(), choice)
         file.write_bytes(data)
     return _outcome(f"record: {how}", lambda: Record.load(file), "what is left is a record")
-
-
-def _journal(choice: random.Random, folder: Path) -> Outcome:
-    """A line of a study's file with one entry that is another."""
-    head = study_head("1", {"duration": 1.0}, [{"a": 1}, {"a": 2}])
-    line = {"run": 0, "outcome": "finished", "reason": "", "figures": {"end [s]": 1.0}}
-    line |= {"exceeded": [], "seconds": 1.0}
-    key = choice.choice(list(line))
-    values = [-1, 2, 99, "0", True, None, 1.5, 1e300, [], {}, "x", float("nan"), [[1]], "\ud800"]
-    new = choice.choice(values)
-    text = json.dumps({**line, key: new})
-    if choice.random() < 0.1:
-        text = "[" * 50_000
-    other = json.dumps({**line, "run": 1})
-    file = folder / "runs.jsonl"
-    file.write_text("\n".join([json.dumps(head), text, other, ""]), "utf-8")
-
-    def read() -> None:
-        with open_journal(file, head) as journal:
-            assert set(journal.results) <= {0, 1}
-
-    fits = (key == "seconds" and new in (2, 99, 1.5, 1e300)) or (key == "figures" and new == {})
-    fits |= (key == "exceeded" and new in ([],)) or (key == "reason" and isinstance(new, str))
-    fits |= key == "exceeded" and isinstance(new, (str, dict))  # A list of letters, or of none.
-    return _outcome(f"journal: {key} = {new!r}", read, "it fits there" if fits else "")
 
 
 # Commands.

@@ -3,10 +3,9 @@
     python tests/campaign/random_tasks.py --count 1000 --seed 0 --out FILE
 
 Each has to end done, or by the chosen reaction, or with an error of the library, in a time that its
-phases and retries allow. Without pushes and payloads the force of every touch on Drake's contact
-has to stay below the expected peak, and the impulse on a contact that opens below speed times mass
-at the tool. Returns 1 if one does not. With `--out` each outcome is a line of that file when it is
-known, and the tasks in the file are not run again.
+phases and retries allow. Without pushes and payloads the force of every touch has to stay below
+the expected peak. Returns 1 if one does not. With `--out` each outcome is a line of that file when
+it is known, and the tasks in the file are not run again.
 """
 
 import random
@@ -31,8 +30,6 @@ from drake_dae.scenario.start import start_scenario
 ENDED = ("done", "held")
 BAD = ("RAW", "HARD", "HANGS")
 REACTIONS = ("hold", "stop", "fail", "leave")
-ABOVE = 1.1
-"""The largest impulse beside the expected one: the distance is controlled, to a few percent."""
 DURATIONS = (6.0, 60.0)
 """In s; a task that has not ended in the first time is run for the second."""
 _NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
@@ -54,7 +51,6 @@ force_feedback: !MeasuredForce {sensor}
 task:
   tare_time: {tare}
   signals: {signals}
-{gains}
   phases:
 {phases}
 """
@@ -67,20 +63,12 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     sensor = f"{{sample_period: 0.001, noise_deviation: {noise}, bias: {bias}, drift: {drift}}}"
     lost = f", loss: {draw.uniform(0.0, 0.01)}, burst: {draw.randrange(1, 5)}"
     link = draw.choice(("", "", f"{lost}, most_lost: 20, seed: {draw.randrange(1000)}"))
-    settings, gains, moved = [], "", False
-    if draw.random() < 0.25:
-        plant = "!Unilateral {restitution: {wall: 0.0}}"
-        settings += ["gains: {all: [-25]}", draw.choice(("", "observer: {rate: 30}"))]
-        if link and draw.random() < 0.5:
-            link = ", jitter: 0.0005" + link
-        settings.append(draw.choice(("", "encoders: {position_noise: 1e-6, velocity_noise: 1e-3}")))
-        gains = '  gains: {outputs: {wall.distance: [-8], "*": [-25]}}'
-    else:
-        stiffness, friction = 10 ** draw.uniform(4.0, 6.0), draw.uniform(0.0, 0.6)
-        plant = f"!CompliantContact {{radius: 1e-5, stiffness: {stiffness}, friction: {friction}}}"
-        of_velocity = "{position_noise: 1e-5, velocity_noise: 0.005}"
-        kinds = ("", "{position_noise: 1e-5}", "{resolution: 2e-5}", of_velocity)
-        settings.append(f"encoders: {encoders}" if (encoders := draw.choice(kinds)) else "")
+    settings, moved = [], False
+    stiffness, friction = 10 ** draw.uniform(4.0, 6.0), draw.uniform(0.0, 0.6)
+    plant = f"!CompliantContact {{radius: 1e-5, stiffness: {stiffness}, friction: {friction}}}"
+    of_velocity = "{position_noise: 1e-5, velocity_noise: 0.005}"
+    kinds = ("", "{position_noise: 1e-5}", "{resolution: 2e-5}", of_velocity)
+    settings.append(f"encoders: {encoders}" if (encoders := draw.choice(kinds)) else "")
     if draw.random() < 0.4:
         force = [draw.uniform(-60.0, 20.0), 0.0, draw.uniform(-15.0, 15.0)]
         start, end = draw.uniform(0.0, 2.0), draw.uniform(2.0, 3.0)
@@ -102,10 +90,9 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     late = draw.choice((*REACTIONS, "touch", "away"))
     touch = f"name: touch, speed: {speed}, over: 0.1, within: 6, if_late: {late}, {again}"
     if draw.random() < 0.5:
-        felt = f"distance: {draw.uniform(0.01, 0.08)}, force: {draw.uniform(2.0, 10.0)}"
-        phases = [f"!GuardedMove {{{touch}, {felt}}}"]
-    else:
-        phases = [f"!Approach {{{touch}}}"]
+        felt, way = draw.uniform(2.0, 10.0), draw.uniform(0.01, 0.08)
+        touch += f", until: [{{of: force, above: {felt}}}], guards: [{{of: travel, above: {way}}}]"
+    phases = [f"!Approach {{{touch}}}"]
     ends = f"within: 3, on_failure: {draw.choice(after_loss)}, if_lost: {draw.choice(after_loss)}"
     force, tolerance = draw.uniform(3.0, 40.0), max(1.0, 5.0 * noise)
     guards = _guards(draw, force)
@@ -119,13 +106,14 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
         goals = f"references: {{tool.z: {goal}, wall.force: {force}}}, duration: 0.6, over: 0.3"
         failing = f"on_failure: {reaction}, {_guards(draw, force)}"
         move, dwell = f"!Move {{{goals}, {failing}}}", "!Dwell {duration: 0.3}"
-        wait = f"!Wait {{for_signal: ready, within: 2, {failing}}}"
+        ready = "until: [{of: signal, name: ready, above: 0.5}]"
+        wait = f"!Dwell {{{ready}, within: 2, {failing}}}"
         phases.append(draw.choice((move, dwell, wait)))
     phases.append("!Release {over: 0.3, within: 3}")
     phases.append("!Retreat {name: away, distance: 0.02, tolerance: 2e-3, within: 5, retries: 0}")
     first = draw.uniform(0.0, 3.0)
     ramp = f"start: [0], end: [1], start_time: {first}, end_time: {first + 0.1}"
-    waits = any(phase.startswith("!Wait") for phase in phases)
+    waits = any("ready" in phase for phase in phases)
     if draw.random() < 0.3:
         late, loss, burst = draw.uniform(0.0, 0.2), draw.uniform(0.0, 0.02), draw.randrange(1, 5)
         packets = f"late: {late}, loss: {loss}, burst: {burst}, most_lost: 20"
@@ -136,7 +124,6 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
         link=link,
         settings="\n".join(filter(None, settings)),
         tare=0.1 if bias else draw.choice((0.0, 0.1)),
-        gains=gains,
         signals=f"{{ready: !PointToPoint {{{ramp}}}}}" if waits else "{}",
         phases="\n".join(f"  - {phase}" for phase in phases),
     )
@@ -145,14 +132,12 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
 
 def _guards(draw: random.Random, force: float) -> str:
     """Guards of a phase that presses with a force in N."""
-    samples = draw.choice((1, 3, 10))
     found = [
-        f"{{of: force, most: {force * draw.uniform(1.2, 3.0)}, samples: {samples}}}",
-        f"{{of: time, most: {draw.uniform(0.7, 3.0)}}}",
-        f"{{of: work, most: {draw.uniform(0.5, 5.0)}}}",
-        f"{{of: control, most: {draw.uniform(80.0, 150.0)}, samples: {samples}}}",
-        f"{{of: speed, most: {draw.uniform(0.2, 1.0)}, samples: 2}}",
-        f"{{of: travel, most: {draw.uniform(0.05, 0.3)}}}",
+        f"{{of: force, above: {force * draw.uniform(1.2, 3.0)}}}",
+        f"{{of: time, above: {draw.uniform(0.7, 3.0)}}}",
+        f"{{of: control, above: {draw.uniform(80.0, 150.0)}}}",
+        f"{{of: distance, above: {draw.uniform(0.01, 0.1)}}}",
+        f"{{of: travel, above: {draw.uniform(0.05, 0.3)}}}",
     ]
     return f"guards: [{', '.join(draw.sample(found, draw.randrange(3)))}]"
 
@@ -185,13 +170,6 @@ def outcome(text: str, is_model: bool, folder: Path) -> str:
         peak = float(np.max(record["constraint_force"][near, 0], initial=0.0))
         if peak > float(limit[1]):
             return f"HARD: {peak:.3g} N, expected below {limit[1]} N"
-    speeds = [phase.speed_of_approach or 0.0 for phase in completed.scenario.task.make().phases]
-    for event in found.record.events if is_model else ():
-        states = loop.controller.law.structure
-        row = np.searchsorted(found.record.time, event.time) - 1
-        mobility = float(states.constraint_matrix(found.record["state"][row])[0, 0])
-        if max(event.impulses, default=0.0) > ABOVE * max(speeds) / mobility:
-            return f"HARD: {max(event.impulses):.3g} N s, expected {max(speeds) / mobility:.3g} N s"
     if found.failure is None and changes[-1].phase not in ENDED:
         return f"HANGS: {changes[-1]}"
     if found.failure is not None:

@@ -311,18 +311,15 @@ def test_help_reports_the_exit_codes(capsys):
 
 
 @pytest.mark.slow
-# That which leaves its wall shall pull at it; its own test says so.
 @pytest.mark.parametrize(
     "name",
     some(
-        each_scenario(lambda name: name == "wall_bounce"),
+        each_scenario(),
         dear=(
             "wall_flexible_contact",
             "wall_hydroelastic",
             "wall_guarded",
             "wall_point_contact",
-            "flat_press",
-            "edge_follow",
             "polish_unknown_part",
         ),
     ),

@@ -14,12 +14,12 @@ from runs import some
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
 from drake_dae.commands import export
+from drake_dae.running.rollout.run import num_cores
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.scenario import read_scenario
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 from drake_dae.scenario.start import start_scenario
-from drake_dae.studies.processes import cores
 
 BARE = ("--set=write.plots=false", "--set=write.animation=false")
 QUICK = ("--set=duration=0.2", *BARE)
@@ -222,7 +222,7 @@ def test_the_command_starts_no_threads_of_linear_algebra(chosen, threads):
         check=True,
         timeout=60,
     )
-    assert done.stdout.split() == [str(min(threads, cores())), "True"]
+    assert done.stdout.split() == [str(min(threads, num_cores())), "True"]
 
 
 # Where it starts.

@@ -324,7 +324,7 @@ def test_what_is_free_moves_in_the_animation(name, body):
         (
             "three_fingers",
             "forces.2=3",
-            ["forces.2: expected one of !Squeeze, !FaceForces, !ForceCombination, text", "got 3"],
+            ["forces.2: expected one of !Squeeze, !ForceCombination, text", "got 3"],
         ),
         (
             "three_fingers",  # What moves the puck, too.

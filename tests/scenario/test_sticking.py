@@ -61,7 +61,7 @@ def longest(q):
 def parts(chosen):
     """A scenario with its model and structure."""
     model = scenario_model(chosen)
-    return chosen, model, scenario_structure(model, chosen.task)
+    return chosen, model, scenario_structure(model)
 
 
 def test_the_longest_step_is_that_of_drakes_mass_along_the_surface():

@@ -5,8 +5,7 @@ import pytest
 
 from drake_dae import Record, Signal
 from drake_dae.simulation.figures import figures_of, margins
-from drake_dae.simulation.records.record import Recorded, computed_record, recorded_values
-from drake_dae.simulation.records.together import indexed_record
+from drake_dae.simulation.records.record import Recorded
 from drake_dae.simulation.summary import Limits
 
 
@@ -31,11 +30,8 @@ LIMITS = Limits(
 )
 
 
-ONE = indexed_record(RECORD, None)
-
-
 def test_figures_by_hand():
-    (figures,) = figures_of(ONE, margins(ONE, LIMITS))
+    figures = figures_of(RECORD, margins(RECORD, LIMITS))
     assert figures == {
         "largest error of z [m]": 0.3,
         "final error of z [m]": 0.05,
@@ -59,32 +55,10 @@ def test_figures_by_hand():
 
 def test_what_left_its_limits():
     """A force that pulls, a joint beyond; round-off on a limit is none."""
-    assert margins(ONE, LIMITS).exceeded() == [("wall.force", "q1")]
-    free = margins(ONE, Limits(pushing=frozenset()))
+    assert margins(RECORD, LIMITS).exceeded == ("wall.force", "q1")
+    free = margins(RECORD, Limits(pushing=frozenset()))
     assert [signal.name for signal in free.signals] == ["motor", "free"]
-    assert free.values == [[np.inf, np.inf]]
-
-
-def test_runs_together_have_the_figures_of_each_alone():
-    runs = [0.5 * RECORD.signals["control"].values, RECORD.signals["control"].values]
-    signals = RECORD.signals["control"].signals
-    alone = [
-        indexed_record(
-            Record(RECORD.time, {**RECORD.signals, "control": Recorded(run, signals)}), None
-        )
-        for run in runs
-    ]
-    together = computed_record(
-        RECORD.time,
-        {
-            name: recorded_values(np.vstack([r.signals[name].values for r in alone]), each.signals)
-            for name, each in RECORD.signals.items()
-        },
-    )
-    rooms = margins(together, LIMITS)
-    assert figures_of(together, rooms) == [figures_of(r, margins(r, LIMITS))[0] for r in alone]
-    assert [f["margin of motor [N m]"] for f in figures_of(together, rooms)] == [6.5, 3.0]
-    assert rooms.exceeded() == 2 * [("wall.force", "q1")]
+    assert free.values == [np.inf, np.inf]
 
 
 def test_an_empty_record_has_none():
@@ -95,6 +69,6 @@ def test_an_empty_record_has_none():
             for name, values in RECORD.signals.items()
         },
     )
-    rooms = margins(indexed_record(empty, None), LIMITS)
-    assert rooms.exceeded() == [()]
-    assert figures_of(indexed_record(empty, None), rooms) == [{}]
+    rooms = margins(empty, LIMITS)
+    assert rooms.exceeded == ()
+    assert figures_of(empty, rooms) == {}

@@ -4,11 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from runs import scenario
 
 from drake_dae import grid_variations, listed_variations, random_variations
 from drake_dae.errors import ScenarioError
-from drake_dae.studies.run_names import setting
 from drake_dae.studies.variations import parse_variations
 
 
@@ -39,14 +37,6 @@ def test_a_seed_determines_random_values():
     assert [changes["b"] for changes in alone] == [changes["b"] for changes in first]
 
 
-def test_numbers_within_a_value_are_plain_and_written_as_a_setting():
-    """NumPy's scalars have no YAML: a study with a place that varies could not be finished."""
-    (changes,) = random_variations({"a": [[{"b": "-1..2"}, 3]]}, 1)
-    number = changes["a"][0]["b"]
-    assert type(number) is float
-    assert setting("a", changes["a"]) == f"a=[{{b: {number!r}}}, 3]"
-
-
 def test_random_values_are_even():
     """By mean and variance of the uniform distributions, within five of their standard errors."""
     count = 4000
@@ -69,22 +59,21 @@ def test_random_values_are_even():
 def test_a_range_that_no_number_measures_is_refused(low):
     for text, count in ((f"start.errors.tool.z={low}..{-low}:3", None), (f"a={low}..{-low}", 5)):
         with pytest.raises(ScenarioError, match="wider"):
-            parse_variations([text], scenario("two_link_wall"), count, 0, False)
+            parse_variations([text], count, 0, False)
     with pytest.raises(ScenarioError, match="wider"):
         random_variations({"a": (low, -low)}, 5)
 
 
 def test_ranges_of_more_whole_numbers_than_there_are_runs_are_refused():
     for values in (range(10**7), range(10**300)):
-        with pytest.raises(ScenarioError, match=r"at most 1000000 runs|more values than a study"):
+        with pytest.raises(ScenarioError, match="at most 1000000 runs"):
             grid_variations({"a": values})
     with pytest.raises(ScenarioError, match="whole numbers"):
         random_variations({"a": range(10**300)}, 5)
 
 
 def parsed(*texts, count=None, seed=0, together=False):
-    chosen = scenario("two_link_measured_force")
-    return parse_variations(texts, chosen, count, seed, together)
+    return parse_variations(texts, count, seed, together)
 
 
 @pytest.mark.parametrize(
@@ -143,11 +132,11 @@ def test_ranges_within_a_value_are_drawn_each_on_its_own():
         (["duration="], {}, "expected KEY=VALUES"),
         ([".a=1"], {}, "expected KEY=VALUES"),
         (["duration=[]"], {}, "duration: expected at least one value"),
-        (["duration=2..1:3"], {}, "duration: 2..1:3 is an empty range"),
-        (["duration=1..1"], {"count": 3}, "duration: 1..1 is an empty range"),
+        (["duration=2..1:3"], {}, "duration: .* 2 to 1 "),
+        (["duration=1..1"], {"count": 3}, "duration: .* 1 to 1 "),
         (["duration=1..2:1"], {}, "at least 2 values"),
         (["duration=1..2"], {}, "1..2:11, or --random COUNT"),
-        (["start.errors=[{tool.z: 2..1}]"], {"count": 3}, "2..1 is an empty range"),
+        (["start.errors=[{tool.z: 2..1}]"], {"count": 3}, "start.errors: .* 2 to 1 "),
         (["duration=[1"], {}, "duration: line 1"),
         (["duration=1", "duration=2"], {}, "duration: the key varies twice"),
         (
@@ -173,7 +162,7 @@ def test_what_cannot_be_read_is_reported(texts, options, words):
 @pytest.mark.parametrize(
     ("ranges", "words"),
     [
-        ({"a": (1.0, 1.0)}, "the range .* is empty"),
+        ({"a": (1.0, 1.0)}, "a: .* 1 to 1 "),
         ({"a": (1.0, float("inf"))}, "must be finite"),
         ({"a": range(0)}, "at least one value"),
         ({"a": []}, "at least one value"),

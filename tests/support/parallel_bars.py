@@ -70,8 +70,3 @@ def swung(windows, gravity, angle, rate, duration, tilt=0.0):
         atol=1e-13,
     )
     return found.y[:, -1]
-
-
-def energy(windows, gravity, angle, rate, tilt=0.0):
-    inertia, lever = (windows + 1) / 3 + windows, (windows + 1) / 2 + windows
-    return inertia * rate**2 / 2 + gravity * lever * np.sin(angle + tilt)

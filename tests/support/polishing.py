@@ -1,21 +1,24 @@
-"""The two-link arm and a task on its wall: short, and with a hand that can pull it off."""
+"""The two-link arm and a task on its wall, which gives way: with a hand that can pull it off."""
 
 from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from arms import arm, error_controlled, parse
+from arms import arm, parse
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
 from drake_dae import (
     Approach,
     ClosedLoop,
+    CompliantPlant,
     KnownForce,
     LoopSettings,
     Move,
+    PointMaterial,
     PointToPointReference,
     Press,
     Release,
@@ -25,7 +28,6 @@ from drake_dae import (
     Task,
     TaskController,
     TrackingLaw,
-    UnilateralRobotPlant,
     open_contact,
     poles,
     shipped_model,
@@ -37,6 +39,7 @@ from drake_dae.systems.task.phases import Phase
 
 SPEED, OVER, FAR = 0.05, 0.2, 0.02
 POLE = -8.0
+PERIOD = 1e-3
 CLIMB = PointToPointReference(0.3, 0.4, 0.0, 0.4)
 WHOLE = (
     Approach(SPEED, over=OVER),
@@ -63,19 +66,25 @@ def polisher() -> RobotModel:
 
 @cache
 def laws() -> tuple[TrackingLaw, TrackingLaw]:
+    """In contact, whose constraint the law damps, and of the free arm, soft toward the wall."""
     system = polisher().dae
+    law = TrackingLaw(system, poles(-25.0), constraint_damping=poles(-250.0))
     free = open_contact(system, "wall.force")
-    return TrackingLaw(system, poles(POLE)), TrackingLaw(free, poles(POLE))
+    return law, TrackingLaw(free, poles({"tool.z": -25.0, "wall.distance": POLE}))
+
+
+def soft_wall() -> CompliantPlant:
+    """The arm at a wall of 1e5 N/m, in steps of PERIOD."""
+    return CompliantPlant(polisher(), PointMaterial(PERIOD, stiffness=1e5, radius=1e-5))
 
 
 def task_loop(
     phases: Sequence[Phase], sampling: Sampling | None = None, **settings: float
 ) -> ClosedLoop:
-    """The ideal plant under a task."""
-    period = 0.0 if sampling is None else sampling.period
+    """A wall of 1e5 N/m under a task; the law acts at each step, or as it is sampled."""
+    period = PERIOD if sampling is None else sampling.period
     controller = TaskController(Task(phases, **settings), *laws(), sample_period=period)
-    plant = UnilateralRobotPlant(polisher(), {"wall": 0.0})
-    return wire_loop(plant, controller, settings=LoopSettings(sampling=sampling))
+    return wire_loop(soft_wall(), controller, settings=LoopSettings(sampling=sampling))
 
 
 def started(loop: ClosedLoop, distance: float = FAR, height: float = 0.3) -> Context:
@@ -86,10 +95,9 @@ def started(loop: ClosedLoop, distance: float = FAR, height: float = 0.3) -> Con
     return context
 
 
-def run_on(loop: ClosedLoop, context: Context, end: float, accuracy: float = 1e-6) -> RunStatistics:
+def run_on(loop: ClosedLoop, context: Context, end: float) -> RunStatistics:
     """Goes on until a time."""
-    config = error_controlled(accuracy)
-    config.start_time = context.get_time()
+    config = SimulatorConfig(start_time=context.get_time())
     return simulate(loop.diagram, context, end - context.get_time(), config)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from drake_dae.trace.factorization import Factorization, smallest_sine
+from drake_dae.trace.factorization import Factorization
 
 
 @pytest.mark.parametrize("small", [1.0, 1e-3, 1e-5, 1e-7])
@@ -32,20 +32,3 @@ def test_shortest_solution_of_rows_that_are_nearly_parallel(small):
     found = function(A).full()[:, 0]
     assert_allclose(found, x, rtol=0.0, atol=1e-15 / small * np.abs(x).max())
     assert_allclose(A.T @ found, b, rtol=0.0, atol=1e-14 * np.abs(x).max())
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_smallest_sine_counts_a_row_that_is_shorter_than_usual_as_nearer(seed):
-    """The distance of a row from the span of those before it over its length, or the usual one."""
-    random = np.random.default_rng(seed)
-    rows = random.standard_normal((3, 5)) * 10.0 ** random.uniform(-3.0, 3.0, (3, 1))
-    usual = 10.0 ** random.uniform(-3.0, 3.0, 3)
-    sines = []
-    for i, row in enumerate(rows):
-        before = rows[:i].T
-        share = np.linalg.lstsq(before, row)[0] if i else np.zeros(0)
-        left = np.linalg.norm(row - before @ share)
-        sines.append(left / max(np.linalg.norm(row), usual[i]))
-    found = float(smallest_sine(ca.SX(rows), usual.tolist()))
-    assert found == pytest.approx(min(sines), rel=1e-12)
-    assert float(smallest_sine(ca.SX(np.vstack([rows[:2], rows[0]])), [1e-9] * 3)) < 1e-14

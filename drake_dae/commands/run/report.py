@@ -2,15 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from textwrap import fill
 from typing import Any
 
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.followed import followed_lines
+from drake_dae.robots.links_behind import LinkBehind, links_behind
 from drake_dae.scenario.feasibility.limits import limits_of_run
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
@@ -24,7 +22,7 @@ from drake_dae.simulation.remarks import (
     touch_remarks,
 )
 from drake_dae.simulation.simulate import RunStatistics
-from drake_dae.simulation.summary import WIDTH, Limits, shortfalls, summary
+from drake_dae.simulation.summary import Limits, shortfalls, summary
 from drake_dae.simulation.verdict import TrackingResult, as_data, judge
 from drake_dae.systems.control.phase_change import PhaseChange
 
@@ -77,7 +75,10 @@ def report_run(
     fixed = loop.plant.time_step or not config.use_error_control
     accuracy = None if fixed else config.accuracy
     reasons = _reasons(scenario, loop, record)
-    near = nearness(loop, record, context)
+    behind: tuple[LinkBehind, ...] = ()
+    if model is not None:
+        own = loop.plant_parameters(record, context)
+        behind = links_behind(model, record.time, record["state"], own)
     changes = loop.changes(context)
     is_interrupted = statistics is not None and statistics.interrupted is not None
     job = judge_job(
@@ -87,7 +88,7 @@ def report_run(
         [
             *shortfalls(record, limits),
             *exceeded,
-            *map(str, links_in_the_way(loop, record, context)),
+            *map(str, behind),
         ],
         limits.pushing,
         changes,
@@ -95,22 +96,16 @@ def report_run(
         notes=limit_remarks(record, limits),
     )
     verdict = judge(record, predicted, accuracy)
-    added = None
-    if loop.generator is not None:
-        goal, state = loop.generator.reference, record["state"][0]
-        added = loop.controller.error_bound(goal, record.time, state)
-    lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons, added)]
+    lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons)]
     lines += _contact_remarks(scenario, loop, record)
-    lines += map(str, (*near.distances, *near.speeds))
     lines += reference_remarks({**scenario.references, **scenario.exogenous, "task": scenario.task})
     lines += _task_remarks(scenario, changes, statistics)
-    lines += [fill(str(line), WIDTH) for line in followed_lines(loop, record, context)]
     is_unexplained = verdict.tracking is TrackingResult.OFF and not reasons
     data = {
         "missed": job.outcome is JobOutcome.BAD or is_unexplained,
         "job": job.to_dict(),
         "phases": [asdict(change) for change in changes],
-        **asdict(near),
+        "behind": [asdict(link) for link in behind],
         **as_data(verdict, reasons),
         "interrupted": is_interrupted,
         **{
@@ -168,7 +163,6 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "measurements are late or lost on their way (sampling.measurements)": (
             scenario.sampling is not None and scenario.sampling.measurements is not None
         ),
-        "the law is a cascade around springs": scenario.is_cascade,
     }
     return [reason for reason, holds in reasons.items() if holds]
 

@@ -1,22 +1,16 @@
 """The consistent state next to one from which the first Newton steps do not converge."""
 
-from collections.abc import Callable
-
-import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.manifold.first_steps import FOUND
 from drake_dae.dae.manifold.residual import Residual
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.factorization import smallest_sine
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
-    ROUND_OFF,
     NewtonModel,
     are_dependent,
     newton,
-    norm,
     shortest_steps,
 )
 from drake_dae.trace.round_off import positive
@@ -25,20 +19,9 @@ CONSISTENT = 1e-8
 """A state counts as consistent, and is projected without a message, if its distance from N*
 relative to its size is at most this; where gradients are dependent, if its residual is."""
 
-NEARLY = 3e-3
-"""Gradients whose angle has a sine below this are nearly dependent. They are left out of a
-projection from a state that is almost on N*."""
-
-SMALL = 1e-3
-"""A state is almost on N* if its residual, in lengths of gradients, is at most this, relative to
-its size."""
-
-ITERATIONS = 10
-"""The largest number of steps of such a projection; quadratic convergence takes three."""
-
 
 class ConsistentStateSearch:
-    """Searches a consistent state by Newton's method, then by least squares or a pseudoinverse.
+    """Searches a consistent state by Newton's method, then by least squares.
 
     Args:
         residual: The residual of N*.
@@ -47,21 +30,13 @@ class ConsistentStateSearch:
 
     def __init__(self, residual: Residual, first_steps: TracedFunction) -> None:
         self._residual, self._first_steps = residual, first_steps
-        heads = residual.layout.heads.tolist()
-        if heads:
-            first = ca.mtimes(residual.gradient[heads, :], ca.diag(ca.SX(residual.scale)))
-            sines = {"sine": smallest_sine(first, residual.lengths[heads])}
-            self._sine = residual.system.trace("independence", sines, often=False)
 
-    def searched(
-        self, start: FloatArray, p: FloatArray, crosses: Callable[[FloatArray], bool] | None = None
-    ) -> FloatArray:
+    def searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """Acts as `project` from a state from which `first_steps` did not converge.
 
         Args:
             start: The state, shape (n,).
             p: Values of all parameters, shape (k,).
-            crosses: As for `project`.
         """
         function = self._first_steps
         sizes, moved, _ = function.evaluate(start, p)
@@ -72,13 +47,8 @@ class ConsistentStateSearch:
             and not self._residual.residual_function.evaluate(start, p)[0].any()
         ):
             return start
-        consistent = moved.copy() if is_finite and sizes.item(0) == FOUND else None
-        if crosses is not None and not function.is_valid and self._is_near(start, p, crosses):
-            consistent = self._nearly(start, p)
-        return self._searched(start, p) if consistent is None else consistent
-
-    def _searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """Returns the consistent state from Newton's method, or else from least squares."""
+        if is_finite and sizes.item(0) == FOUND:
+            return moved.copy()
         scale = self._residual.scale
         z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
         if not converged:
@@ -102,35 +72,6 @@ class ConsistentStateSearch:
             lambda z: self._residual.newton_step.evaluate(scale * z, state, parameters)[0].copy(),
             is_regular=True,
         )
-
-    def _is_near(
-        self, state: FloatArray, parameters: FloatArray, crosses: Callable[[FloatArray], bool]
-    ) -> bool:
-        """Returns whether the motion crosses a singular configuration close to a state."""
-        return bool(self._sine(state, parameters)[0][0] < NEARLY) and crosses(state)
-
-    def _nearly(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
-        """The consistent state next to one almost on N*, where gradients are nearly dependent.
-
-        At a singular configuration a regular step would magnify round-off. Gradients that are left
-        out leave a residual, which is small near N*. None if it is not small.
-        """
-        x = start / self._residual.scale
-        size = max(norm(x), norm(self._residual.system.nominal_state / self._residual.scale))
-        for _ in range(ITERATIONS):
-            state = x * self._residual.scale
-            gradients = self._residual.gradients(state, parameters) * self._residual.scale
-            residual = self._residual.residual_function(state, parameters)[0]
-            if not (np.all(np.isfinite(gradients)) and np.all(np.isfinite(residual))):
-                return None
-            length = positive(np.maximum(np.linalg.norm(gradients, axis=1), self._residual.lengths))
-            if norm(residual / length) > SMALL * size:
-                return None
-            step = np.linalg.pinv(gradients / length[:, None], NEARLY) @ (residual / length)
-            x = x - step
-            if norm(step) <= ROUND_OFF * size:
-                return x * self._residual.scale
-        return None
 
     def _downhill(self, state: FloatArray, parameters: FloatArray) -> NewtonModel | None:
         """Least-squares steps that decrease the residual; its rows are scaled to length one."""

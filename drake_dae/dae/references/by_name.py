@@ -47,6 +47,10 @@ class ReferenceRows(Reference):
         return len(self.rows)
 
     @property
+    def repeats(self) -> float | None:
+        return self.reference.repeats
+
+    @property
     def parameters(self) -> Mapping[str, Any]:  # type: ignore[override]
         return self.reference.parameters
 

@@ -13,7 +13,12 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import vector
-from drake_dae.dae.references.reference import FormulaReference, Reference, check_continuity
+from drake_dae.dae.references.reference import (
+    FormulaReference,
+    Reference,
+    check_continuity,
+    common_period,
+)
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.trace.given import result_of
 
@@ -38,6 +43,10 @@ class ConstantReference(FormulaReference):
     @property
     def size(self) -> int:
         return np.size(self.values)
+
+    @property
+    def repeats(self) -> float:
+        return 0.0
 
     def rows(self, time: ca.SX) -> ca.SX:
         return ca.SX(ca.DM(self.values))
@@ -67,6 +76,10 @@ class SinusoidReference(FormulaReference):
 
     def __post_init__(self) -> None:
         settle(self, "amplitudes", "frequencies", "phases")
+
+    @property
+    def repeats(self) -> float | None:
+        return common_period([abs(2.0 * np.pi / w) for w in np.ravel(self.frequencies) if w])
 
     def rows(self, time: ca.SX) -> ca.SX:
         terms = np.transpose([self.amplitudes, self.frequencies, self.phases])

@@ -191,6 +191,10 @@ class CircleReference(PathReference):
     def point(self, distance: ca.SX) -> ca.SX:
         return self._at(self.phase + copysign(1.0, self.turns) * distance / self.radius)
 
+    @property
+    def repeats(self) -> float | None:
+        return None if self.period is None else abs(self.period)
+
     def rows(self, time: ca.SX) -> ca.SX:
         if self.period is None:
             return super().rows(time)

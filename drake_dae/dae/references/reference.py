@@ -78,6 +78,11 @@ class Reference(ABC):
         return self
 
     @property
+    def repeats(self) -> float | None:
+        """Its period in s; 0 if it is constant, None if it has none or none is known."""
+        return None
+
+    @property
     def remark(self) -> str:
         """A text on approximations of its data; empty if there are none."""
         return ""
@@ -116,6 +121,22 @@ class FormulaReference(Reference):
         time = ca.SX.sym("t")
         value = at_time(time, self.expression(degrees, time))
         return lambda time: value(time).copy()
+
+
+def common_period(periods: Sequence[float | None]) -> float | None:
+    """Returns the period of signals together; 0 if all are constant, None without one.
+
+    Args:
+        periods: The period of each in s, as of `Reference.repeats`.
+    """
+    moving = np.array([period for period in periods if period], dtype=float)
+    if None in periods or not moving.size:
+        return None if None in periods else 0.0
+    for count in range(1, 13):
+        turns = count * moving.max() / moving
+        if np.all(np.abs(turns - np.round(turns)) <= 1e-9 * turns):
+            return float(count * moving.max())
+    return None
 
 
 def check_continuity(reference: Reference, order: int, degrees: Sequence[int]) -> None:

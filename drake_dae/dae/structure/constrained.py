@@ -81,17 +81,13 @@ class ConstraintStructure:
         x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
         return function(x, p)[0].reshape(matrix.shape)
 
-    def trace(
-        self, name: str, value: ca.SX, needs_control: bool, doubt: ca.SX | None = None
-    ) -> TracedFunction:
+    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
         """Compiles an expression on N* to a function of state, control and parameters.
 
         Args:
             name: Its name in messages.
             value: An expression of the state and of the control `derivatives.control`.
             needs_control: Whether the function takes the control; otherwise the control is 0.
-            doubt: An expression that is negative where the values are not valid though A(x) is
-                regular.
 
         Returns:
             A function with the output "value", and with A(x) as the matrix that must be regular.
@@ -102,7 +98,7 @@ class ConstraintStructure:
             value = ca.substitute(value, inputs.pop("control"), ca.SX.zeros(control.numel()))
         pivot = self.elimination.pivot
         outputs, regular = {"value": value}, "A(x) of Assumption (2)"
-        return self.system.trace(name, outputs, inputs, pivot, regular, doubt=doubt)
+        return self.system.trace(name, outputs, inputs, pivot, regular)
 
 
 @checked(ModelError)

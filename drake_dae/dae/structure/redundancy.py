@@ -94,7 +94,6 @@ class _Redundant(Manifold):
         self,
         state: ArrayLike,
         parameters: ArrayLike | None = None,
-        crosses: Callable[[FloatArray], bool] | None = None,
     ) -> FloatArray:
         scale = self.system.scale
         z = self.system.state_vector(state) / scale

@@ -1,6 +1,6 @@
 """Feedback gains, the error dynamics that they assign, and their exact response.   (30)-(34)"""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -9,7 +9,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, show, vector
+from drake_dae.arrays import FloatArray, brief, numbers, show, vector
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.errors import GainError
 
@@ -195,6 +195,9 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
             matrices (lowest derivative first) that couple the outputs of this degree, in the
             outputs' order. Rigid joints: `gain_matrices([Lambda_1, Lambda_2])`.
     """
+    for k, group in enumerate(groups):
+        if isinstance(group, str) or not isinstance(group, Collection):
+            raise GainError(f"gain_matrices: groups[{k}] must be matrices, got {brief(group)}")
     blocks = [
         [numbers(f"gain_matrices: groups[{k}]", block, GainError) for block in group]
         for k, group in enumerate(groups)

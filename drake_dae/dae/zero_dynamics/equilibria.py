@@ -1,33 +1,47 @@
 """States at rest with constant outputs."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.isolation import Isolation, isolation
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.pinned.pinned_point import PinnedPoint, Regularity
-from drake_dae.dae.zero_dynamics.stability import (
-    ComplexArray,
-    balanced_norm,
-    linearized_eigenvalues,
-)
+from drake_dae.dae.zero_dynamics.stability import ROUNDED, balanced_norm
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, NewtonModel, newton, shortest_steps
 
 AT_REST = 1e-8
 """A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
 
+ISOLATED = 1e-6
+"""An equilibrium is known to this distance, relative to the scale of the states."""
 
-FAR = 1e8
-"""A search fails if it leaves the known states by this factor of their sizes: relative to such
-large states any rate looks like zero."""
+BESIDE = 1e-5
+"""The distance, relative to the scale, within which the slopes must be nearly constant."""
 
-APART = 1e-6
-"""States at rest that are nearer than this, relative to their sizes, are the same."""
+SAME = 0.5
+"""The allowed relative change of the slopes there: then Newton's method contracts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """Where a search for an equilibrium ends.
+
+    Attributes:
+        state: The state, shape (n,).
+        rate: x' there, shape (n,).
+        unrest: Why the state is not at rest; empty if it is.
+        degenerate: The number of directions in which its Jacobian is singular; at an equilibrium 0.
+    """
+
+    state: FloatArray
+    rate: FloatArray
+    unrest: str
+    degenerate: int = 0
 
 
 def clock_rates(system: DaeSystem) -> FloatArray:
@@ -41,6 +55,10 @@ def clock_rates(system: DaeSystem) -> FloatArray:
 
 class Equilibria:
     """The equilibria on Z(R). The arguments of all methods are arrays of the right sizes.
+
+    An equilibrium is a state at rest whose Jacobian is not singular: Newton's step from there is
+    short, and its slopes hardly change beside it. A small rate alone shows nothing: that of
+    x' = exp(-x) is small for all large x, and Newton's step is 1 everywhere.
 
     Args:
         pinned: Z(R).
@@ -76,10 +94,34 @@ class Equilibria:
         return reference
 
     def find(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """Finds an equilibrium by Newton's method for C(x) = 0 and T^T x' = 0.
+        """Returns the equilibrium at which a search from a guess ends, shape (n,).
 
-        T spans the tangent space of Z(R), which contains x'. On a continuum of equilibria the
+        Raises:
+            InconsistentStateError: It ends at none.
+        """
+        rest = self.search(reference, guess, parameters)
+        unrest = rest.unrest
+        if not unrest and rest.degenerate:
+            unrest = "the Jacobian is singular"
+        if unrest:
+            raise InconsistentStateError(self.none(reference, rest.state, unrest), rest.rate)
+        return rest.state
+
+    def none(self, reference: FloatArray, state: FloatArray, unrest: str) -> str:
+        """Returns in words that a search ended at a state that is no equilibrium."""
+        return (
+            f"{self.pinned.system.name}: {self.pinned.describe(reference)} have no regular state "
+            f"at rest near the given one: the search ends at x = {show(state)}, where {unrest}"
+        )
+
+    def search(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> Rest:
+        """Searches by Newton's method for C(x) = 0 and T^T x' = 0.
+
+        T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
         shortest step is taken.
+
+        Raises:
+            InconsistentStateError: There is no state on Z(R) near the guess, or a state is a clock.
         """
         pinned = self.pinned
         if self._clocks.any():
@@ -119,63 +161,32 @@ class Equilibria:
 
         start = pinned.state(reference, guess, parameters)
         z, converged = newton(start / scale, linearize)
-        state = scale * z
-        point = pinned.point(state, reference, parameters)
+        point = pinned.point(scale * z, reference, parameters)
         unrest = self.unrest(point, reference, parameters)
-        if np.any(np.abs(state) > FAR * np.maximum(self.sizes, np.abs(start))):
-            unrest = "it grows without bound"
-        if converged and not unrest:
-            if isolation(pinned, state, reference, parameters):
-                return state
-            unrest = "the rates are small and do not vanish"
-        raise InconsistentStateError(
-            f"{pinned.system.name}: {pinned.describe(reference)} have no regular state at rest "
-            f"near the given one: the search ends at x = {show(state)}, where "
-            f"{unrest or 'the equations are singular'}",
-            point.rate,
-        )
+        if not converged:
+            unrest = unrest or "the rates are small and do not vanish"
+        if unrest:
+            return Rest(point.state, point.rate, unrest)
+        degenerate = self._degenerate(point.state, reference, parameters)
+        return Rest(point.state, point.rate, "", degenerate)
 
     def find_all(
         self, reference: FloatArray, guesses: Sequence[FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        """Finds distinct equilibria from several guesses, shape (k, n).
-
-        Of equilibria that are not isolated (with a zero eigenvalue) only the first is returned.
-        """
+        """Finds distinct equilibria from several guesses, shape (k, n)."""
         distinct = np.zeros((0, self.sizes.size))
-        radii: list[float] = []
         for guess in guesses:
             try:
                 rest = self.find(reference, guess, parameters)
             except InconsistentStateError:
                 continue
-            near = np.abs(distinct - rest) <= APART * np.maximum(self.sizes, np.abs(rest))
-            if np.any(np.all(near, axis=1)):
-                continue
-            values, errors, accuracy = self.eigenvalues(reference, rest, parameters)
-            radius = 0.0
-            if not np.all(np.abs(values) > errors):
-                # Infinite if the linearization is singular up to round-off.
-                radius = accuracy.radius if accuracy.degenerate else np.inf
-            off = np.max(np.abs(distinct - rest) / self.pinned.system.scale, axis=1)
-            if np.any(off <= radius + np.array(radii)) or (radius == np.inf and len(distinct)):
-                continue
-            distinct = np.vstack([distinct, rest])
-            radii.append(radius if radius < np.inf else 0.0)
+            near = np.abs(distinct - rest) <= ISOLATED * np.maximum(self.sizes, np.abs(rest))
+            if not np.any(np.all(near, axis=1)):
+                distinct = np.vstack([distinct, rest])
         return distinct
 
-    def eigenvalues(
-        self, reference: FloatArray, rest: FloatArray, parameters: FloatArray
-    ) -> tuple[ComplexArray, FloatArray, Isolation]:
-        """Returns the eigenvalues at an equilibrium, their errors, and its accuracy."""
-        accuracy = isolation(self.pinned, rest, reference, parameters) or Isolation(0, 0.0)
-        values, errors = linearized_eigenvalues(
-            self.pinned, self.sizes, rest, reference, parameters
-        )
-        return values, accuracy.errors(values, errors), accuracy
-
     def unrest(self, point: PinnedPoint, reference: FloatArray, parameters: FloatArray) -> str:
-        """Returns why a point is no regular equilibrium, as text; empty if it is one.
+        """Returns why a point is no regular state at rest, as text; empty if it is one.
 
         A state that a tiny change brings to rest, as in a fast system, does not count as changing.
         """
@@ -189,3 +200,31 @@ class Equilibria:
         if unrest[worst] <= AT_REST:
             return ""
         return f"{self.pinned.system.state_signals[worst].name}' = {point.rate[worst]:.3g}"
+
+    @np.errstate(all="ignore")  # The domain may end near the state.
+    def _degenerate(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> int:
+        """The number of directions on Z(R) in which the Jacobian isolates no equilibrium."""
+        pinned, scale = self.pinned, self.pinned.system.scale
+        free, moved = pinned.coordinates(state, parameters, scale)
+
+        def slopes_at(x: FloatArray) -> FloatArray:
+            slopes = pinned.slopes(x, reference, parameters)[0] @ moved
+            return np.asarray(slopes[free] * scale[free] / scale[free][:, None])
+
+        slopes = slopes_at(state)
+        rate = (pinned.rate(state, reference, parameters) / scale)[free]
+        if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate))):
+            return free.size
+        left, sizes, right = np.linalg.svd(slopes)
+        terms = pinned.sizes_of_slopes(state, reference, parameters) @ np.abs(state)
+        rates = np.abs(left.T @ rate) + ROUNDED * np.abs(left.T) @ (terms / scale)[free]
+        count = 0
+        for u, size, v, rest in zip(left.T, sizes, right, rates, strict=True):
+            isolated = size > 0.0 and rest <= ISOLATED * size
+            if isolated:
+                along = moved @ (scale[free] * v)
+                along *= BESIDE / np.max(np.abs(along) / scale)
+                changes = [u @ (slopes_at(x) - slopes) @ v for x in (state + along, state - along)]
+                isolated = all(abs(change) <= SAME * size for change in changes)
+            count += not isolated
+        return count

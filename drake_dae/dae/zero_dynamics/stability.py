@@ -26,9 +26,8 @@ class Verdict(StrEnum):
     """The verdicts on the zero dynamics."""
 
     STABLE = "exponentially stable"
-    BOUNDED = "bounded, not asymptotically stable"
     UNSTABLE = "unstable"
-    UNDECIDED = "undecided"
+    UNDECIDED = "not decided"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +39,15 @@ class Stability:
 
     Attributes:
         verdict: Stable if all eigenvalues have negative real parts, unstable if one has a positive
-            one; bounded if motions that leave an unstable equilibrium converge to an attracting
-            limit cycle; undecided if an eigenvalue is on the imaginary axis up to round-off, if no
-            equilibrium is found, or if motions that leave it attract their neighbours but do not
-            return. Without zero dynamics: stable, or undecided if A(x) or B(x) is singular.
+            one; otherwise not decided: an eigenvalue is on the imaginary axis up to round-off, the
+            Jacobian is singular, or no equilibrium is found. Whether a motion that leaves an
+            unstable equilibrium stays bounded, as on a limit cycle, is not examined. Without zero
+            dynamics: stable, or not decided if A(x) or B(x) is singular.
         reason: The reason for the verdict, in words.
         eigenvalues: The eigenvalues of the zero dynamics in 1/s, largest real part first, shape
-            (dimension,); empty if no equilibrium is found.
-        state: The equilibrium, shape (n,); None if none is needed, or found.
+            (dimension,); empty if no state at rest is found.
+        state: The equilibrium, or the state at rest with a singular Jacobian, shape (n,); None if
+            none is needed, or found.
     """
 
     verdict: Verdict
@@ -159,14 +159,21 @@ def eigenvalues_of(
     return values[order], errors[order]
 
 
-def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: str) -> Stability:
-    """Judges an equilibrium by its eigenvalues.
+def judge(
+    values: ComplexArray, errors: FloatArray, state: FloatArray, place: str, degenerate: int = 0
+) -> Stability:
+    """Judges a state at rest by its eigenvalues.
 
     Args:
         values, errors: The result of `linearized_eigenvalues`, at least one eigenvalue.
-        state: The equilibrium, shape (n,).
-        place: The equilibrium in words.
+        state: The state, shape (n,).
+        place: The state in words.
+        degenerate: The number of directions in which its Jacobian is singular; the smallest
+            eigenvalues, as many, are known to nothing.
     """
+    smallest = np.argsort(np.abs(values))[:degenerate]
+    errors = errors.copy()
+    errors[smallest] = np.maximum(errors[smallest], 2.0 * np.abs(values[smallest]))
     largest = f"the largest real part of an eigenvalue is {values[0].real:.4g} 1/s {place}"
     if np.any(values.real > errors):
         return Stability(Verdict.UNSTABLE, f"non-minimum phase: {largest}", values, state)
@@ -177,6 +184,8 @@ def judge(values: ComplexArray, errors: FloatArray, state: FloatArray, place: st
         f"the linearization does not decide: {count} of {values.size} eigenvalues are on the "
         f"imaginary axis, up to round-off, {place}"
     )
+    if degenerate:
+        reason += ", where the Jacobian is singular"
     return Stability(Verdict.UNDECIDED, reason, values, state)
 
 

@@ -15,16 +15,16 @@ from drake_dae.arrays import FloatArray, numbers, show, vector
 from drake_dae.dae import references
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.along import StabilityAlong, judge_along
-from drake_dae.dae.zero_dynamics.disturbances import DisturbanceFlow
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
-from drake_dae.dae.zero_dynamics.long_term import judge_at_rest, judge_without_rest
+from drake_dae.dae.zero_dynamics.floquet import PeriodicMotions, StabilityAlong
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.pursuit import Reference, follow
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     Stability,
+    Verdict,
+    judge,
     linearized_eigenvalues,
     without_dynamics,
 )
@@ -123,7 +123,8 @@ class ZeroDynamics:
     ) -> FloatArray:
         """Returns a state at rest, x' = 0, with constant outputs, by Newton's method from a guess.
 
-        Where there is a continuum of equilibria, it is one near the guess.
+        The Jacobian is not singular there: of states at rest that are not isolated none is
+        returned.
 
         Args:
             outputs: z, shape (p,).
@@ -135,7 +136,7 @@ class ZeroDynamics:
 
         Raises:
             InconsistentStateError: No state near the guess has these outputs; or there are such
-                states, but none at rest: `residual` is then x', shape (n,).
+                states, but no equilibrium: `residual` is then x', shape (n,).
             ModelError: A shape is wrong, or a number is not finite.
         """
         goal = self._constant(outputs)
@@ -205,13 +206,20 @@ class ZeroDynamics:
             return without_dynamics(self.structure)
         p = self.system.parameter_vector(parameters)
         start = self.structure.manifold.project(self._guess(state), p)
+        goal = self._goal(start, outputs, p)
         try:
-            goal = self._goal(start, outputs, p)
-            rest = self._equilibria.find(goal, start, p)
+            rest = self._equilibria.search(goal, start, p)
         except InconsistentStateError as error:
-            goal = self._goal(start, outputs, p)
-            return judge_without_rest(self._equilibria, goal, start, p, str(error))
-        return judge_at_rest(self._equilibria, goal, rest, p)
+            return Stability(Verdict.UNDECIDED, str(error))
+        if rest.unrest:
+            reason = self._equilibria.none(goal, rest.state, rest.unrest)
+            return Stability(Verdict.UNDECIDED, reason)
+        values, errors = linearized_eigenvalues(
+            self._pinned, self._equilibria.sizes, rest.state, goal, p
+        )
+        where = "at rest" if rest.degenerate else "at the equilibrium"
+        place = f"{where} with {self._pinned.describe(goal)}"
+        return judge(values, errors, rest.state, place, rest.degenerate)
 
     @checked(ModelError)
     def equilibria(
@@ -228,8 +236,7 @@ class ZeroDynamics:
             outputs: z, shape (p,). If None those of the first guess, as in `stability`.
 
         Returns:
-            The distinct states, in the order in which they are found, shape (l, n). Of states at
-            rest that are not isolated, only the first one.
+            The distinct states, in the order in which they are found, shape (l, n).
 
         Raises:
             InconsistentStateError: The first guess is not near N*.
@@ -250,49 +257,41 @@ class ZeroDynamics:
         self,
         reference: Reference,
         motion: PinnedMotion,
+        period: float,
         parameters: ArrayLike | None = None,
         exogenous: Sequence[references.Reference] = (),
     ) -> StabilityAlong:
-        """Judges by the growth of small disturbances whether Assumption 2.2 holds along a motion.
+        """Judges by Floquet multipliers whether Assumption 2.2 holds along a periodic reference.
 
-        On Z(R(t)) a disturbance moves by delta' = (dx'/dx) delta. If the reference repeats itself
-        within the times, the motion of the same period is sought, and the eigenvalues of the
-        matrix that takes disturbances through one period, the Floquet multipliers, decide;
-        otherwise how much disturbances grow over the second half of the times. A constant
-        reference is judged as by `stability`.
+        The motion with the same period is sought, by Newton's method from late in the given motion,
+        and from its start. The multipliers are the eigenvalues of the matrix that takes small
+        disturbances of it, delta' = (dx'/dx) delta on Z(R(t)), through one period.
 
         Args:
             reference: The function t -> R(t).
             motion: The result of `motion` for this reference.
+            period: The period of R(t) and of the exogenous signals, in s.
             parameters: Values of all parameters.
             exogenous: The references of the exogenous signals, as for `motion`.
 
         Raises:
-            ModelError: A shape is wrong, or a number is not finite.
+            ModelError: A shape is wrong, a number is not finite, or the period is not one.
         """
+        if not (np.isfinite(period) and period > 0.0):
+            raise ModelError(f"{self.system.name}: period must be positive, got {period!r}")
         if self.dimension == 0:
             at_rest = without_dynamics(self.structure)
-            return StabilityAlong(at_rest.verdict, at_rest.reason)
+            return StabilityAlong(at_rest.verdict, at_rest.reason, period)
         p, n = self.system.parameter_vector(parameters), self.system.num_states
         if motion.states.shape != (motion.times.size, n):
             raise ModelError(
                 f"{self.system.name}: the motion belongs to another system: its states have shape "
                 f"{motion.states.shape}, and not {(motion.times.size, n)}"
             )
-        moving = self._moving(p, exogenous)
-        flow = DisturbanceFlow(self._pinned, reference, moving, self._equilibria.sizes)
-        period = None
-        if motion.ending is None and motion.times.size > 1:
-            period = flow.period(float(motion.times[0]), float(motion.times[-1]))
-        if period == 0.0:
-            begin = float(motion.times[0])
-            outputs = self._pinned.layout.values(flow.goal(begin))
-            at_rest = self.stability(motion.states[0], moving(begin), outputs)
-            rates = at_rest.eigenvalues.real.copy()
-            return StabilityAlong(
-                at_rest.verdict, at_rest.reason, 0.0, exponents=rates, state=at_rest.state
-            )
-        return judge_along(flow, motion, period)
+        motions = PeriodicMotions(
+            self._pinned, reference, self._moving(p, exogenous), self._equilibria.sizes, period
+        )
+        return motions.judge(motion)
 
     def _moving(
         self, parameters: FloatArray, exogenous: Sequence[references.Reference]

@@ -6,7 +6,6 @@ from drake_dae.robots.constraints.couplers import JointCoupler
 from drake_dae.robots.constraints.loop_joints import PrismaticLoopJoint, RevoluteLoopJoint
 from drake_dae.robots.constraints.points import FixedDistance, PointOnSurface
 from drake_dae.robots.constraints.rolling import Blade, RollingBall, RollingWheel
-from drake_dae.robots.constraints.screws import ScrewHead
 from drake_dae.robots.constraints.welds import CoincidentPoints, WeldedFrames
 from drake_dae.robots.surfaces.surface import Surface
 
@@ -24,7 +23,6 @@ __all__ = [
     "RevoluteLoopJoint",
     "RollingBall",
     "RollingWheel",
-    "ScrewHead",
     "Surface",
     "WeldedFrames",
 ]

@@ -49,9 +49,9 @@ def failure_of(program: RolloutProgram, problem: RunProblem, run: Run) -> Simula
         case RunEnding.SLOW:
             return endless_steps(name, PACE_STEPS, run.mark, run.time, state)
         case RunEnding.SPOILT:
-            return spoilt_step(name, run.time, run.next, state, str(trial or ""))
+            return spoilt_step(name, run.time, run.next, state, trial)
         case RunEnding.STUCK if trial is not None:
-            return no_step_leads_on(name, run.time, state, trial, str(trial))
+            return no_step_leads_on(name, run.time, state, trial)
         case RunEnding.STUCK:
             reason = "no step, however short, is as accurate as it should be"
             return cannot_go_on(run.time, state, reason, "choose a lower accuracy")

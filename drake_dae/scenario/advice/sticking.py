@@ -53,8 +53,8 @@ def sticking_before(scenario: Scenario, model: RobotModel, structure: Structure)
     contacts = [constraint.force_signals[0].name for constraint in model.constraints]
     if scenario.task is not None:
         task = scenario.task
-        goals = [phase.needed(task.contact_force).get("force") for phase in task.make().phases]
-        forces = np.full((1, len(contacts)), max(filter(None, goals), default=task.contact_force))
+        largest = max(phase.felt(task.contact_force) for phase in task.make().phases)
+        forces = np.full((1, len(contacts)), largest)
     else:
         names = [signal.name for signal in model.dae.output_signals]
         references = references_by_name(scenario.references, names, structure.output_degrees)

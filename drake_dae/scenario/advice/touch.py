@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from drake_dae.arrays import FloatArray
-from drake_dae.scenario.advice.springs import rounded
+from drake_dae.dae.references import Reference
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.task.fade import fade
@@ -47,6 +47,11 @@ def reaction_time(sampling: Sampling | None, step: float) -> float:
     if sampling.measurements is not None:
         lost += sampling.measurements.longest
     return sampling.period * (1 + sampling.late_samples + lost)
+
+
+def rounded(value: float) -> float:
+    """Returns a recommended number, rounded to three digits for a scenario file."""
+    return float(f"{value:.3g}")
 
 
 @dataclass(frozen=True)
@@ -117,21 +122,20 @@ class Touching:
         return replace(task, phases=phases)
 
     def _lasting(self, task: ScenarioTask, press: Press) -> float:
-        goal = press.needed(task.contact_force).get("force")
-        if goal is None:
+        if isinstance(press.force, Reference):
             return inf
-        return self.lasting_speed(task.contact_force, goal + press.tolerance, press.over)
+        return self.lasting_speed(task.contact_force, press.force, press.over)
 
     def note(self, task: ScenarioTask) -> str:
         """A sentence on the largest `touch_peak` of a task, and on touches that may not last."""
         peaks, lost = [], ""
         made = task.make().phases
         for phase, then in zip(made, [*made[1:], None], strict=True):
-            if speed := phase.speed_of_approach:
-                felt = phase.felt(task.contact_force)
+            if isinstance(phase, Approach):
+                felt, speed = phase.felt(task.contact_force), phase.speed_of_approach
                 peak = touch_peak(felt, speed, self.stiffness, self.mobility, self.late)
                 peaks.append((peak, speed, phase.name))
-                if isinstance(then, Press) and speed > (most := self._lasting(task, then)):
+                if isinstance(then, Press) and speed > (most := rounded(self._lasting(task, then))):
                     lost = (
                         f". After {phase.name} at {speed:g} m/s the tool may bounce: {then.name} "
                         f"keeps the contact up to {most:.2g} m/s; a shorter `over` of {then.name} "

@@ -6,16 +6,11 @@ from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.constraints.points import PointOnSurface
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.surfaces.plate import Plate
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.parts.parts import Impedance
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.task.contacts.laws import laws_of_latches
 from drake_dae.systems.task.contacts.open_contact import open_contact
 from drake_dae.systems.task.controller import TaskController
-from drake_dae.systems.task.phases import Insert
 
 
 def check_task(scenario: Scenario) -> None:
@@ -29,74 +24,11 @@ def check_task(scenario: Scenario) -> None:
     problems = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
     if (task := scenario.task) is not None:
         names = [name for name in task.make().signals if name not in task.signals]
-        problems += [(f"task.signals.{name}", "needed: a phase waits for it") for name in names]
-        gains = {"gains": scenario.gains, "task.gains": task.gains}
-        text = "an !Impedance is not for a task with latches; give !Poles or !Coefficients"
-        if task.make().plan.latches:
-            problems += [(key, text) for key, own in gains.items() if isinstance(own, Impedance)]
-        ending = [c.name for c in scenario.constraints if isinstance(c, Constraint) and c.ends]
-        entering = [phase.name for phase in task.phases if phase.enters_holes]
-        if ending and entering and not scenario.plant.has_sides:
-            text = (
-                f"{entering[0]} enters a hole, and the ideal contact of '{ending[0]}' has a face "
-                "that ends, and no sides without a peg; give it, as pegs: [{constraint: "
-                f"{ending[0]}, radius: 0.00495, length: 0.02}}], or take !MultibodyPlant"
-            )
-            problems.append(("plant", text))
-        problems += _too_deep(scenario)
+        problems += [(f"task.signals.{name}", "needed: a phase watches it") for name in names]
     if scenario.start.errors:
         problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if problems:
         raise ScenarioError(*problems)
-
-
-def _too_deep(scenario: Scenario) -> list[tuple[str, str]]:
-    """Insertions beyond the end of what the plant has in a hole.
-
-    A through hole lets a longer peg through, in ideal contact up to its far side. Nothing is in the
-    hole behind a peg, or where a ball has left it.
-    """
-    plant, task = scenario.plant, scenario.task
-    assert task is not None
-    plates = {
-        c.name: c.surface
-        for c in scenario.constraints
-        if isinstance(c, PointOnSurface) and isinstance(c.surface, Plate)
-    }
-    inserts = [phase for phase in task.phases if isinstance(phase, Insert)]
-    if not inserts or not plant.has_sides:
-        return []
-    pegs = {peg.constraint: peg for peg in plant.pegs}
-    material, ends = plant.material, list[tuple[float, str]]()
-    if material is None:
-        for name, peg in pegs.items():
-            end = min(peg.length, plates[name].thickness if name in plates else np.inf)
-            text = "in ideal contact it must be less than {end:g} m, the length of the peg or the "
-            ends.append(
-                (float(np.nextafter(end, 0.0)), text.format(end=end) + "thickness of the plate")
-            )
-    else:
-        pegs = {peg.constraint: peg for peg in material.pegs}
-        for name, plate in plates.items():
-            if plate.hole is None:
-                continue
-            if name in pegs:
-                end = pegs[name].length
-                text = f"the peg of '{name}' (plant.pegs) is {end:g} m long"
-            else:
-                end = plate.thickness + 2.0 * material.radius
-                text = (
-                    f"the tool is a ball of {material.radius:g} m (plant.radius), which has left "
-                    f"the plate of '{name}' at its far side then, {plate.thickness:g} m below its "
-                    "face; give a smaller depth, or a peg as plant.pegs"
-                )
-            ends.append((end, text))
-    return [
-        ("task.phases", f"{phase.name} is {phase.depth:g} m deep, and {text}")
-        for phase in inserts
-        for end, text in ends
-        if phase.depth > end
-    ]
 
 
 def task_controller(
@@ -123,21 +55,13 @@ def task_controller(
             "cannot filter, and would take for a touch"
         )
         raise ScenarioError(("sampling", text))
-    if scenario.observer is not None and any(isinstance(p, Insert) for p in task.phases):
-        text = (
-            "an Insert lets the hole push the tool aside, and an observer would cancel that push; "
-            "give gains, and no observer"
-        )
-        raise ScenarioError(("observer", text))
-    if task.make().plan.latches:
-        return _latched(scenario, model, law.latency, period)
     points = opening_contact(scenario, model)
     forces = [signal.name for point in points for signal in point.force_signals]
     with at("task"):
         free_system = open_contact(law.system, forces)
     with at("task.gains" if task.gains else "gains"):
         structure = find_structure(free_system)
-        gains = (task.gains or scenario.gains).design(structure)
+        gains = (task.gains or scenario.gains).design()
         free_law = TrackingLaw(free_system, gains, structure=structure, latency=law.latency)
     with at("task"):
         # The noise of the sum over the points.
@@ -146,39 +70,9 @@ def task_controller(
         )
 
 
-def _latched(
-    scenario: Scenario, model: RobotModel, latency: float, period: float
-) -> TaskController:
-    """The controller of a scenario whose task opens and closes latches."""
-    task = scenario.task
-    assert task is not None
-    assert scenario.gains is not None
-    assert not isinstance(scenario.gains, Impedance)
-    assert not isinstance(task.gains, Impedance)
-    if task.contact:
-        text = "its phases name the latches that they open and close; leave it out"
-        raise ScenarioError(("task.contact", text))
-    for key in ("observer", "integral"):
-        if getattr(scenario, key):
-            raise ScenarioError((key, "not for a task with latches; leave it out"))
-    if scenario.force_feedback.is_measured:
-        text = "a law of a task with latches takes no measured force; leave it out"
-        raise ScenarioError(("force_feedback", text))
-    with at("task"):
-        made = task.make()
-        free = None if task.gains is None else task.gains.design()
-        gains = scenario.gains.design()
-        pairs = laws_of_latches(made.plan, model.dae, gains, free, latency)
-        return TaskController(
-            made, *pairs[0], further=pairs[1:], whole=model.dae, sample_period=period
-        )
-
-
 def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, ...]:
-    """The constraint that opens and closes, or those of the points of a face; none with latches."""
+    """The constraints of the points of the contact of a task."""
     assert scenario.task is not None
-    if scenario.task.make().plan.latches:
-        return ()
     fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
     given = scenario.task.contact
     names = [given] if isinstance(given, str) and given else list(given)
@@ -194,6 +88,6 @@ def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, 
         if not names and len(fitting) != 1:
             raise ModelError(
                 "needed, since the unilateral constraints with one force are "
-                f"{', '.join(fitting) or 'none'}; give one, or a list of the points of a face"
+                f"{', '.join(fitting) or 'none'}; give one, or a list of points"
             )
     return tuple(c for name, c in fitting.items() if not names or name in names)

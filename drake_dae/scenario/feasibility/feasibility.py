@@ -10,28 +10,22 @@ from pydrake.geometry import SceneGraph
 from drake_dae.analysis.analyze import along, analyze, examine
 from drake_dae.analysis.limits import limits_along
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.dae.references.reference import common_period
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError, ScenarioError
-from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
-from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
-from drake_dae.robots.link_side import link_side
+from drake_dae.robots.links_behind import links_behind
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.limits import robot_limits
-from drake_dae.scenario.feasibility.pace import paced
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
-from drake_dae.scenario.feasibility.springs import spring_laws
-from drake_dae.scenario.feasibility.task import TaskNeeds, task_needs
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.loop import build_loop, exogenous_references
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
-from drake_dae.scenario.observed import law_robot
-from drake_dae.scenario.parts.parts import Poles, Tracking
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.robot_file.links import RobotLinks
 from drake_dae.scenario.scenario import Scenario
@@ -90,50 +84,24 @@ def complete_and_examine(
     if scenario.task is not None:
         check_task(scenario)
     completed, model = completed_model(scenario, scene_graph, drawn=False, robot=robot)
-    return completed.scenario, _feasibility(completed.scenario, model, scene_graph)
+    return completed.scenario, _feasibility(completed.scenario, model)
 
 
-def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph) -> Feasibility:
+def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     """The feasibility of a completed scenario with its model."""
     examined = None
     try:
-        if scenario.task is None and not scenario.is_cascade:
+        if scenario.task is None:
             examined = examine_scenario(model)
         if examined is None or examined.structure is None or examined.problems:
-            structure = scenario_structure(model, scenario.task)
+            structure = scenario_structure(model)
         else:
             structure = examined.structure
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    if scenario.task is not None:
-        chosen = paced(advised(scenario, model, structure).scenario, model, structure).scenario
-        needs = task_needs(chosen, model, structure)
-        behind = _in_the_way(needs, model, scene_graph)
-        return Feasibility(
-            analyze(structure.system),
-            scenario.duration,
-            *_ranges(needs, model),
-            behind=behind,
-            task=needs,
-            sticking=sticking_note(chosen, model, needs.states, needs.constraint_inputs),
-        )
     gains = _without_gains(scenario, model, structure)
-    laws = None
-    if scenario.is_cascade:
-        # The requirements of the links, as if they were rigid.
-        links, structure = law_robot(scenario, model, structure)
-        laws = spring_laws(scenario, model, links, structure)
-        model = links
-        scenario = replace(
-            scenario,
-            law=Tracking(),
-            gains=Poles(all=[-4.0]),
-            integral=[],
-            plant_parameters={},  # Their names may be those of springs.
-        )
-    elif scenario.actuation and scenario.actuation[0].is_spring and scenario.sampling is not None:
-        links = link_side(model)
-        laws = spring_laws(scenario, model, links, find_structure(links.dae))
+    if scenario.task is not None:
+        return Feasibility(analyze(model.dae), scenario.duration, gains=gains)
     # The law's model, without differences of the plant.
     ideal = replace(
         scenario,
@@ -158,7 +126,10 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
     exogenous = exogenous_references(
         scenario, loop.plant.dae, loop.controller.law.exogenous_degrees
     )
-    analysis = along(examined or examine(model.dae), reference, times, start, exogenous)
+    period = common_period([r.repeats for r in (*loop.reference.references, *exogenous)])
+    analysis = along(
+        examined or examine(model.dae), reference, times, start, period or None, exogenous
+    )
     motion, slowing = analysis.motion, None
     if motion is not None and analysis.structure is not None:
         with at("friction_cones"):
@@ -169,8 +140,11 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
         scenario.duration,
         *(((), (), (), ()) if motion is None else _ranges(motion, model)),
         is_resolved=is_resolved,
-        behind=() if motion is None else _in_the_way(motion, model, scene_graph),
-        laws=laws,
+        behind=(
+            ()
+            if motion is None
+            else links_behind(model, motion.times, motion.states, motion.parameters)
+        ),
         sticking=(
             ""
             if motion is None
@@ -229,18 +203,7 @@ def sample_times(
             return times, is_resolved
 
 
-def _in_the_way(
-    motion: PinnedMotion | TaskNeeds, model: RobotModel, scene_graph: SceneGraph
-) -> tuple[LinkBehind | Collision, ...]:
-    """The links that move behind a surface, and those that collide."""
-    shapes, along = LinkShapes(model, scene_graph), (motion.times, motion.states)
-    behind: tuple[LinkBehind | Collision, ...] = links_behind(
-        model, *along, motion.parameters, shapes
-    )
-    return behind + collisions(shapes, *along)
-
-
-def _ranges(motion: PinnedMotion | TaskNeeds, model: RobotModel) -> _Ranges:
+def _ranges(motion: PinnedMotion, model: RobotModel) -> _Ranges:
     """The controls, joint forces, constraint forces and joints of a `Feasibility`."""
     dae, limits = model.dae, Limits.of(model)
     if not motion.times.size:
@@ -273,7 +236,7 @@ def _ranges(motion: PinnedMotion | TaskNeeds, model: RobotModel) -> _Ranges:
     return controls, joint_forces, constraint_forces, limited
 
 
-def _forces(dae: DaeSystem, motion: PinnedMotion | TaskNeeds) -> FloatArray:
+def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
     """All constraint forces at each state, shape (k, M), as `constraint_force` of a plant."""
     if dae.sharing is None:
         return motion.constraint_inputs

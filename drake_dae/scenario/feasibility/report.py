@@ -10,18 +10,12 @@ from drake_dae.analysis.limits import LimitsAlong
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
-from drake_dae.robots.geometry.clearances import LinkBehind
-from drake_dae.robots.geometry.shapes import Collision
-from drake_dae.scenario.feasibility.springs import SpringLaws
-from drake_dae.scenario.feasibility.task import TaskNeeds
+from drake_dae.robots.links_behind import LinkBehind
 
 WRONG_SIDE = (
     ": turn its normal around if its free side is the other one, or choose another posture or place"
 )
 """The remedy for a link behind a surface."""
-
-IN_EACH_OTHER = ": begin in another configuration, by start.positions, or choose another path"
-"""The remedy for links that collide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +75,7 @@ class Feasibility:
         joints: Positions and velocities of the joints that have limits.
         is_resolved: Whether the times resolve the reference; otherwise values between them are not
             known.
-        behind: Links that move behind a contact surface, and links that collide; see `links_behind`
-            and `collisions`.
-        laws: The requirements of two laws for springs; None without springs or samples.
-        task: The requirements of a task, phase by phase; None without a task.
+        behind: Links that move behind a contact surface.
         sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
         gains: Why no gains can be computed where they are left out, else empty.
         slowing: How much slower the references keep all limits; None where they keep them.
@@ -97,20 +88,15 @@ class Feasibility:
     constraint_forces: tuple[SignalRange, ...] = ()
     joints: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
-    behind: tuple[LinkBehind | Collision, ...] = ()
-    laws: SpringLaws | None = None
-    task: TaskNeeds | None = None
+    behind: tuple[LinkBehind, ...] = ()
     sticking: str = ""
     gains: str = ""
     slowing: LimitsAlong | None = None
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
-        """The problems with links behind a surface, or in each other."""
-        return tuple(
-            f"{link}{IN_EACH_OTHER if isinstance(link, Collision) else WRONG_SIDE}"
-            for link in self.behind
-        )
+        """The problems with links behind a surface."""
+        return tuple(f"{link}{WRONG_SIDE}" for link in self.behind)
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -121,7 +107,6 @@ class Feasibility:
             *map(_pulling, _beyond(self.constraint_forces)),
             *map(_left, _beyond(self.joints)),
             *self.wrong_sides,
-            *(() if self.task is None else self.task.problems),
             *([self.gains] if self.gains else []),
             *(
                 []
@@ -152,8 +137,6 @@ class Feasibility:
                 for key in ("controls", "joint_forces", "constraint_forces", "joints")
             },
             "behind": [asdict(link) for link in self.behind],
-            "spring_laws": None if self.laws is None else self.laws.to_dict(),
-            "task": None if self.task is None else self.task.to_dict(),
             "sticking": self.sticking,
             "slowing": None if self.slowing is None else asdict(self.slowing),
             "problems": list(self.problems),
@@ -176,10 +159,6 @@ class Feasibility:
                     "known. A shorter duration takes them closer together."
                 )
             parts.append([text])
-        if self.laws is not None:
-            parts.append(self.laws.lines)
-        if self.task is not None:
-            parts += [self.task.table(), self.task.lines]
         if self.sticking:
             parts.append([self.sticking])
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])

@@ -7,9 +7,8 @@ is not plain data is `written` as another type. A tag chooses among the classes 
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
-from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import pydantic
 from pydantic_core import CoreSchema, core_schema
@@ -23,23 +22,6 @@ PLAIN = {str: "text", float: "a number"}
 """The names of plain values in a choice by tag."""
 
 
-MOST_KNOWN = 1000
-"""The largest number of parts in the cache of a `ReadingContext`."""
-
-
-class ReadingContext(NamedTuple):
-    """The context in which data are read.
-
-    Attributes:
-        folder: The folder of relative file names; None for the working directory.
-        known: The cache of parts that were read already, for many scenarios that have most parts in
-            common; None for no cache.
-    """
-
-    folder: Path | None = None
-    known: dict[Any, Any] | None = None
-
-
 @dataclass(frozen=True, eq=False)
 class Form:
     """Annotates a dataclass, or a Drake class with `__fields__`: data have the keys of its fields.
@@ -50,7 +32,6 @@ class Form:
         tag: The tag that chooses the class, "!Sphere"; empty if there is no choice.
         needs_tag: Whether the tag is required: without it another class is chosen.
         texts: Name of a field -> its text, if the docstring of the class has none.
-        is_part: Whether it is a part of another form, so that it can be in the cache.
         keys: The keys of data, in less time than for all fields; all fields if empty.
     """
 
@@ -59,7 +40,6 @@ class Form:
     tag: str = ""
     needs_tag: bool = False
     texts: Mapping[str, str] = field(default_factory=dict)
-    is_part: bool = True
     keys: tuple[str, ...] = ()
 
     def __get_pydantic_json_schema__(
@@ -72,7 +52,7 @@ class Form:
         self, source: type[Any], handler: pydantic.GetCoreSchemaHandler
     ) -> CoreSchema:
         # A form at several places, as a reference, is made once: this halves the time of a reader.
-        traits = self.tag, self.needs_tag, self.is_part, repr(self.defaults), repr(self.texts)
+        traits = self.tag, self.needs_tag, repr(self.defaults), repr(self.texts)
         key = source, id(self.written), traits, self.keys
         if key not in _MADE:
             _MADE[key] = self, self._core_schema(source, handler)
@@ -108,30 +88,11 @@ class Form:
             extra_behavior="forbid",
             config=core_schema.CoreConfig(strict=True, allow_inf_nan=False),
         )
-        made = core_schema.no_info_after_validator_function(
+        return core_schema.no_info_after_validator_function(
             make,
             data,
             serialization=core_schema.wrap_serializer_function_ser_schema(dump, schema=data),
         )
-        if not self.is_part:
-            return made
-
-        def read_once(part: Any, read: Callable[[Any], Any], info: Any) -> Any:
-            cache = info.context.known if info.context is not None else None
-            if cache is None:
-                return read(part)
-            same, made = cache.get((id(self), id(part)), (None, None))
-            if same is part:  # As in most runs of a study.
-                return made
-            if len(cache) >= MOST_KNOWN:
-                cache.clear()
-            key = id(self), source, repr(part)
-            if key not in cache:
-                cache[key] = read(part)
-            cache[id(self), id(part)] = part, cache[key]
-            return cache[key]
-
-        return core_schema.with_info_wrap_validator_function(read_once, made)
 
     def _type_in_data(self, hint: Any) -> Any:
         """The type in data of a field with an annotation."""

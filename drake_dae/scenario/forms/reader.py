@@ -1,16 +1,15 @@
 """Reads dataclasses from plain data and writes them, with all problems at once."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import make_dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar, get_type_hints
+from typing import Annotated, Any, Generic, TypeVar
 
 import pydantic
 
 from drake_dae.arrays import can_be_written
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.forms.forms import MOST_KNOWN, Form, ReadingContext
+from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import problem
 
 T = TypeVar("T")
@@ -25,8 +24,7 @@ class Reader(Generic[T]):
     """
 
     def __init__(self, form: type[T], keys: tuple[str, ...] = ()) -> None:
-        whole = Annotated[form, Form(is_part=False, keys=keys)]  # type: ignore[valid-type]
-        self._form, self._parts = form, dict[str, Reader[Any]]()
+        whole = Annotated[form, Form(keys=keys)]  # type: ignore[valid-type]
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(whole)
 
     @cached_property
@@ -40,24 +38,22 @@ class Reader(Generic[T]):
         # The schema of pydantic: the JSON Schema takes longer than a short run.
         return set(_free_names(self._adapter.core_schema, ""))
 
-    def read(self, data: Any, folder: Path | None = None, known: dict[Any, Any] | None = None) -> T:
+    def read(self, data: Any, folder: Path | None = None) -> T:
         """Makes the dataclass of plain data.
 
         Args:
             data: The plain data.
             folder: The folder of relative file names; None for the working directory.
-            known: The cache of a `ReadingContext`.
 
         Raises:
             ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
                 listed.
         """
-        doubtful = _may_have_halves(data, {} if known is None else known)
-        if doubtful and (unwritable := dict.fromkeys(_unwritable(data, ""))):
+        if "\\ud" in repr(data) and (unwritable := dict.fromkeys(_unwritable(data, ""))):
             text = "a text has half of a letter (\\ud800 to \\udfff), which no file can hold"
             raise ScenarioError(*((key or "scenario", text) for key in unwritable))
         try:
-            return self._adapter.validate_python(data, context=ReadingContext(folder, known))
+            return self._adapter.validate_python(data, context=folder)
         except pydantic.ValidationError as error:
             # Each member of a Union reports the same.
             problems = dict.fromkeys(
@@ -65,35 +61,9 @@ class Reader(Generic[T]):
             )
             raise ScenarioError(*problems) from None
 
-    def read_part(
-        self, name: str, data: Any, folder: Path | None, known: dict[Any, Any] | None
-    ) -> Any:
-        """Reads the data of one field alone; other arguments and errors are those of `read`."""
-        if name not in self._parts:
-            hint = get_type_hints(self._form, include_extras=True)[name]
-            self._parts[name] = Reader(make_dataclass("Part", [(name, hint)]))
-        return getattr(self._parts[name].read({name: data}, folder, known), name)
-
     def write(self, value: T) -> Any:
         """Converts a value to plain data, the inverse of `read`."""
         return self._adapter.dump_python(value, mode="json")
-
-
-def _may_have_halves(data: Any, known: dict[Any, Any]) -> bool:
-    """Whether a text in plain data may have half of a letter: repr shows it as a number.
-
-    Parts that were read before, by the cache of a `ReadingContext`, are not examined again.
-    """
-    if not isinstance(data, Mapping):
-        return "\\ud" in repr(data)
-    seen = known.setdefault("without halves", {})
-    if len(seen) >= MOST_KNOWN:
-        seen.clear()
-    new = {key: part for key, part in data.items() if seen.get(id(part), data) is not part}
-    if "\\ud" in repr(new):
-        return True
-    seen.update((id(part), part) for part in new.values())
-    return False
 
 
 def _unwritable(data: Any, key: str) -> Iterator[str]:

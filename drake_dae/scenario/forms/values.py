@@ -55,7 +55,7 @@ def _file(value: Any, info: pydantic.ValidationInfo) -> Path:
     if not isinstance(value, (str, Path)) or not str(value):
         raise ValueError(f"expected the name of a file, got {shown(value)}")
     try:
-        return ((info.context and info.context.folder) or Path()) / value
+        return (info.context or Path()) / value
     except ValueError:  # A null byte.
         raise ValueError(f"expected the name of a file, got {shown(value)}") from None
 

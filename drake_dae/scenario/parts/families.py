@@ -56,8 +56,7 @@ Constraint = Annotated[
     | contact.AxisNormalToSurface
     | contact.Blade
     | contact.RollingWheel
-    | contact.RollingBall
-    | contact.ScrewHead,
+    | contact.RollingBall,
     Choice({**_WRITTEN, **_PRESLIDING, surface.Surface: Surface}),
 ]
 Output = Annotated[
@@ -69,7 +68,7 @@ Output = Annotated[
     Choice(_WRITTEN),
 ]
 ForceOutput = Annotated[
-    str | force_outputs.Squeeze | force_outputs.FaceForces | force_outputs.ForceCombination,
+    str | force_outputs.Squeeze | force_outputs.ForceCombination,
     Choice(_WRITTEN),
 ]
 Stage = Annotated[
@@ -98,7 +97,6 @@ Load = Annotated[
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 FrictionCone = Annotated[friction.FrictionCone, Form(_WRITTEN)]
-Law = Annotated[parts.Tracking | parts.SpringCascadeForm, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 _Pegs = Annotated[
     tuple[Annotated[contact_material.Peg, Form(_WRITTEN)], ...], pydantic.Strict(False)
@@ -117,32 +115,18 @@ Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]
 LargestErrors = Annotated[parts.LargestErrors, Form()]
-_Guards = Annotated[
-    tuple[Annotated[phases.PhaseGuard, Form()], ...], pydantic.Strict(False)
+_Conditions = Annotated[
+    tuple[Annotated[phases.Condition, Form()], ...], pydantic.Strict(False)
 ]  # In data a tuple is a list.
 _BY_NAME: dict[Any, Any] = {Mapping[str, references.Reference | float]: dict[str, Reference]}
 _PHASE_DATA = {
     float | references.Reference: Reference,
-    Mapping[str, float]: dict[str, float],
-    Sequence[phases.PhaseGuard]: _Guards,
+    Sequence[phases.Condition]: _Conditions,
     **_BY_NAME,
 }
 Phase = Annotated[
-    phases.Approach
-    | phases.Press
-    | phases.Move
-    | phases.Dwell
-    | phases.Wait
-    | phases.GuardedMove
-    | phases.Search
-    | phases.Follow
-    | phases.Insert
-    | phases.Screw
-    | phases.Release
-    | phases.Retreat
-    | phases.Close,
+    phases.Approach | phases.Press | phases.Move | phases.Dwell | phases.Release | phases.Retreat,
     Choice(_PHASE_DATA),
 ]
 Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase], **_BY_NAME})]
-Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices | parts.Impedance, Choice()]
-Damping = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]
+Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]

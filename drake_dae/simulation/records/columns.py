@@ -4,12 +4,11 @@ import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray, brief, by_columns, listed, number_in
+from drake_dae.arrays import FloatArray, brief, listed, number_in
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 
@@ -30,18 +29,6 @@ class Recorded:
 
     values: FloatArray
     signals: tuple[Signal, ...]
-
-    @cached_property
-    def extremes(self) -> tuple[FloatArray, FloatArray]:
-        """The least and the largest number in each column, of at least one row."""
-        columns = by_columns(self.values)
-        return columns.min(axis=-1), columns.max(axis=-1)
-
-    @cached_property
-    def sizes(self) -> FloatArray:
-        """The largest size in each column."""
-        least, largest = self.extremes
-        return np.maximum(-least, largest)
 
 
 Table = tuple[FloatArray, dict[str, Recorded]]

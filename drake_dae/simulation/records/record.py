@@ -32,10 +32,7 @@ def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded
 
 
 def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Record":
-    """A record that the library itself has computed, made without checks of the arguments.
-
-    It may be of several runs with the same times: values have then the shape (runs, k, size).
-    """
+    """A record that the library itself has computed, made without checks of the arguments."""
     record = object.__new__(Record)
     vars(record).update(time=time, signals=signals, events=(), about={})
     return record

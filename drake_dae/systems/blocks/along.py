@@ -10,26 +10,19 @@ from drake_dae.errors import DrakeDaeError
 from drake_dae.trace.functions import TracedFunction
 
 
-def function_along(
-    function: TracedFunction,
-    given: Mapping[str, FloatArray],
-    otherwise: Callable[[tuple[FloatArray, ...]], tuple[FloatArray, ...] | None] | None = None,
-) -> FloatArray:
+def function_along(function: TracedFunction, given: Mapping[str, FloatArray]) -> FloatArray:
     """The first value of a function at each time, one row each; nan without a value.
 
     Args:
         function: The function.
         given: Name of an input -> its values, one row for each time; further names are ignored.
-        otherwise: Inputs at one time -> other values, for inputs at which the function has none.
     """
     arguments = [given[name] for name in function.input_names]
     rows = np.full((len(arguments[0]), function.nowhere()[0].size), np.nan)
     evaluate = function.evaluate
     for row, inputs in zip(rows, zip(*arguments, strict=True), strict=True):
-        values: tuple[FloatArray, ...] | None = evaluate(*inputs)
-        if not function.is_valid:
-            values = otherwise(inputs) if otherwise else None
-        if values is not None:
+        values = evaluate(*inputs)
+        if function.is_valid:
             row[:] = values[0]
     return rows
 

@@ -1,6 +1,6 @@
 """Base classes of LeafSystems: parameters, checked functions, and conversion to AutoDiffXd."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import ClassVar
 
@@ -31,11 +31,6 @@ from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.trials import StepWatch
 from drake_dae.trace.functions import TracedFunction
-
-Alternative = Callable[
-    [TracedFunction, FloatArray, Sequence[FloatArray], FloatArray], tuple[FloatArray, ...] | None
-]
-"""A function of a traced function, its state, its inputs and its parameters."""
 
 NO_TIME_DERIVATIVE = "it samples, and a sample has no derivative by the time"
 """The reason why a sampled block does not convert to AutoDiffXd."""
@@ -85,11 +80,6 @@ class DifferentiableSystem(LeafSystem):
     def _formulas(self) -> dict[str, Formula]:
         raise NotImplementedError
 
-    @property
-    def references_by_time(self) -> Formula | None:
-        """The value of an input port `reference` without a wire; None if it needs one."""
-        return None
-
     def check_context(self, context: Context) -> None:
         """Refuses the context of another system.
 
@@ -127,8 +117,6 @@ class ParameterizedSystem(DifferentiableSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
-    _otherwise: Alternative | None = None
-    """Other values of a function whose own are not valid; they may be None, too."""
 
     def __init__(
         self,
@@ -188,10 +176,6 @@ class ParameterizedSystem(DifferentiableSystem):
         values = function.evaluate(state, *inputs, parameters)
         if function.is_valid:
             return values
-        if self._otherwise is not None:
-            alternative = self._otherwise(function, state, inputs, parameters)
-            if alternative is not None:
-                return alternative
         time, state = context.get_time(), state.copy()
         error = simulation_error(function.failure(), time, state, self._signals)
         self._steps.tolerate(context, self.explained(error, parameters, *inputs))
@@ -297,4 +281,4 @@ def _shown(port: InputPort | OutputPort) -> str:
 def _converted(original: DifferentiableSystem) -> AutoDiffSystem:
     """A block on AutoDiffXd."""
     places = original.exogenous_places if isinstance(original, ParameterizedSystem) else []
-    return AutoDiffSystem(original, original.formulas, places, original.references_by_time)
+    return AutoDiffSystem(original, original.formulas, places)

@@ -83,16 +83,15 @@ def simulation_error(
         case FailureKind.SINGULAR:
             return SingularityError(
                 f"{failure.singular} is singular {where}, so {failure.function} is not determined "
-                "there: a singular configuration, through which smaller steps do not lead. A plant "
-                "passes one only where its velocity leads across, along one branch. Keep away from "
-                "this state, or choose other constraints or outputs",
+                "there: a singular configuration, through which smaller steps do not lead. Keep "
+                "away from this state, or choose other constraints or outputs",
                 time,
                 state,
             )
 
 
 def no_step_leads_on(
-    name: str, time: float, state: FloatArray, reason: SimulationError, text: str
+    name: str, time: float, state: FloatArray, reason: SimulationError
 ) -> SimulationError:
     """The exception if each trial step failed; it has the class of the reason.
 
@@ -100,35 +99,37 @@ def no_step_leads_on(
         name: The name of the block.
         time: The time of the last accepted state, in s.
         state: That state.
-        reason: The error of a trial.
-        text: The message of the earliest trial.
+        reason: The error of the earliest trial.
     """
     return reason.retold(
         f"{name}: no step leads on from t = {time:.6g} s{_at(state)} since each that was tried "
-        f"failed, however short: {text}",
+        f"failed, however short: {reason}",
         time,
         state if state.size else reason.state,
     )
 
 
 def spoilt_step(
-    name: str, start: float, end: float, state: FloatArray, text: str
-) -> NonFiniteError:
+    name: str, start: float, end: float, state: FloatArray, reason: SimulationError | None
+) -> SimulationError:
     """The exception if an integrator without error control accepted a trial that failed.
+
+    It has the class of the reason.
 
     Args:
         name: The name of the block.
         start, end: The times of the step, in s.
         state: The state at its start.
-        text: The message of the earliest trial; empty if none failed.
+        reason: The error of the earliest trial; None if none failed.
     """
-    reason = f": {text}" if text else ""
-    return NonFiniteError(
+    text = (
         f"{name}: the step from t = {start:.6g} s{_at(state)} to t = {end:.6g} s led to a state "
-        f"that is not finite{reason}. Take smaller steps, or an integrator with error control",
-        start,
-        state,
+        f"that is not finite{'' if reason is None else f': {reason}'}. Take smaller steps, or an "
+        "integrator with error control"
     )
+    if reason is None:
+        return NonFiniteError(text, start, state)
+    return reason.retold(text, start, state)
 
 
 def endless_steps(
@@ -211,6 +212,28 @@ def assembled_otherwise(
         "one of these constraints and not the others; start nearer to where all hold",
         residual,
     )
+
+
+def singular_configuration(
+    name: str, time: float, state: FloatArray, constraints: tuple[str, ...]
+) -> SingularityError:
+    """The exception of a run that comes to a singular configuration of its constraints.
+
+    Args:
+        name: The name of the system.
+        time: The time, in s.
+        state: The state, shape (n,).
+        constraints: The constraints whose gradients become dependent.
+    """
+    error = SingularityError(
+        f"{name}: the gradients of {', '.join(constraints)} become dependent at t = {time:.6g} s, "
+        f"state {show_state(state)}: A(x) of Assumption (2) is singular in this configuration. "
+        "Keep away from it, or choose other constraints",
+        time,
+        state,
+    )
+    error.constraints = constraints
+    return error
 
 
 def jammed_contact(

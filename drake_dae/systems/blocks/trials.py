@@ -65,33 +65,27 @@ class RunProgress:
             state is a trial.
         state: The continuous state of the block then; empty if it has none.
         failures: The number of failed trials since then.
-        reason: The message of the earliest of them.
-        reason_time: The time of that trial, in s.
+        reason: The error of the earliest of them.
         start: The start of the simulation, in s.
         steps: The number of accepted steps.
         mark: The time after the last `PACE_STEPS` steps, in s.
         parameters: The numeric parameters of the block, each with the time in s after which it had
             them.
-        laws: Likewise those of the law that is fed back to it, if any.
         entry: The cache entry of this value, since looking it up takes longer.
     """
 
     time: float = inf
     state: FloatArray = field(default_factory=lambda: np.zeros(0))
     failures: int = 0
-    reason: str = ""
-    reason_time: float = inf
+    reason: SimulationError | None = None
     start: float = 0.0
     steps: int = 0
     mark: float = 0.0
     parameters: list[tuple[float, FloatArray]] = field(default_factory=list)
-    laws: list[tuple[float, FloatArray]] = field(default_factory=list)
     entry: CacheEntry | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "RunProgress":
-        return replace(
-            self, state=self.state.copy(), parameters=list(self.parameters), laws=list(self.laws)
-        )
+        return replace(self, state=self.state.copy(), parameters=list(self.parameters))
 
 
 class StepWatch:
@@ -132,38 +126,18 @@ class StepWatch:
             raise error from None
         progress.failures += 1
         # A state that is not finite is the consequence of another failure.
-        if error.time < progress.reason_time and np.isfinite(error.state).all():
-            progress.reason, progress.reason_time = str(error), error.time
+        earliest = inf if progress.reason is None else progress.reason.time
+        if error.time < earliest and np.isfinite(error.state).all():
+            progress.reason = error
         if step > SHORTEST * abs(error.time) and progress.failures < FAILURES:
             return
         raise no_step_leads_on(
-            self._system.get_name(), progress.time, progress.state.copy(), error, progress.reason
+            self._system.get_name(), progress.time, progress.state.copy(), progress.reason or error
         ) from None
 
     def parameters_along(self, context: Context, times: FloatArray) -> FloatArray:
         """The numeric parameters of the block at accepted times, in s, one row for each."""
         return _along(self._progress(context).parameters or [(0.0, _parameters(context))], times)
-
-    def note_law(self, context: Context, parameters: FloatArray, begins: bool = False) -> None:
-        """Stores the parameters of the law from the last accepted state on.
-
-        Args:
-            context: The context.
-            parameters: The parameters; the array must not be changed.
-            begins: Whether a simulation begins; without one nothing is stored.
-        """
-        progress = self._progress(context)
-        if begins:
-            before = float(np.nextafter(context.get_time(), -inf))
-            progress.laws = [entry for entry in progress.laws if entry[0] < before]
-            _add(progress.laws, before, parameters)
-        elif progress.laws:
-            _add(progress.laws, progress.time, parameters)
-
-    def laws_along(self, context: Context, times: FloatArray) -> FloatArray | None:
-        """The parameters of the law at accepted times, in s, one row for each; None if unknown."""
-        laws = self._progress(context).laws
-        return _along(laws, times) if laws else None
 
     def _progress(self, context: Context) -> RunProgress:
         # The object is not replaced, and is changed in place.
@@ -179,10 +153,7 @@ class StepWatch:
             _add(parameters, before, _parameters(context))
         entry = self._system.get_cache_entry(self._index)
         self._entry = ref(entry)
-        laws = progress.laws
-        begun = RunProgress(
-            time, start=time, mark=time, parameters=parameters, laws=laws, entry=entry
-        )
+        begun = RunProgress(time, start=time, mark=time, parameters=parameters, entry=entry)
         vars(progress).update(vars(begun))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
@@ -204,7 +175,7 @@ class StepWatch:
                 self._check_pace(progress, time)
         progress.time = time
         if progress.failures:
-            progress.failures, progress.reason, progress.reason_time = 0, "", inf
+            progress.failures, progress.reason = 0, None
         return _DONE
 
     def _check_pace(self, progress: RunProgress, time: float) -> None:

@@ -24,9 +24,6 @@ class PhaseChange:
         chosen: The key word that led here from the phase before: the name of a phase, "next",
             "approach", "hold", "leave" or "stop"; empty at the start.
         failed: Whether the phase before failed.
-        law: The number of the law that is active from then on; see `TaskSupervisor`.
-        followed: The names of the contacts whose points draw a line that the phase finds; empty if
-            it finds none.
     """
 
     time: float
@@ -39,8 +36,6 @@ class PhaseChange:
     distance_rate: float
     chosen: str = ""
     failed: bool = False
-    law: int = 0
-    followed: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return (

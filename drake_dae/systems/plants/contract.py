@@ -18,7 +18,6 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.block import check_context
 from drake_dae.systems.plants.contact_events import ContactEvent
-from drake_dae.trace.functions import TracedFunction
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System
@@ -71,13 +70,10 @@ class Plant(System):
         such contacts has empty lists.
     11. Projection. `projects` says whether the state is projected onto N* after each step; a record
         then has the state before the projection.
-    12. Feedback. A plant that can compute its control itself has an input port `feedback`, which
-        takes a law as a value; see `DaePlant`. `laws_along` are the parameters of that law at the
-        times of a run, or None.
-    13. Contact. `is_ideal` says whether the constraints hold exactly while contacts are closed.
-    14. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
+    12. Contact. `is_ideal` says whether the constraints hold exactly while contacts are closed.
+    13. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
         surfaces and constraint forces.
-    15. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
+    14. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
         the law may not know; not negative.
     """
 
@@ -182,14 +178,6 @@ class Plant(System):
     def events(self, context: Context) -> tuple[ContactEvent, ...]:
         """The events of contacts since the start of the run of a context."""
         return ()
-
-    def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
-        """The parameters of the law at `feedback`, one row for each time; None without one."""
-        return None
-
-    def motion_under(self, law: TracedFunction) -> TracedFunction:
-        """Law and plant as one function, for a plant that takes a law as a value."""
-        raise ModelError(f"{self.dae.name}: no law can be fed back to a {type(self).__name__}")
 
     @property
     def port_signals(self) -> dict[str, tuple[Signal, ...]]:

@@ -14,9 +14,10 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name, vector
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.shared_forces import manifold_of_left_out
+from drake_dae.dae.structure.singular import dependent_constraints
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError, SingularityError
 from drake_dae.systems.blocks.along import function_along
@@ -26,15 +27,13 @@ from drake_dae.systems.blocks.failures import (
     jammed_contact,
     off_manifold,
     off_start,
+    singular_configuration,
 )
-from drake_dae.systems.blocks.feedback import Feedback
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.crossing import Crossing
-from drake_dae.systems.plants.law_input import LawInput
 from drake_dae.systems.plants.traced_plant import traced_plant
 from drake_dae.trace.functions import TracedFunction
 
@@ -58,9 +57,6 @@ class DaePlant(ParameterizedSystem, Plant):
         control: u, shape (p,).
         exogenous: The signals w with their derivatives, if the system has any; see
             `ParameterizedSystem`.
-        feedback: A law from the port `feedback` of a `TrackingController`; with feedback=True. If
-            `control` has no wire, u is the law's control at x. This equals wires for `state` and
-            `control`, in half the time, since the integrator calls only one block.
 
     Output ports:
         state: x, shape (n,).
@@ -73,11 +69,8 @@ class DaePlant(ParameterizedSystem, Plant):
         controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
             zero.
 
-    The motion passes through isolated singular configurations, where gradients of constraints are
-    dependent, along the branch of N* of its velocity; see `Passage`. Within 1e-3 of it (the sine of
-    an angle between gradients) `constraint_force` and `controlled_output` are without their
-    unbounded components. If no continuation is determined, as at rest, and always with friction,
-    exogenous signals or shared forces, A(x) is singular and an error is raised.
+    A run ends at a singular configuration, where gradients of constraints become dependent; the
+    error names them.
 
     At a trial state of an integrator, missing values are nan, and error control takes a shorter
     step. At an accepted state, or if no step is short enough, an error is raised.
@@ -93,7 +86,6 @@ class DaePlant(ParameterizedSystem, Plant):
         structure: The structure of the system, by `find_constraint_structure` or
             `find_structure`; the former if None.
         project: False leaves the drift off N* uncorrected, to study it.
-        feedback: Whether there is an input port `feedback`; not with exogenous signals.
 
     Attributes:
         structure: The structure.
@@ -103,8 +95,7 @@ class DaePlant(ParameterizedSystem, Plant):
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
-        ModelError: It is not a system, the structure is that of another one, or a law cannot be fed
-            back.
+        ModelError: It is not a system, or the structure is that of another one.
         InconsistentStateError: A simulation starts from a state that is off N*.
         SingularityError: A(x) is singular during a run; the exception has time and state. In a
             Painleve paradox it is a PainleveError with the outcome.
@@ -120,7 +111,6 @@ class DaePlant(ParameterizedSystem, Plant):
         *,
         structure: ConstraintStructure | None = None,
         project: bool = True,
-        feedback: bool = False,
     ) -> None:
         structure = constraint_structure_of(type(self).__name__, system, structure)
         signals = {"state": system.state_signals, "control": system.control_signals}
@@ -133,18 +123,15 @@ class DaePlant(ParameterizedSystem, Plant):
         force = system.forces(constraint_input)
         self._is_controlled = system.num_controls > 0
         rate = derivatives.expand(derivatives.rate)
-        self._crossing = Crossing(structure)
-        self._otherwise, doubt = self._crossing.values, self._crossing.doubt
-        self.dynamics = structure.trace("dynamics", rate, self._is_controlled, doubt)
-        self._force = structure.trace("constraint force", force, elimination.beta.nnz() > 0, doubt)
+        self.dynamics = structure.trace("dynamics", rate, self._is_controlled)
+        self._force = structure.trace("constraint force", force, elimination.beta.nnz() > 0)
         needs_control = elimination.n_star.nnz() > 0
-        self._output = structure.trace("controlled output", output, needs_control, doubt)
+        self._output = structure.trace("controlled output", output, needs_control)
         self.functions: dict[str, TracedFunction] = {
             "constraint_force": self._force,
             "constraint_residual": structure.manifold.residual_function,
             "controlled_output": self._output,
         }
-        self._crossing.stands_in_for(self.dynamics, self._force, self._output)
 
         self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
         self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
@@ -152,7 +139,7 @@ class DaePlant(ParameterizedSystem, Plant):
         self._left_out = manifold_of_left_out(system)
         degrees = system.exogenous.degrees(rate, force, output, residual)
         self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
-        self._declare_feedback(feedback)
+        self._control_ticket = self.input_port_ticket(self._control_port.get_index())
         self.DeclareVectorOutputPort(
             "state", system.num_states, weakly(self._copy_state), state_tickets(self)
         )
@@ -170,24 +157,7 @@ class DaePlant(ParameterizedSystem, Plant):
     def _tickets(self, function: TracedFunction) -> set[DependencyTicket]:
         """The dependencies of the values of a function."""
         takes_control = "control" in function.input_names
-        return self._by_state | (self._control_tickets if takes_control else set())
-
-    def _declare_feedback(self, is_fed_back: bool) -> None:
-        """Declares the input port `feedback`, and the dependencies of u besides time and state."""
-        self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
-        self._law: LawInput | None = None
-        if not is_fed_back:
-            return
-        if not self._is_controlled or self._exogenous is not None:
-            missing = "has exogenous signals" if self._is_controlled else "has no control"
-            raise ModelError(f"{self.dae.name} {missing}: no law can be fed back to it")
-        values, compiled = weakly(self._values), self.dae.compiled
-        self._law = LawInput(self, self._control_port, values, self._steps, self.dynamics, compiled)
-        self._control_tickets.add(self.input_port_ticket(self._law.port.get_index()))
-
-    def motion_under(self, law: TracedFunction) -> TracedFunction:
-        """Law and plant as one function; see `feedback.motion_under`."""
-        return super().motion_under(law) if self._law is None else self._law.motion_under(law)
+        return self._by_state | ({self._control_ticket} if takes_control else set())
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
@@ -204,15 +174,7 @@ class DaePlant(ParameterizedSystem, Plant):
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         # Called most by an integrator, so without further calls for valid values.
-        if self._law is not None:
-            motion = self._law.motion(context)
-            if motion is not None:
-                state = context.get_continuous_state_vector().value()
-                rate = motion(context.get_time(), state)
-                if rate is not None:
-                    derivatives.SetFromVector(rate)
-                    return
-        elif self._is_controlled and self._exogenous is None:
+        if self._is_controlled and self._exogenous is None:
             control = self._control_port.Eval(context)
             state = context.get_continuous_state_vector().value()
             parameters = context.get_numeric_parameter(0).value()
@@ -225,33 +187,8 @@ class DaePlant(ParameterizedSystem, Plant):
     def _evaluate(self, function: TracedFunction, context: Context) -> FloatArray:
         x = context.get_continuous_state_vector().value()  # The context's own numbers, no copy.
         if "control" in function.input_names:
-            control = self._control(context)
-            if control is None:
-                return function.nowhere()[0]
-            return self._checked(function, context, x, control)[0]
+            return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
-
-    def _control(self, context: Context) -> FloatArray | None:
-        """u; None if the law at `feedback` has no value at a trial state."""
-        feedback = self._feedback(context)
-        if feedback is None:
-            wired: FloatArray = self._control_port.Eval(context)
-            return wired
-        time, state = context.get_time(), self.state(context)
-        control = feedback.control(time, state)
-        if control is None:
-            self._steps.tolerate(context, feedback.error(time, state))
-            return None
-        return control.copy()
-
-    def _feedback(self, context: Context) -> Feedback | None:
-        """The law at `feedback`; None if the control has a wire or a fixed value."""
-        return None if self._law is None else self._law.feedback(context)
-
-    def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
-        """The parameters of the law at `feedback`, as `parameters_along`; None without one."""
-        self.check_context(context)
-        return self._steps.laws_along(context, vector("times", times, None))
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
         """The values of a port of `functions` at given times, one row each; nan without a value.
@@ -274,16 +211,7 @@ class DaePlant(ParameterizedSystem, Plant):
         for name in function.input_names:
             if name not in given or np.shape(given[name])[1:] != (sizes[name],):
                 raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {sizes[name]})")
-        return function_along(
-            function, given, lambda at: self._crossing.values(function, at[0], at[1:-1], at[-1])
-        )
-
-    def _crosses(self, state: FloatArray, context: Context) -> bool:
-        """Whether the system passes a singular configuration near a state."""
-        control = self._control(context) if self._is_controlled else np.zeros(0)
-        if control is None:
-            return False
-        return self._crossing.happens(state, control, self._values(context))
+        return function_along(function, given)
 
     def explained(
         self,
@@ -292,9 +220,13 @@ class DaePlant(ParameterizedSystem, Plant):
         *inputs: FloatArray,
         held: FloatArray | None = None,
     ) -> SimulationError:
-        """Returns in a Painleve paradox the error with its outcome."""
-        is_known = isinstance(error, SingularityError) and (inputs or not self._is_controlled)
-        if not (self.dae.frictional_contacts and is_known):
+        """Returns the error with dependent constraints, or in a Painleve paradox its outcome."""
+        if not isinstance(error, SingularityError):
+            return error
+        if not self.dae.frictional_contacts:
+            names = dependent_constraints(self.structure, error.state, parameters)
+            return singular_configuration(self.dae.name, error.time, error.state, names)
+        if not inputs and self._is_controlled:
             return error
         control = inputs[0] if self._is_controlled else np.zeros(0)
         taken = (control,) if "control" in self._force.input_names else ()
@@ -328,9 +260,6 @@ class DaePlant(ParameterizedSystem, Plant):
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
-        feedback = self._feedback(context)
-        if feedback is not None:
-            self._steps.note_law(context, feedback.parameters, begins=True)
         return EventStatus.DidNothing()
 
     def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
@@ -368,9 +297,7 @@ class DaePlant(ParameterizedSystem, Plant):
         projected = manifold.first_steps(x, parameters)
         if projected is None:
             try:
-                projected = manifold.searched(
-                    x, parameters, lambda near: self._crosses(near, context)
-                )
+                projected = manifold.searched(x, parameters)
             except InconsistentStateError as error:
                 raise off_manifold(context.get_time(), x.copy(), error) from error
         if projected is x:

@@ -11,7 +11,6 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError
@@ -23,15 +22,13 @@ from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.task.contacts.fit import check_plant_of_task
-from drake_dae.systems.task.contacts.laws import CONTACT, FREE, law_name, paired_laws
+from drake_dae.systems.task.contacts.open_contact import CONTACT, FREE, LAWS, contact_laws
 from drake_dae.systems.task.contacts.outputs import TaskOutputs
-from drake_dae.systems.task.prediction import predicted_errors
 from drake_dae.systems.task.progress import ReferenceSegment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.task import Task, check_sampled
 
 _REFUSED = {"tolerances": "the phases of a task have their own, and times to end in; leave it out"}
-_LATCHED = {"observer": "it observes one contact, and this task has latches; leave it out"}
 
 
 @checked(ModelError)
@@ -55,10 +52,6 @@ class TaskController(Diagram, Controller):
     J^T = 0. At a release lambda is at most the task's `contact_force`, and the jump is J^T lambda.
     A slow touch, and small gains of the free law for the distance, keep the first jump small.
 
-    A task with latches has two laws for each latch with other latches closed: one leads its
-    distances while it is open, the other its forces while it is closed. The load of an object
-    passes from one hand to another by a Release of the first hand, whose forces go to zero.
-
     Of a plant it needs only the state x and the measured constraint forces. If the laws are for a
     system with a disturbance, one observer serves both, since its equation contains the measured
     force and so holds for closed and open contacts. Drake's Simulator finds the guards as zeros of
@@ -80,10 +73,7 @@ class TaskController(Diagram, Controller):
         phase: The index of the phase in the task, shape (1,); after the last one their number.
         ending: 0 while the task goes on, then how it has ended, shape (1,); see `TaskSupervisor`.
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
-            of k points. In contact the distances are zero, otherwise the forces. Those of further
-            latches follow.
-        latch: 1 for each latch that is commanded to be closed, else 0, in the order of
-            `task.plan.latches`; only with latches.
+            of k points. In contact the distances are zero, otherwise the forces.
         contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
         integral, free_integral: The integrals of each law, if it has any. They are not updated
@@ -92,22 +82,17 @@ class TaskController(Diagram, Controller):
 
     Args:
         task: The phases.
-        law: The law in contact. Its force, "wall.force" for example, is one of its outputs. The
-            contact may be a face of several points, whose force and moments are outputs; see
-            `FaceForces`.
+        law: The law in contact. Its force, "wall.force" for example, is one of its outputs. A
+            contact may have several points, which open and close together: then as many outputs
+            are forces, one of them their sum.
         free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
-        further: With latches, law and free_law for each further entry of `task.plan.pairs`, by
-            `laws_of_latches`.
-        whole: The system with the constraints of all latches, if `law.system` has fewer.
         sample_period: The period of guards and integrals of errors, in s; 0 for continuously.
 
     Attributes:
         task, law, free_law, sample_period: The arguments.
         supervisor, controller: Blocks in it: the latter has the first law in contact.
-        contact: The contact that opens and closes, or the first latch.
-        pairs: The laws of each contact with other closed ones.
-        columns: The places of their outputs in a record.
-        whole: The system with all constraints.
+        contact: The contact that opens and closes.
+        columns: The places of the outputs of both laws in a record.
         output_signals: Names and units of `desired_output`.
         outputs: (x, lambda, parameters) -> the outputs, in the order of `desired_output`, and the
             derivatives of the distances, shape (p + 2 k,) for a contact of k points.
@@ -125,8 +110,6 @@ class TaskController(Diagram, Controller):
         law: TrackingLaw,
         free_law: TrackingLaw,
         *,
-        further: Sequence[tuple[TrackingLaw, TrackingLaw]] = (),
-        whole: DaeSystem | None = None,
         sample_period: float = 0.0,
     ) -> None:
         super().__init__()
@@ -134,31 +117,26 @@ class TaskController(Diagram, Controller):
         self.task, self.law, self.free_law = task, law, free_law
         self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
         self.sample_period = sample_period
-        self.whole = law.system if whole is None else whole
-        self.pairs = paired_laws(task.plan, self.whole, [(law, free_law), *further])
-        self.columns = TaskOutputs(self.pairs, self.whole)
-        self.contact = contact = self.pairs[0].contact
-        if contact.size == 1 and task.watches("eccentricity"):
-            raise ModelError("a guard of the eccentricity needs a contact of several points")
+        pair = contact_laws(law, free_law)
+        self.contact, self.columns = pair.contact, TaskOutputs(pair)
         self.outputs, self.output_signals = self.columns.function, self.columns.signals
         builder = DiagramBuilder()
-        measured = self.whole.num_constraints
-        supervisor = TaskSupervisor(task, self.pairs, self.columns, measured, sample_period)
+        measured = law.system.num_constraints
+        supervisor = TaskSupervisor(task, pair, self.columns, measured, sample_period)
         self.supervisor = builder.AddSystem(supervisor)
         for name in ("estimated_state", "measured_force", "hold"):
             builder.ExportInput(self.supervisor.GetInputPort(name), name)
         for port in self.supervisor.signal_ports.values():
             builder.ExportInput(port, port.get_name())
-        laws = [each for pair in self.pairs for each in pair.laws]
-        names = [law_name(which, "law") for which in range(len(laws))]
+        names = [f"{name}_law" for name in LAWS]
         switch = builder.AddSystem(LawSwitch(law.system.num_controls, names))
         builder.Connect(self.supervisor.GetOutputPort("law"), switch.GetInputPort("law"))
         self.controllers = []
-        for which, its_law in enumerate(laws):
+        for which, its_law in enumerate(pair.laws):
             controller = builder.AddSystem(TrackingController(its_law, sample_period=sample_period))
-            controller.set_name(law_name(which, "controller"))
+            controller.set_name(f"{LAWS[which]}_controller")
             builder.ConnectInput("estimated_state", controller.GetInputPort("estimated_state"))
-            reference = self.supervisor.GetOutputPort(law_name(which, "reference"))
+            reference = self.supervisor.GetOutputPort(f"{LAWS[which]}_reference")
             builder.Connect(reference, controller.GetInputPort("reference"))
             if its_law.measured_force:
                 measured = controller.GetInputPort("measured_force")
@@ -176,9 +154,9 @@ class TaskController(Diagram, Controller):
                     builder.ConnectInput("exogenous", port)
             if count := len(its_law.integral.outputs):
                 hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-                hold.set_name(law_name(which, "hold"))
+                hold.set_name(f"{LAWS[which]}_hold")
                 builder.Connect(
-                    self.supervisor.GetOutputPort(law_name(which, "hold")), hold.get_input_port()
+                    self.supervisor.GetOutputPort(f"{LAWS[which]}_hold"), hold.get_input_port()
                 )
                 builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
                 shown = "integral" if which == CONTACT else "free_integral"
@@ -190,10 +168,9 @@ class TaskController(Diagram, Controller):
         self.exogenous_places = self.controller.exogenous_places
         control = switch.GetOutputPort("control")
         builder.ExportOutput(control, "control")
-        if task.watches("control"):
+        if task.controls:
             builder.Connect(control, self.supervisor.GetInputPort("control"))
-        names = ["phase", "ending", "desired_output"]
-        names += ["latch"] if task.plan.latches else ["contact_reference"]
+        names = ["phase", "ending", "desired_output", "contact_reference"]
         for name in [*names, "tared_force"] if task.tare_time else names:
             builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
         builder.BuildInto(self)
@@ -271,14 +248,13 @@ class TaskController(Diagram, Controller):
 
     @property
     def start_structure(self) -> ConstraintStructure:
-        first = self.task.plan.law_of(0)
-        return self.pairs[first // 2].laws[first % 2].structure
+        return (self.law if self.task.plan.contacts[0] else self.free_law).structure
 
     def all_parameters(self, context: Context) -> FloatArray:
         return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
 
     def check_plant(self, plant: Plant) -> None:
-        check_plant_of_task(self.task.plan, self.whole, self.contact, self.sample_period, plant)
+        check_plant_of_task(self.law.system, self.sample_period, plant)
 
     def derived(
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
@@ -293,28 +269,21 @@ class TaskController(Diagram, Controller):
         signals, columns = self.output_signals, self.columns
         every = function_along(self.outputs, {**values, "force": values["constraint_force"]})
         outputs, rates = every[:, : columns.size], every[:, columns.size :]
-        own = [signals[column] for column in columns.of_distances]
+        own = [signals[column] for column in columns.distances]
         desired = np.zeros_like(outputs)
-        segments = () if context is None else self.segments(context)
         if times.size and context is not None:  # A run that failed at its start has no segments.
             desired = self.desired_along(context, times)
-            laws = np.array([segments[i].law for i in places_at(segments, times)])
-            desired = columns.led(desired, outputs, laws)
         places = values["phase"].astype(int)
-        predicted = predicted_errors(
-            self.pairs, columns, segments, times, {**values, "outputs": outputs}
-        )
         names = self.phase_signals
         return {
             "phase": ((places == np.arange(len(names))).astype(float), names),
             "distance": (
-                np.hstack([outputs[:, columns.of_distances], rates]),
+                np.hstack([outputs[:, columns.distances], rates]),
                 (*own, *(signal.derivative(1) for signal in own)),
             ),
             "controlled_output": (outputs, signals),
             "desired_output": (desired, signals),
             "tracking_error": (outputs - desired, signals),
-            "predicted_error": (predicted, signals),
         }
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared:
@@ -328,7 +297,8 @@ class TaskController(Diagram, Controller):
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        return values["predicted_error"]
+        """Zero: the references of each phase begin as those before it end."""
+        return np.zeros((times.size, self.columns.size))
 
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of the laws' model in a context, as `TrackingController` does.

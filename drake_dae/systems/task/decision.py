@@ -1,6 +1,6 @@
 """The decision whether a phase goes on, and how it has ended."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -10,7 +10,6 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.errors import SimulationError
 from drake_dae.systems.task.contacts.open_contact import OpeningContact
 from drake_dae.systems.task.phases import Moment, Outcome, Phase
-from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.progress import LET_GO, ReferenceSegment, TaskProgress
 from drake_dae.systems.task.traced import EARLY, TracedTask
 
@@ -55,14 +54,11 @@ class PhaseDecision:
             phase = phases[change.place]
             late, holds = float(phase.remaining(moment)), phase.holds_contact
             if not traced.tares(held):
-                end = float(phase.margin(moment, task.contact_force))
-            margins = traced.tally.margins(phase, traced.tally_of(held), moment)
-            guards = np.array([float(margin) for margin in margins])
+                end = float(phase.success(moment, task.contact_force))
+            guards = np.array([float(moment.margin(guard)) for guard in phase.guards])
         if holds and change.in_contact and not progress.is_felt:
             lost = task.patience - (time - progress.felt)
         felt = excess + LET_GO * task.contact_force if progress.is_felt else -excess
-        if task.plan.latches:  # A latch without force is not lost.
-            lost = felt = np.inf
         nearest = np.min(guards, initial=np.inf)
         return cls(moment, guards, np.array([nearest, end, lost, late, felt]))
 
@@ -86,12 +82,10 @@ class PhaseDecision:
         ended = self.margins <= 2.0 * EARLY
         if ended[0]:
             guard = phase.guards[int(np.argmax(self.guards <= 2.0 * EARLY))]
-            value = float(getattr(self.moment, guard.of))
-            return "guard", f"{phase.name} is ended by {guard.tripped(value)}"
+            value = float(self.moment.value(guard))
+            return "guard", f"{phase.name} is ended by {guard}, with {value:.4g}"
         if ended[1]:
-            return "success", f"after {phase.awaited(contact_force)}"
-        if ended[2] and phase.ends_by_loss:
-            return "success", "after its contact is lost"
+            return "success", f"after {phase.awaits(contact_force)}"
         if ended[2]:
             return "lost", f"the contact of {phase.name} is lost"
         return "late", phase.lateness(self.moment, contact_force)
@@ -119,41 +113,31 @@ def moment_of(
     segment: ReferenceSegment,
     contact: OpeningContact,
     time: float,
-    motion: tuple[float, float, FloatArray, FloatArray],
+    motion: tuple[float, float, FloatArray],
     forces: Sequence[float],
-    contact_force: float,
-    work: float,
-    signal: float,
-    controls: FloatArray,
-    measured: int | None,
+    signals: Mapping[str, float],
+    controls: Mapping[str, float],
 ) -> Moment:
     """The measurements that decide when the phase of a segment ends.
 
     Args:
         segment: The current references.
-        contact: The contact that they lead.
+        contact: The contact that opens and closes.
         time: The time, in s.
         motion: As of `TaskPlanner.motion`.
         forces: The measured forces of the contact.
-        contact_force: Forces below this, in N, count as zero.
-        work, signal: As of `Moment`.
-        controls: |u|, shape (p,); 0 if nothing watches it.
-        measured: The index of the control that the phase measures; None for none.
+        signals, controls: As of `Moment`.
     """
-    (distance, rate, moved, rates), change = motion, segment.change
+    (distance, rate, moved), change = motion, segment.change
     wanted = [contact.main] if change.in_contact else list(contact.places)
     return Moment(
         time=time - change.time,
-        force=float(contact.total(np.array(forces))),
+        force=float(np.sum(forces)),
         distance=distance,
         rate=rate,
         wanted=float(np.mean(segment.reference(time)[segment.layout.lowest[wanted]])),
         away=distance - change.distance,
-        speed=float(np.linalg.norm(rates)),
         travel=float(np.linalg.norm(moved - segment.origin)),
-        work=work,
-        control=float(controls.max()),
-        torque=0.0 if measured is None else float(controls[measured]),
-        eccentricity=float(eccentricity(forces, contact_force)),
-        signal=signal,
+        signals=signals,
+        controls=controls,
     )

@@ -1,6 +1,6 @@
 """The references of each phase, which continue those of the phase before."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -12,8 +12,12 @@ from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.systems.control.phase_change import PhaseChange
-from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws
-from drake_dae.systems.task.contacts.open_contact import OpeningContact
+from drake_dae.systems.task.contacts.open_contact import (
+    CONTACT,
+    FREE,
+    ContactLaws,
+    OpeningContact,
+)
 from drake_dae.systems.task.phases import Moment
 from drake_dae.systems.task.progress import DONE, HELD, ReferenceSegment
 from drake_dae.systems.task.task import Task
@@ -74,76 +78,65 @@ class TaskPlanner:
 
     Args:
         task: The phases.
-        pairs: The laws of each contact with other closed ones; see `PhasePlan.pairs`.
+        pair: The laws of the task.
 
     Attributes:
         goals: The references of each phase.
         rates: The final rates of all outputs in each phase, shape (p,).
-        motion_functions: For each pair: (x, parameters) -> the distance and its derivative by the
-            model, then all outputs in m including the distance, then their derivatives. Of several
-            distances it has the mean, and of a latch the largest one.
+        motion_function: (x, parameters) -> the distance and its derivative by the model, then all
+            outputs in m including the distance. Of several distances it has the mean.
         moved: The number of these outputs.
-        controls: The index of the control that each phase measures, None for none; last None.
+        control_places: Name of each control that a phase watches -> its index.
 
     Raises:
         ModelError: A phase has a reference that does not fit its law.
     """
 
-    def __init__(self, task: Task, pairs: Sequence[ContactLaws]) -> None:
-        self._task, self._pairs = task, pairs
-        self._laws = [law for pair in pairs for law in pair.laws]
+    def __init__(self, task: Task, pair: ContactLaws) -> None:
+        self._task, self._contact, self._laws = task, pair.contact, pair.laws
         self._phases = task.plan.phases
-        self.goals, self.rates, self.controls = [], [], list[int | None]()
+        self.goals, self.rates = [], []
         for index in range(len(self._phases)):
-            number = task.plan.law_of(index)
-            contact, closed = pairs[number // 2].contact, number % 2 == CONTACT
-            self.goals.append(_goals(task, index, self._laws[number], contact, closed))
-            self.rates.append(_rates(task, index, self._laws[number], contact, closed))
-            self.controls.append(_measured_control(task, index, self._laws[number]))
-        self.controls.append(None)
-        self._nothing = [_no_goals(law) for law in self._laws]
-        self.motion_functions, self.moved = [], 0
-        for pair in pairs:
-            free, contact = pair.laws[FREE], pair.contact
-            chains = free.structure.output_chains
-            own = [
-                ca.vertcat(*(chains[place][order] for place in contact.places)) for order in (0, 1)
-            ]
-            distance = [
-                ca.norm_inf(part) if contact.is_latch else ca.sum1(part) / contact.size
-                for part in own
-            ]
-            moved = [
-                distance if place == contact.main else chains[place]
-                for place, signal in enumerate(free.system.output_signals)
-                if place == contact.main or (signal.unit == "m" and place not in contact.places)
-            ]
-            rows = [*distance, *(chain[0] for chain in moved), *(chain[1] for chain in moved)]
-            function = free.system.trace("motion", {"value": ca.vertcat(*rows)})
-            self.motion_functions.append(function)
-            self.moved = len(moved)
+            closed = task.plan.contacts[index]
+            law = pair.laws[int(closed)]
+            self.goals.append(_goals(task, index, law, pair.contact, closed))
+            self.rates.append(_rates(task, index, law, pair.contact, closed))
+        self._nothing = [_no_goals(law) for law in pair.laws]
+        free, contact = pair.laws[FREE], pair.contact
+        chains = free.structure.output_chains
+        distance = [
+            sum((chains[place][order] for place in contact.places), ca.SX(0)) / contact.size
+            for order in (0, 1)
+        ]
+        moved = [
+            distance[0] if place == contact.main else chains[place][0]
+            for place, signal in enumerate(free.system.output_signals)
+            if place == contact.main or (signal.unit == "m" and place not in contact.places)
+        ]
+        self.motion_function = free.system.trace("motion", {"value": ca.vertcat(*distance, *moved)})
+        self.moved = len(moved)
+        names = [signal.name for signal in free.system.control_signals]
+        for name in filter(None, task.controls):
+            if name not in names:
+                raise ModelError(f"condition of a control: {unknown_name('control', name, names)}")
+        self.control_places = {name: names.index(name) for name in task.controls if name}
 
-    def motion(self, now: ModelMoment, law: int) -> tuple[float, float, FloatArray, FloatArray]:
-        """The distance and its derivative, then all outputs in m and their derivatives.
+    def motion(self, now: ModelMoment) -> tuple[float, float, FloatArray]:
+        """The distance and its derivative, then all outputs in m.
 
         Args:
             now: The moment.
-            law: The number of the law that acts.
         """
-        function = self.motion_functions[law // 2]
-        values = function.evaluate(now.state, now.parameters)[0].copy()
-        first, rates = values[2 : 2 + self.moved], values[2 + self.moved :]
-        return float(values[0]), float(values[1]), first, rates
+        values = self.motion_function.evaluate(now.state, now.parameters)[0].copy()
+        return float(values[0]), float(values[1]), values[2:]
 
     def first(self, now: ModelMoment) -> ReferenceSegment:
         """The references of the first phase, which start at the current outputs."""
-        law, force = self._task.plan.law_of(0), 0.0
-        contact = self._pairs[law // 2].contact
-        if law % 2 == CONTACT and not contact.is_latch:
-            force = self._task.contact_force
-        moment = Moment(0.0, force, *self.motion(now, law)[:2], 0.0)
-        present = self._met(now, law, moment, [0.0] * contact.size)
-        return self._started(now, 0, self._name(0), law, BEGIN, moment, present)
+        closed = self._task.plan.contacts[0]
+        force = self._task.contact_force if closed else 0.0
+        moment = Moment(0.0, force, *self.motion(now)[:2], 0.0)
+        present = self._met(now, int(closed), moment)
+        return self._started(now, 0, self._name(0), int(closed), BEGIN, moment, present)
 
     def following(
         self,
@@ -152,7 +145,6 @@ class TaskPlanner:
         moment: Moment,
         place: int | None,
         cause: PhaseCause,
-        forces: Callable[[int], Sequence[float]],
     ) -> ReferenceSegment:
         """The references of the next phase, which continue those before.
 
@@ -163,7 +155,6 @@ class TaskPlanner:
             place: The index of the next phase, the number of phases when the task is done; None if
                 the robot rests for another reason.
             cause: The reason.
-            forces: The number of a law -> the measured forces of its contact.
         """
         was, present = before.law, before.reference(now.time)
         end = len(self._phases)
@@ -171,16 +162,14 @@ class TaskPlanner:
         if place is None or place == end:  # The robot rests as it is: it touches, or is free.
             ends = cause.ends_in_contact
             is_closed = before.change.in_contact if ends is None else ends
-            if not self._pairs[was // 2].contact.is_latch:
-                is_closed = is_closed and moment.force >= self._task.contact_force
-            law, place = was - was % 2 + int(is_closed), end
+            is_closed = is_closed and moment.force >= self._task.contact_force
+            law, place = int(is_closed), end
         else:
-            law = self._task.plan.law_of(place)
+            law = int(self._task.plan.contacts[place])
         if law != was:
-            old, present = present, self._met(now, law, moment, forces(law))
-            places = {*self._pairs[law // 2].contact.places, *self._pairs[was // 2].contact.places}
+            old, present = present, self._met(now, law, moment)
             for i, first in enumerate(self._laws[law].layout.lowest):
-                if i not in places:
+                if i not in self._contact.places:
                     size, start = self._laws[law].degrees[i] + 1, before.layout.lowest[i]
                     present[first : first + size] = old[start : start + size]
         return self._started(now, place, name, law, cause, moment, present)
@@ -203,47 +192,32 @@ class TaskPlanner:
             time=float(now.time),
             phase=name,
             place=place,
-            in_contact=number % 2 == CONTACT,
+            in_contact=number == CONTACT,
             reason=cause.reason,
             force=float(moment.force),
             distance=float(moment.distance),
             distance_rate=float(moment.rate),
             chosen=cause.chosen,
             failed=cause.failed,
-            law=number,
-            followed=self._followed(place, number),
         )
-        origin = self.motion(now, number)[2]
+        origin = self.motion(now)[2]
         return ReferenceSegment.begin(
             change, law.layout, goals.function, goals.named, rate, present, over, origin
         )
 
-    def _met(
-        self, now: ModelMoment, number: int, moment: Moment, forces: Sequence[float]
-    ) -> FloatArray:
+    def _met(self, now: ModelMoment, number: int, moment: Moment) -> FloatArray:
         """R of a law from the current outputs, z_i, z_i', ...; zero for the highest derivatives.
 
-        A force of degree 0 is the measured one, and moments of degree 0 are zero: from an even
-        pressure on, all points of a face are pressed to the surface. All forces and moments of a
-        latch are the measured ones.
+        A force of degree 0 is the measured one, and differences of forces of degree 0 are zero:
+        from an even pressure on, all points are pressed to the surface.
         """
-        law, contact = self._laws[number], self._pairs[number // 2].contact
+        law, main = self._laws[number], self._contact.main
         reference = np.zeros(law.layout.reference_size)
         coordinates = law.error_coordinates(now.state, reference, now.parameters)
         reference[law.layout.chained] = np.delete(coordinates, _integral_places(law))
-        if number % 2 == CONTACT and law.degrees[contact.main] == 0:
-            if contact.is_latch:
-                reference[law.layout.lowest[list(contact.places)]] = forces
-            else:
-                reference[law.layout.lowest[contact.main]] = moment.force
+        if number == CONTACT and law.degrees[main] == 0:
+            reference[law.layout.lowest[main]] = moment.force
         return reference
-
-    def _followed(self, place: int, number: int) -> tuple[str, ...]:
-        """The names of the contacts whose points draw the line that a phase finds."""
-        if place >= len(self._phases) or not self._phases[place].finds_line:
-            return ()
-        signals = self._laws[number].system.force_signals
-        return tuple(signals[i].name.split(".")[0] for i in self._pairs[number // 2].contact.forces)
 
     def _name(self, place: int) -> str:
         return self._phases[place].name if place < len(self._phases) else DONE
@@ -265,22 +239,19 @@ def _goals(
 ) -> PhaseReferences:
     """The references of a phase.
 
-    With a goal for the force of a face, its moments without goals go to zero; with one for the
-    first of its distances, the others go to the same. So it is for a latch in phases that open or
-    close it.
+    With a goal for the force of several points, their differences of forces without goals go to
+    zero; with one for the first of their distances, the others go to the same.
     """
     phase = task.plan.phases[index]
     names = [signal.name for signal in law.system.output_signals]
     assignments, degrees = [], law.degrees
-    goals = phase.goals_of_latch if contact.is_latch else phase.goals
-    for name, reference in goals(names[contact.main]).items():
+    for name, reference in phase.goals(names[contact.main]).items():
         try:
             assignments.append(assigned(name, reference, names, degrees))
         except ReferenceSignalError as error:
             raise ModelError(f"{task.plan.where(index)}: reference '{name}': {error}") from error
     named = tuple(i for assignment in assignments for i in assignment.places)
-    leads_all = not contact.is_latch or phase.ends_in_contact is not None
-    for assignment in [a for a in assignments if leads_all and list(a.places) == [contact.main]]:
+    for assignment in [a for a in assignments if list(a.places) == [contact.main]]:
         for place in contact.others:
             if place not in named:
                 reference = ConstantReference(0.0) if closed else assignment.reference
@@ -290,8 +261,7 @@ def _goals(
     assignments += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
     try:
         references = tuple(in_order(assignments, names))
-        here = () if phase.is_relative else named
-        return PhaseReferences(stack_references(references, degrees), here, references)
+        return PhaseReferences(stack_references(references, degrees), named, references)
     except ReferenceSignalError as error:
         raise ModelError(f"{task.plan.where(index)}: {error}") from error
 
@@ -300,37 +270,14 @@ def _rates(
     task: Task, index: int, law: TrackingLaw, contact: OpeningContact, closed: bool
 ) -> FloatArray:
     """The final rates of the outputs of a phase, shape (p,); those of all distances are equal."""
-    signals, rates = law.system.output_signals, np.zeros(len(law.degrees))
-    names = [signal.name for signal in signals]
+    names, rates = [s.name for s in law.system.output_signals], np.zeros(len(law.degrees))
     for name, rate in task.plan.phases[index].rates(names[contact.main]).items():
         if name not in names:
-            text = unknown_name("output", name, names)
-            raise ModelError(f"{task.plan.where(index)}: direction: {text}")
-        if signals[names.index(name)].unit != "m":
-            unit = signals[names.index(name)].unit or "1"
-            raise ModelError(
-                f"{task.plan.where(index)}: direction: '{name}' is in {unit}, and a move goes "
-                "along outputs in m"
-            )
+            raise ModelError(f"{task.plan.where(index)}: {unknown_name('output', name, names)}")
         rates[names.index(name)] = rate
-    if task.plan.phases[index].speed_of_approach and not rates[contact.main] < 0.0:
-        raise ModelError(
-            f"{task.plan.where(index)}: direction: it does not lead to the surface; give it a "
-            f"negative component of '{names[contact.main]}'"
-        )
     if not closed:
         rates[contact.others] = rates[contact.main]
     return rates
-
-
-def _measured_control(task: Task, index: int, law: TrackingLaw) -> int | None:
-    """The index of the control that a phase measures; None for none."""
-    name = task.plan.phases[index].measured_control
-    names = [signal.name for signal in law.system.control_signals]
-    if name and name not in names:
-        text = unknown_name("control", name, names)
-        raise ModelError(f"{task.plan.where(index)}: {text}")
-    return names.index(name) if name else None
 
 
 def _no_goals(law: TrackingLaw) -> PhaseReferences:

@@ -1,6 +1,5 @@
 """The block that runs the phases of a task: their guards, their order and their references."""
 
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -23,7 +22,7 @@ from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import Block, Guard, Update, zero
 from drake_dae.systems.control.contract import SIGNAL
-from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws, law_name
+from drake_dae.systems.task.contacts.open_contact import FREE, LAWS, ContactLaws
 from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.decision import PhaseDecision, moment_of
 from drake_dae.systems.task.phases import Moment
@@ -40,17 +39,14 @@ class TaskSupervisor(LeafSystem):
 
     Input ports:
         estimated_state, measured_force, hold, signal_<name>: As of `TaskController`.
-        control: u, shape (p,); only if a guard watches it, or a phase measures a control.
+        control: u, shape (p,); only if a phase watches one.
         exogenous: As of the laws; only for exogenous signals that are not an observer's. Without
             a wire these keep the values of the parameters.
 
     Output ports:
         phase, desired_output, tared_force: As of `TaskController`.
-        contact_reference, free_reference, contact_reference_2, ...: R of the active law; zero for
-            the others.
-        law: The number of the active law, shape (1,): 0 without contact, 1 in contact; 2 and 3 for
-            the next contact, and so on.
-        latch: As of `TaskController`.
+        contact_reference, free_reference: R of the active law; zero for the other one.
+        law: The number of the active law, shape (1,): 0 without contact, 1 in contact.
         ending: 0 while the task goes on; then 1 if it is done, 2 if it has stopped, 3 if the robot
             rests by "hold", shape (1,). In exports, which have no errors, 4 after "fail".
         contact_hold, free_hold: While it is 1, the law's integrals are not updated, shape (1,):
@@ -59,7 +55,7 @@ class TaskSupervisor(LeafSystem):
 
     Args:
         task: The phases.
-        pairs: The laws of each contact with other closed ones; see `PhasePlan.pairs`.
+        pair: The laws of the robot with and without its contact.
         columns: The places of their outputs in a record.
         num_forces: The number of all measured forces.
         sample_period: The period at which guards are evaluated, in s; 0 for continuously.
@@ -73,7 +69,7 @@ class TaskSupervisor(LeafSystem):
     def __init__(
         self,
         task: Task,
-        pairs: Sequence[ContactLaws],
+        pair: ContactLaws,
         columns: TaskOutputs,
         num_forces: int,
         sample_period: float,
@@ -81,17 +77,17 @@ class TaskSupervisor(LeafSystem):
         super().__init__()
         self.set_name("task")
         self._sample_period = sample_period
-        self.task, self._pairs, self._columns = task, pairs, columns
-        self._laws = laws = [law for pair in pairs for law in pair.laws]
-        self._contact = pairs[0].contact
-        self._phases, self._plan = task.plan.phases, TaskPlanner(task, pairs)
-        self._traced = SampledTask(task, pairs, columns, self._plan, num_forces, sample_period)
+        self.task, self._columns = task, columns
+        self._laws, self._contact = pair.laws, pair.contact
+        laws = self._laws
+        self._phases, self._plan = task.plan.phases, TaskPlanner(task, pair)
+        self._traced = SampledTask(task, pair, columns, self._plan, num_forces, sample_period)
         system = laws[FREE].system
         self._state_port = self.DeclareVectorInputPort("estimated_state", system.num_states)
         self._force_port = self.DeclareVectorInputPort("measured_force", num_forces)
         self._hold_port = self.DeclareVectorInputPort("hold", 1)
         declared, self._control_port = self.DeclareVectorInputPort, None
-        if task.watches("control"):
+        if task.controls:
             self._control_port = declared("control", system.num_controls)
         self._moving: list[int] = []
         moving = [parameter.name for parameter in system.exogenous.moving]
@@ -133,15 +129,13 @@ class TaskSupervisor(LeafSystem):
             self.discrete_state_ticket(self._held),
         }
         for which, law in enumerate(self._laws):
-            size, name = law.layout.reference_size, law_name(which, "reference")
+            size, name = law.layout.reference_size, f"{LAWS[which]}_reference"
             self.DeclareVectorOutputPort(name, size, weakly(self._calc_reference, which), by_time)
         size = self._columns.size
         self.DeclareVectorOutputPort("desired_output", size, weakly(self._calc_desired), by_time)
         progress = {self.abstract_state_ticket(self._index), self.discrete_state_ticket(self._held)}
         for name, number in (("phase", "place"), ("law", "law"), ("ending", "ending")):
             self.DeclareVectorOutputPort(name, 1, weakly(self._calc_number, number), progress)
-        if count := len(self.task.plan.latches):
-            self.DeclareVectorOutputPort("latch", count, weakly(self._calc_latch), progress)
         hold = self.input_port_ticket(self._hold_port.get_index())
         for name, calc, tickets in (
             ("free_hold", weakly(self._calc_free_hold), by_state),
@@ -174,18 +168,18 @@ class TaskSupervisor(LeafSystem):
     # The end of a phase.
 
     def _moment(self, context: Context, segment: ReferenceSegment) -> Moment:
-        port, signal, place = self._control_port, 0.0, segment.change.place
-        controls = np.zeros(1) if port is None else np.abs(port.Eval(context))
-        if not self._is_over(segment):
-            name = self._phases[place].signal
-            if name and self.signal_ports[name].HasValue(context):
-                signal = float(self.signal_ports[name].Eval(context)[0])
-        work = self._traced.work_of(context.get_discrete_state(self._held).value())
-        forces = self._traced.filter.forces(self._filtered(context), segment.law)
-        contact, least = self._pairs[segment.law // 2].contact, self.task.contact_force
-        motion, time = self._plan.motion(self._now(context), segment.law), context.get_time()
-        watched = controls, self._plan.controls[place]
-        return moment_of(segment, contact, time, motion, forces, least, work, signal, *watched)
+        controls = dict[str, float]()
+        if self._control_port is not None:
+            sizes = np.abs(self._control_port.Eval(context))
+            controls = {name: float(sizes[i]) for name, i in self._plan.control_places.items()}
+            controls[""] = float(sizes.max())
+        signals = {
+            name: float(port.Eval(context)[0]) if port.HasValue(context) else 0.0
+            for name, port in self.signal_ports.items()
+        }
+        forces, time = self._traced.filter.forces(self._filtered(context)), context.get_time()
+        motion = self._plan.motion(self._now(context))
+        return moment_of(segment, self._contact, time, motion, forces, signals, controls)
 
     def _filtered(self, context: Context) -> FloatArray:
         """The state of the force filter after the present sample; see `TracedTask`."""
@@ -224,8 +218,7 @@ class TaskSupervisor(LeafSystem):
                 self._state_port.Eval(context).copy(),
             )
         progress = TaskProgress((self._segment(context),), time - self._sample_period, time)
-        zeros = np.zeros(self._traced.filter.size), np.zeros(self._traced.tally.size)
-        self._put(state, progress, *zeros)
+        self._put(state, progress, np.zeros(self._traced.filter.size))
         return EventStatus.Succeeded()
 
     def _at_guard(
@@ -239,34 +232,26 @@ class TaskSupervisor(LeafSystem):
             return EventStatus.DidNothing()  # A continued run begins with the last sample.
         force, decision = self._filtered(context), self._decision(context, progress)
         status, segments = EventStatus.Succeeded(), progress.segments
-        tally, place = np.zeros(self._traced.tally.size), segments[-1].change.place
         if decision.ends:
             following, status = self._changed(context, progress, decision)
             segments = (*segments, following)
-        elif tally.size and place < len(self._phases):
-            before = self._traced.tally_of(context.get_discrete_state(self._held).value())
-            after = self._traced.tally.after(self._phases[place], before, decision.moment)
-            tally = np.array([float(number) for number in after])
         felt = time if progress.is_felt else progress.felt
         now = TaskProgress(segments, time, felt, progress.is_felt != decision.turns)
-        self._put(state, now, force, tally)
+        self._put(state, now, force)
         return status
 
-    def _put(
-        self, state: State, progress: TaskProgress, force: FloatArray, tally: FloatArray
-    ) -> None:
+    def _put(self, state: State, progress: TaskProgress, force: FloatArray) -> None:
         state.get_mutable_abstract_state().get_mutable_value(int(self._index)).set_value(progress)
-        state.get_mutable_discrete_state().set_value(self._traced.numbers(progress, force, tally))
+        state.get_mutable_discrete_state().set_value(self._traced.numbers(progress, force))
 
     def _changed(
         self, context: Context, progress: TaskProgress, decision: PhaseDecision
     ) -> tuple[ReferenceSegment, EventStatus]:
         """The references after a phase, and the status of the event."""
         segment, now, moment = progress.segments[-1], self._now(context), decision.moment
-        forces = partial(self._traced.filter.forces, self._filtered(context))
         if self._is_over(segment):
             cause = PhaseCause("the contact is lost at rest", segment.change.chosen, True)
-            following = self._plan.following(now, segment, moment, None, cause, forces)
+            following = self._plan.following(now, segment, moment, None, cause)
             return following, EventStatus.Succeeded()
         place = segment.change.place
         outcome, reason = decision.outcome(self._phases[place], self.task.contact_force)
@@ -283,7 +268,7 @@ class TaskSupervisor(LeafSystem):
         has_failed = outcome != "success" or (leaves and segment.change.failed)
         ends = self.task.plan.ends_in_contact(place) if outcome == "success" else None
         cause = PhaseCause(reason, after.chosen, has_failed, ends)
-        return self._plan.following(now, segment, moment, after.place, cause, forces), status
+        return self._plan.following(now, segment, moment, after.place, cause), status
 
     # The output ports.
 
@@ -301,12 +286,8 @@ class TaskSupervisor(LeafSystem):
     def _calc_number(self, name: str, context: Context, output: BasicVector) -> None:
         value = context.get_discrete_state(self._held).value()[NAMES.index(name)]
         if not self.progress(context).segments:
-            value = float(self.task.plan.law_of(0)) if name == "law" else 0.0
+            value = float(self.task.plan.contacts[0]) if name == "law" else 0.0
         output.SetFromVector([value])
-
-    def _calc_latch(self, context: Context, output: BasicVector) -> None:
-        closed = self.task.plan.closed_by(self._segment(context).law)
-        output.SetFromVector([float(name in closed) for name in self.task.plan.latches])
 
     def _calc_tared(self, context: Context, output: BasicVector) -> None:
         force = self._force_port.Eval(context).copy()
@@ -325,9 +306,7 @@ class TaskSupervisor(LeafSystem):
     def _calc_contact_hold(self, context: Context, output: BasicVector) -> None:
         segments = self.progress(context).segments or (self._segment(context),)
         begin = segments[-1].change
-        least = self._contact.size * min(
-            self._traced.filter.forces(self._filtered(context), CONTACT)
-        )
+        least = self._contact.size * min(self._traced.filter.forces(self._filtered(context)))
         is_open = not begin.in_contact or least < self.task.contact_force
         # The force of an impact is no error to be integrated.
         end = begin.time + segments[-1].over

@@ -8,8 +8,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases import Phase
-from drake_dae.systems.task.phases.guards import Watched
-from drake_dae.systems.task.phases.plan import PhasePlan, check_guards, named
+from drake_dae.systems.task.phases.condition import Watched
+from drake_dae.systems.task.phases.plan import PhasePlan, check_forces, named
 
 _STEADY = 6.0
 """The least `contact_force` in standard deviations of the filtered noise: one sample in 1e9 exceeds
@@ -45,7 +45,7 @@ class Task:
     Raises:
         ModelError: There are no phases; one begins in contact although the one before does not end
             in contact, or the other way round; a successor is not a phase, or the task may not end;
-            a guard trips before its phase can succeed; or a number is not valid.
+            or a number is not valid.
     """
 
     phases: Sequence[Phase]
@@ -76,9 +76,7 @@ class Task:
         if self.tare_time and self.phases[0].begins_in_contact:
             raise ModelError("tare_time: a task that begins in contact finds no bias; leave it out")
         phases = named(self.phases)
-        if self.tare_time and any(phase.contact for phase in phases):
-            raise ModelError("tare_time: a task with latches finds no bias; leave it out")
-        check_guards(phases, self.contact_force)
+        check_forces(phases, self.contact_force)
         plan = PhasePlan(phases, self.retries)
         object.__setattr__(self, "phases", phases)
         object.__setattr__(self, "plan", plan)
@@ -121,14 +119,17 @@ class Task:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The names of the signals that its phases wait for."""
-        return tuple(dict.fromkeys(phase.signal for phase in self.phases if phase.signal))
+        """The names of the signals that its phases watch."""
+        return self._watched("signal")
 
-    def watches(self, of: Watched) -> bool:
-        """Whether a guard of a phase watches this quantity, or a phase itself a control."""
-        if of == "control" and any(phase.measured_control for phase in self.phases):
-            return True
-        return any(guard.of == of for phase in self.phases for guard in phase.guards)
+    @property
+    def controls(self) -> tuple[str, ...]:
+        """The names of the controls that its phases watch; "" for the largest."""
+        return self._watched("control")
+
+    def _watched(self, of: Watched) -> tuple[str, ...]:
+        conditions = [each for phase in self.phases for each in phase.conditions]
+        return tuple(dict.fromkeys(each.name for each in conditions if each.of == of))
 
     def __repr__(self) -> str:
         return f"Task({', '.join(phase.name for phase in self.phases)})"
@@ -136,7 +137,7 @@ class Task:
     def __str__(self) -> str:
         """One line for each phase, with the condition that ends it."""
         return "\n".join(
-            f"{index + 1}. {phase.name}, until {phase.awaited(self.contact_force)}"
+            f"{index + 1}. {phase.name}, until {phase.awaits(self.contact_force)}"
             for index, phase in enumerate(self.phases)
         )
 
@@ -159,10 +160,6 @@ def check_sampled(task: Task, sample_period: float) -> None:
         "force_noise": (task.force_noise, "noise and bias of a force are found in samples"),
         "tare_time": (task.tare_time, "noise and bias of a force are found in samples"),
     }
-    for index, phase in enumerate(task.phases):
-        for guard in phase.guards:
-            where = f"phase {index + 1} of the task, {phase.name}: guard of the {guard.of}"
-            needs[where] = (guard.of == "work" or guard.samples > 1, "it counts in samples")
     for name, (is_needed, why) in needs.items():
         if is_needed:
             raise ModelError(

@@ -1,7 +1,6 @@
 """The outputs and guards of a task as traced functions of the numbers of its current segment."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import casadi as ca
@@ -21,12 +20,10 @@ from drake_dae.systems.blocks.traced import (
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.control.references import traced_references
 from drake_dae.systems.task.contacts.force_filter import ForceFilter
-from drake_dae.systems.task.contacts.laws import CONTACT, FREE, ContactLaws, law_name
+from drake_dae.systems.task.contacts.open_contact import CONTACT, FREE, LAWS, ContactLaws
 from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.phases import Moment, Phase
-from drake_dae.systems.task.phases.guards import eccentricity
 from drake_dae.systems.task.phases.phase import APPROACH, DONE, FAIL, HOLD, LEAVE, NEXT, STOP
-from drake_dae.systems.task.phases.tally import GuardMemory
 from drake_dae.systems.task.planner import TaskPlanner
 from drake_dae.systems.task.progress import LET_GO, ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
@@ -58,7 +55,7 @@ class TracedTask:
     """The functions of a `TaskSupervisor` of the numbers of its current segment.
 
     Args:
-        task, pairs, columns: Those of the supervisor.
+        task, pair, columns: Those of the supervisor.
         plan: The planner of its references.
         num_forces: The number of measured constraint forces.
         sample_period: The period at which guards are evaluated, in s; 0 for continuously.
@@ -67,35 +64,33 @@ class TracedTask:
         task: The argument.
         size: The number of these numbers.
         filter: The filter of the measured forces.
-        tally: The counts for the guards.
     """
 
     def __init__(
         self,
         task: Task,
-        pairs: Sequence[ContactLaws],
+        pair: ContactLaws,
         columns: TaskOutputs,
         plan: TaskPlanner,
         num_forces: int,
         sample_period: float,
     ) -> None:
-        self.task, self._pairs, self._columns, self._plan = task, pairs, columns, plan
-        self._laws = laws = [law for pair in pairs for law in pair.laws]
+        self.task, self._contact, self._columns, self._plan = task, pair.contact, columns, plan
+        self._laws = laws = pair.laws
         tares = task.tare_samples(sample_period)
-        self.filter = ForceFilter([pair.contact for pair in pairs], task.force_gain, tares)
+        self.filter = ForceFilter(pair.contact, task.force_gain, tares)
         self._phases = task.plan.phases
-        self.tally = GuardMemory(self._phases, sample_period)
         count = len(laws[FREE].degrees)
         rows = max(law.layout.reference_size for law in laws)
         self._shape = (rows, 2 * max(2, *(max(law.degrees) for law in laws)) + 2)
         sizes = [len(NAMES), self.filter.size, count, count, rows * self._shape[1], plan.moved]
-        sizes += [len(self._phases), self.tally.size]
+        sizes += [len(self._phases)]
         ends = np.cumsum(sizes).tolist()
         self.size = ends[-1]
         self._time, self._held = ca.SX.sym("time"), ca.SX.sym("held", self.size)
         self._segment, self._entered_places = slice(ends[1], ends[5]), slice(ends[5], ends[6])
-        self._filter_places, self._tallied = slice(ends[0], ends[1]), slice(ends[6], ends[7])
-        before, self._base, self._rate, fade, self._origin, self._entered, self._counts = (
+        self._filter_places = slice(ends[0], ends[1])
+        before, self._base, self._rate, fade, self._origin, self._entered = (
             self._held[a:b] for a, b in pairwise(ends)
         )
         self._faded = ca.reshape(fade, *self._shape)
@@ -105,15 +100,8 @@ class TracedTask:
         self._filtered = self.filter.after(before, self._forces)
         given = {"before": before, "forces": self._forces}
         self._filter_function = TracedFunction("filter", given, {"after": self._filtered})
-        self._is_latched = bool(task.plan.latches)
-        each = [self._filtered[self.filter.of_law(law)] for law in range(len(laws))]
-        total = ca.norm_inf if self._is_latched else ca.sum1
-        self._each, self._force = each[CONTACT], self._by_law([total(part) for part in each])
-
-    def _by_law(self, values: Sequence[ca.SX]) -> ca.SX:
-        """The value for the active law, one for each law."""
-        each = [ca.if_else(self._acts(law), value, 0) for law, value in enumerate(values)]
-        return sum(each[1:], each[0])
+        self._each = self._filtered[: pair.contact.size]
+        self._force = ca.sum1(self._each)
 
     def _acts(self, law: int) -> ca.SX:
         """Whether a law is active."""
@@ -132,16 +120,8 @@ class TracedTask:
         """Whether the bias of the force is still being estimated."""
         return bool(held[self._filter_places][-1] < self.filter.tares - 0.5)
 
-    def tally_of(self, held: FloatArray) -> FloatArray:
-        """The counts for the guards; see `GuardMemory`."""
-        return held[self._tallied]
-
-    def work_of(self, held: FloatArray) -> float:
-        """The work of the contact force since the phase began, in J; 0 if no guard needs it."""
-        return float(self.tally.work(self.tally_of(held)))
-
-    def numbers(self, progress: TaskProgress, force: FloatArray, tally: FloatArray) -> FloatArray:
-        """The numbers of a task from its progress, the force filter and the counts of its guards.
+    def numbers(self, progress: TaskProgress, force: FloatArray) -> FloatArray:
+        """The numbers of a task from its progress and the force filter.
 
         Shape (size,); zero before a run.
         """
@@ -158,7 +138,7 @@ class TracedTask:
         faded = np.zeros(self._shape)
         faded[: segment.faded.shape[0], : segment.faded.shape[1]] = segment.faded
         sums = segment.base, segment.rate, faded.ravel(order="F"), segment.origin
-        return np.hstack([flags, force, *sums, entered, tally])
+        return np.hstack([flags, force, *sums, entered])
 
     @staticmethod
     def touched(segments: Sequence[ReferenceSegment]) -> bool:
@@ -180,7 +160,7 @@ class TracedTask:
 
         def goals(index: int) -> ca.SX:
             references = self._plan.goals[index].references
-            if self.task.plan.law_of(index) != which:
+            if self.task.plan.contacts[index] != (which == CONTACT):
                 return ca.SX.zeros(size)
             time = ca.SX.sym("time")
             rows = traced_references(references, law.degrees, time)
@@ -201,11 +181,10 @@ class TracedTask:
     def computations(self) -> tuple[Computation, ...]:
         """The computations of all vector output ports."""
         computations = []
-        contact = self._pairs[0].contact
-        size = contact.size
+        contact, size = self._contact, self._contact.size
         desired = ca.SX.zeros(self._columns.size)
         for which, law in enumerate(self._laws):
-            row, name = self._reference(which), law_name(which, "reference")
+            row, name = self._reference(which), f"{LAWS[which]}_reference"
             function = TracedFunction(name, {"time": self._time, "held": self._held}, {"R": row})
             computations.append(Computation.of(function, (TIME, HELD), (name,)))
             desired[self._columns.of_law(which)] += row[law.layout.lowest.tolist()]
@@ -216,10 +195,6 @@ class TracedTask:
         inputs, hold = [self._time, self._held], ca.SX.sym("hold")
         outputs = ["desired_output", "phase", "law", "ending"]
         values = [desired, *(self._named[name] for name in ("place", "law", "ending"))]
-        if latches := self.task.plan.latches:
-            closed = [self.task.plan.closed_by(law) for law in range(len(self._laws))]
-            shut = [ca.DM([float(name in names) for name in latches]) for names in closed]
-            values, outputs = [*values, self._by_law(shut)], [*outputs, "latch"]
         shown = ca.Function("shown", inputs, values)
         computations.append(Computation(shown, (TIME, HELD), tuple(outputs)))
         waits = ca.Function("free_hold", [self._held, hold], [ca.logic_or(is_closed, hold)])
@@ -239,38 +214,29 @@ class TracedTask:
         """The numbers after a sample at which the phase goes on."""
         held = ca.SX(self._held)
         held[self._filter_places] = self._filtered
-        if not self.tally.size:
-            function = ca.Function("held", [self._held, self._forces], [held])
-            return Computation(function, (HELD, "measured_force"), (HELD,))
-        moment, inputs, sources = self._moment()
-        counts = self._counted()
-
-        def after(index: int) -> ca.SX:
-            return ca.vertcat(*self.tally.after(self._phases[index], counts, moment))
-
-        held[self._tallied] = self._in_phase(after, ca.SX.zeros(self.tally.size))
-        return Computation(ca.Function("held", inputs, [held]), sources, (HELD,))
-
-    def _counted(self) -> list[ca.SX]:
-        return [self._counts[i] for i in range(self.tally.size)]
+        function = ca.Function("held", [self._held, self._forces], [held])
+        return Computation(function, (HELD, "measured_force"), (HELD,))
 
     def _moment(self) -> tuple[Moment, list[ca.SX], tuple[str, ...]]:
-        """The measurements without a signal, and the symbols and sources of their inputs."""
-        named, law, moved = self._named, self._laws[FREE], self._plan.moved
-        x, parameters = law.system.state, law.system.parameter_symbol
-        motion = self._motion_of(named["law"], x, parameters)
-        first, rates = motion[2 : 2 + moved], motion[2 + moved :]
+        """The measurements, and the symbols and sources of their inputs."""
+        named, system = self._named, self._laws[FREE].system
+        x, parameters = system.state, system.parameter_symbol
+        motion = self._motion(x, parameters)
         wanted = ca.SX(0)
         for which, each in enumerate(self._laws):
-            contact = self._pairs[which // 2].contact
-            places = [contact.main] if which % 2 else list(contact.places)
+            places = [self._contact.main] if which == CONTACT else list(self._contact.places)
             rows = each.layout.lowest[places].tolist()
             wanted += ca.sum1(self._reference(which)[rows]) / len(places)
-        inputs = [self._time, self._held, x, self._forces, parameters]
-        sources, control = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS], 0.0
-        if self.task.watches("control"):
+        signals = {name: ca.SX.sym(name) for name in self.task.signals}
+        inputs = [self._time, self._held, x, self._forces, parameters, *signals.values()]
+        sources = [TIME, HELD, "estimated_state", "measured_force", PARAMETERS]
+        sources += [SIGNAL + name for name in signals]
+        controls = dict[str, ca.SX]()
+        if self.task.controls:
             inputs, sources = [*inputs, self._control], [*sources, "control"]
-            control = ca.norm_inf(self._control)
+            sizes = ca.fabs(self._control)
+            controls = {name: sizes[i] for name, i in self._plan.control_places.items()}
+            controls[""] = ca.mmax(sizes)
         moment = Moment(
             self._time - named["start"],
             self._force,
@@ -278,21 +244,15 @@ class TracedTask:
             motion[1],
             wanted,
             motion[0] - named["distance"],
-            speed=ca.norm_2(rates),
-            travel=ca.norm_2(first - self._origin),
-            work=self.tally.work(self._counted()),
-            control=control,
-            eccentricity=eccentricity(ca.vertsplit(self._each), self.task.contact_force),
+            ca.norm_2(motion[2:] - self._origin),
+            signals,
+            controls,
         )
         return moment, inputs, tuple(sources)
 
-    def _motion_of(self, law: ca.SX, state: ca.SX, parameters: ca.SX) -> ca.SX:
-        """The values of `TaskPlanner.motion_functions` for a law by its number."""
-        each = [f.function.call([state, parameters])[0] for f in self._plan.motion_functions]
-        value = each[0]
-        for pair, other in enumerate(each[1:], 1):
-            value = ca.if_else(law > 2 * pair - 0.5, other, value)
-        return value
+    def _motion(self, state: ca.SX, parameters: ca.SX) -> ca.SX:
+        """The values of `TaskPlanner.motion_function`."""
+        return self._plan.motion_function.function.call([state, parameters])[0]
 
     def guard(self) -> Computation:
         """The margins of a phase, the same as those of the supervisor.
@@ -309,39 +269,28 @@ class TracedTask:
         """The margins of `PhaseDecision`, and the symbols and sources of their inputs."""
         named, task = self._named, self.task
         moment, inputs, sources = self._moment()
-        signals = {name: ca.SX.sym(name) for name in task.signals}
-        counts, tares = (
-            self._counted(),
-            self._held[self._filter_places][-1] < self.filter.tares - 0.5,
-        )
+        tares = self._held[self._filter_places][-1] < self.filter.tares - 0.5
         excess = self._force - task.contact_force
 
-        waits = ca.logic_and(ca.fmod(named["law"], 2), named["is_felt"] < 0.5)
+        waits = ca.logic_and(named["law"], named["is_felt"] < 0.5)
         lost = ca.if_else(waits, task.patience - (self._time - named["felt"]), 1)
         felt = ca.if_else(named["is_felt"] > 0.5, excess + LET_GO * task.contact_force, -excess)
-        if self._is_latched:  # A latch without force is not lost.
-            lost = felt = ca.SX(1)
 
         def margins(index: int) -> ca.SX:
             phase = self._phases[index]
-            now = replace(moment, signal=signals[phase.signal]) if phase.signal else moment
-            if (measured := self._plan.controls[index]) is not None:
-                now = replace(now, torque=ca.fabs(self._control[measured]))
-            end, late = self._ends(phase, now)
-            guards = [ca.fmin(margin, 1e9) for margin in self.tally.margins(phase, counts, now)]
+            end, late = self._ends(phase, moment)
+            guards = [ca.fmin(moment.margin(guard), 1e9) for guard in phase.guards]
             if self.filter.tares:
                 end = ca.if_else(tares, 1, end)
             trips = ca.mmin(ca.vertcat(1e9, *guards))
             return ca.vertcat(trips, end, lost if phase.holds_contact else 1, late, felt)
 
-        values = self._in_phase(margins, ca.vertcat(1, 1, lost, 1, felt))
-        sources = (*sources, *(SIGNAL + name for name in signals))
-        return values, [*inputs, *signals.values()], sources
+        return self._in_phase(margins, ca.vertcat(1, 1, lost, 1, felt)), inputs, sources
 
     def _ends(self, phase: Phase, now: Moment) -> tuple[ca.SX, ca.SX]:
         """The margins of a phase until it succeeds and until it is late."""
         try:
-            end = ca.SX(phase.margin(now, self.task.contact_force))
+            end = ca.SX(phase.success(now, self.task.contact_force))
             return end, ca.fmin(ca.SX(phase.remaining(now)), 1e9)
         except (TypeError, ValueError, RuntimeError, NotImplementedError) as error:
             raise ModelError(

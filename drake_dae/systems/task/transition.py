@@ -11,7 +11,7 @@ from drake_dae.systems.blocks.traced import (
     TracedChanges,
     Update,
 )
-from drake_dae.systems.task.contacts.laws import CONTACT, FREE
+from drake_dae.systems.task.contacts.open_contact import CONTACT, FREE
 from drake_dae.systems.task.fade import fade
 from drake_dae.systems.task.phases import Outcome
 from drake_dae.systems.task.phases.phase import APPROACH, FAIL, LEAVE
@@ -40,14 +40,11 @@ class SampledTask(TracedTask):
 
     def _begun(self) -> Computation:
         """The numbers at the start of a run, as `TaskPlanner.first`."""
-        law, first = self._laws[FREE], self.task.plan.law_of(0)
+        law, first = self._laws[FREE], int(self.task.plan.contacts[0])
         x, parameters = law.system.state, law.system.parameter_symbol
-        force = self.task.contact_force if first % 2 and not self._is_latched else 0.0
-        motion = self._plan.motion_functions[first // 2].function.call([x, parameters])[0]
-        present = [
-            self._met(which, ca.SX(force), ca.SX.zeros(self._pairs[which // 2].contact.size))
-            for which in range(len(self._laws))
-        ]
+        force = ca.SX(self.task.contact_force if first else 0.0)
+        motion = self._motion(x, parameters)
+        present = [self._met(which, force) for which in range(len(self._laws))]
         held = ca.SX.zeros(self.size)
         self._begin_phase(held, ca.SX(0), ca.SX(first), present, motion)
         held[NAMES.index("felt")] = self._time
@@ -73,11 +70,11 @@ class SampledTask(TracedTask):
             ends = ca.logic_or(ends, each)
         to, approaches, ending = self._successors(ended)
 
-        was = ca.fmod(self._named["law"], 2)
+        was = named["law"]
         before, present = [self._reference(which) for which in range(len(self._laws))], []
         for which, law_after in enumerate(self._laws):
-            met = self._met(which, self._force, self._filtered[self.filter.of_law(which)])
-            places = self._pairs[which // 2].contact.places
+            met = self._met(which, self._force)
+            places = self._contact.places
             for i, first in enumerate(law_after.layout.lowest.tolist()):
                 if i not in places:
                     size = law_after.degrees[i] + 1
@@ -88,7 +85,7 @@ class SampledTask(TracedTask):
             present.append(ca.if_else(self._acts(which), before[which], met))
         changed = ca.SX(same)
         after_law = self._law_after(to, ended)
-        motion = self._motion_of(after_law, x, parameters)
+        motion = self._motion(x, parameters)
         self._begin_phase(changed, to, after_law, present, motion)
         values = {
             "touched": ca.logic_not(was),
@@ -98,7 +95,6 @@ class SampledTask(TracedTask):
         for name, value in values.items():
             changed[NAMES.index(name)] = value
         changed[self._entered_places] = self._entered + _at(to, end + 1)[:end]
-        changed[self._tallied] = 0
 
         after = ca.if_else(ends, changed, same)
         is_felt = named["is_felt"] > 0.5
@@ -117,9 +113,9 @@ class SampledTask(TracedTask):
             place: The index of the phase.
             number: The number of the law that becomes active.
             present: R of all laws at the end of the phase before.
-            motion: The values of its function of `TaskPlanner.motion_functions`.
+            motion: The values of `TaskPlanner.motion_function`.
         """
-        phases, plan, moved = self._phases, self._plan, self._plan.moved
+        phases, plan = self._phases, self._plan
         chosen, count = _at(place, len(phases) + 1), len(self._laws[FREE].degrees)
         overs = [phase.over for phase in phases]
         over = ca.mtimes(ca.DM([[*overs, overs[-1]]]), chosen)
@@ -133,7 +129,7 @@ class SampledTask(TracedTask):
             size, lowest = law.layout.reference_size, law.layout.lowest.tolist()
             first_goals = np.zeros((size, len(phases) + 1))
             for index, each in enumerate(plan.goals):
-                if self.task.plan.law_of(index) == which:
+                if self.task.plan.contacts[index] == (which == CONTACT):
                     first_goals[:, index] = each.function(0.0)
             goal = ca.mtimes(ca.DM(first_goals), chosen)
             base, rate = ca.SX.zeros(count), ca.SX(goes * free)
@@ -151,13 +147,13 @@ class SampledTask(TracedTask):
         chosen_sums = ca.SX.zeros(sums[0].numel())
         for which, values_of in enumerate(sums):
             chosen_sums += ca.if_else(ca.fabs(number - which) < 0.5, values_of, 0)
-        held[self._segment] = ca.vertcat(chosen_sums, motion[2 : 2 + moved])
+        held[self._segment] = ca.vertcat(chosen_sums, motion[2:])
         values = [place, number, self._time, over, motion[0]]
         for name, value in zip(("place", "law", "start", "over", "distance"), values, strict=True):
             held[NAMES.index(name)] = value
 
-    def _met(self, which: int, force: ca.SX, forces: ca.SX) -> ca.SX:
-        """R of a law from the current outputs and the measured forces, as `TaskPlanner`."""
+    def _met(self, which: int, force: ca.SX) -> ca.SX:
+        """R of a law from the current outputs and the measured force, as `TaskPlanner`."""
         law, free = self._laws[which], self._laws[FREE].system
         chains = [
             chain[:degree]
@@ -168,40 +164,32 @@ class SampledTask(TracedTask):
         function = ca.Function("outputs", own, [rows])
         reference = ca.SX.zeros(law.layout.reference_size)
         reference[law.layout.chained.tolist()] = function(free.state, free.parameter_symbol)
-        contact = self._pairs[which // 2].contact
-        if which % 2 == CONTACT and law.degrees[contact.main] == 0:
-            if contact.is_latch:
-                reference[law.layout.lowest[list(contact.places)].tolist()] = forces
-            else:
-                reference[int(law.layout.lowest[contact.main])] = force
+        main = self._contact.main
+        if which == CONTACT and law.degrees[main] == 0:
+            reference[int(law.layout.lowest[main])] = force
         return reference
 
     def _law_after(self, to: ca.SX, ended: list[ca.SX]) -> ca.SX:
         """The number of the law of the next phase, or of the law while the robot rests."""
         end, plan = len(self._phases), self.task.plan
-        numbers = [float(plan.law_of(place)) for place in range(end)]
+        numbers = [float(closed) for closed in plan.contacts[:end]]
         next_law = ca.mtimes(ca.DM([[*numbers, 0.0]]), _at(to, end + 1))
-        was = ca.fmod(self._named["law"], 2)
+        was = self._named["law"]
 
         def after(place: int) -> ca.SX:
-            lost = ended[2] if self._phases[place].ends_by_loss else ca.SX(0)
-            succeeds = ca.logic_and(ca.logic_not(ended[0]), ca.logic_or(ended[1], lost))
+            succeeds = ca.logic_and(ca.logic_not(ended[0]), ended[1])
             return ca.if_else(succeeds, float(plan.ends_in_contact(place)), was)
 
-        rests = self._in_phase(after, was)
-        if not self._is_latched:
-            rests = ca.logic_and(rests, self._force >= self.task.contact_force)
-        return ca.if_else(to > end - 0.5, self._named["law"] - was + rests, next_law)
+        felt = self._force >= self.task.contact_force
+        rests = ca.logic_and(self._in_phase(after, was), felt)
+        return ca.if_else(to > end - 0.5, rests, next_law)
 
     def _successors(self, ended: list[ca.SX]) -> _Change:
         """The change after the current phase, by how it has ended."""
         end = len(self._phases)
 
         def after(place: int, number: int) -> ca.SX:
-            outcome = _OUTCOMES[number]
-            if outcome == "lost" and self._phases[place].ends_by_loss:
-                outcome = "success"
-            change = ca.vertcat(*self._successor(place, outcome))
+            change = ca.vertcat(*self._successor(place, _OUTCOMES[number]))
             if number == len(_OUTCOMES) - 1:
                 return change
             return ca.if_else(ended[number], change, after(place, number + 1))

@@ -199,7 +199,6 @@ def test_pages_share_a_bundle(tmp_path):
     ("name", "reason"),
     [
         ("wall_point_contact", "!CompliantContact"),
-        ("wall_bounce", "wall_bounce"),
         ("wall_polish", "wall_polish"),
     ],
 )

@@ -70,9 +70,8 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
         pytest.param(
             "seven_joint_moving_plate", (SAMPLED,), marks=[pytest.mark.slow, pytest.mark.thorough]
         ),
-        pytest.param("wall_bounce", (SAMPLED,), marks=pytest.mark.slow),
         pytest.param("wall_point_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
-        pytest.param("wall_polish", (SAMPLED,), marks=pytest.mark.slow),
+        pytest.param("wall_polish", (), marks=pytest.mark.slow),
         pytest.param(
             "wall_point_contact", ("sampling=null",), marks=[pytest.mark.slow, pytest.mark.thorough]
         ),
@@ -327,7 +326,6 @@ int main() {
             ("integral=[tool.z]", "sampling=null"),
             "'tracking_controller' has a continuous state, as integrals of a law without samples",
         ),
-        ("wall_polish", (), "'task' ends phases between samples"),
         (
             "two_link_wall",
             ("sampling={period: 0.001, delay: 0.00012345678}",),

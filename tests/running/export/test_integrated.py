@@ -190,7 +190,6 @@ def test_all_files_are_linked_together(tmp_path):
 @pytest.mark.parametrize(
     ("name", "settings", "reason"),
     [
-        ("wall_bounce", (), "changes at moments that a run has to find"),
         ("wall_point_contact", (), "has Drake's own contact ('seven_joint_arm')"),
         (
             "two_link_wall",

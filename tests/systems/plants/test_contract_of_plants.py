@@ -36,7 +36,7 @@ from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Record
-from drake_dae.studies.results import Outcome
+from drake_dae.studies.runs import Outcome
 from drake_dae.systems.plants.contract import Plant
 
 FINE = 1e-10
@@ -57,9 +57,6 @@ def contact():
 MEMBERS = {
     "dae": lambda: DaePlant(arm("two_link").model.dae, structure=arm("two_link").structure),
     "robot": lambda: RobotPlant(arm("two_link").model, structure=arm("two_link").structure),
-    "fed back": lambda: RobotPlant(
-        arm("two_link").model, structure=arm("two_link").structure, feedback=True
-    ),
     "unilateral": lambda: UnilateralRobotPlant(
         arm("two_link").model, {"wall": 0.0}, structure=arm("two_link").structure
     ),
@@ -217,14 +214,6 @@ def test_rules_11_and_13_projection_and_contact(plant):
         assert np.max(np.abs(record["constraint_residual"])) > 1e-6
 
 
-def test_rule_12_feedback(plant):
-    context = plant.CreateDefaultContext()
-    assert plant.laws_along(context, [0.0]) is None
-    function = arm_law().function
-    if plant.HasInputPort("feedback"):
-        assert plant.motion_under(function).input_names[-1] == "plant"
-
-
 @cache
 def arm_law():
     return TrackingLaw(arm("two_link").model.dae, poles(-4.0), structure=arm("two_link").structure)
@@ -295,7 +284,7 @@ def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monk
     found = []
     for kind in ("!OwnPlant {maker: 'members:SpringyPlant'}", "!IdealConstraints {}"):
         scenario = load_scenario(path, [*settings, f"plant={kind}"])
-        study = sweep(scenario, changes, tmp_path / f"{len(found)}.jsonl", workers=1)
+        study = sweep(scenario, changes, tmp_path / f"{len(found)}.db", workers=1)
         assert {run.outcome for run in study.results} == {Outcome.FINISHED}, study.results
         found.append([run.figures["largest error of tool.z [m]"] for run in study.results])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-5)

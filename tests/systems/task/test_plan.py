@@ -5,16 +5,14 @@ from polishing import laws
 
 from drake_dae import (
     Approach,
+    Condition,
     Dwell,
-    GuardedMove,
     Move,
-    PhaseGuard,
     Press,
     Release,
     Retreat,
     Task,
     TaskController,
-    Wait,
 )
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases.plan import Successor
@@ -107,17 +105,7 @@ PRESS = Press(20.0)
             "touch and away lead back to touch",
         ),
         ([Approach(on_success="done"), PRESS], "2 of the task, Press: no phase leads to it"),
-        (
-            [Approach(), Press(20.0, guards=[PhaseGuard("force", 10.0)])],
-            "phase 2 of the task, Press: its guard ends it at a force of 10 N, and it needs 19 N "
-            "to succeed; give more",
-        ),
-        ([Dwell(2.0, guards=[PhaseGuard("time", 1.0)])], "at a time of 1 s, and it needs 2 s to"),
-        (
-            [Approach(guards=[PhaseGuard("speed", 1.0), PhaseGuard("speed", 2.0)])],
-            "two guards watch the speed; leave one out",
-        ),
-        ([GuardedMove(0.1, force=0.2)], "force: 0.2 N counts as no force, since it is less than"),
+        ([Move({}, until=[Condition("force", above=0.2)])], "force: 0.2 N counts as no force"),
         ([Approach(), Press(0.3)], "Press: force: 0.3 N counts as no force, since it is less than"),
     ],
 )
@@ -131,27 +119,17 @@ def test_plans_that_make_no_sense_are_refused(phases, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: PhaseGuard("heat", 1.0), "PhaseGuard: of must be"),
-        (lambda: PhaseGuard("force", 0.0), "most, of the force, must be positive"),
-        (lambda: PhaseGuard("force", 1.0, samples=0), "samples must be 1 or more, got 0"),
         (lambda: Approach(retries=-1), "Approach: retries must be 0 or more, got -1"),
         (lambda: Approach(on_failure="approach"), "on_failure: 'approach' would go on as before"),
-        (lambda: GuardedMove(0.0), "GuardedMove: distance must be positive"),
-        (lambda: GuardedMove(0.1, direction={"a": 0.0}), "all of its components are 0"),
-        (lambda: Wait(), "Wait: give the signal that it waits for"),
-        (
-            lambda: TaskController(Task([GuardedMove(0.1, direction={"wall": 1.0})]), *laws()),
-            "phase 1 of the task, GuardedMove: direction: no output 'wall'",
-        ),
         (
             lambda: TaskController(
-                Task([Approach(guards=[PhaseGuard("speed", 1.0, samples=2)])]), *laws()
+                Task([Approach(guards=[Condition("control", above=1.0, name="elbow")])]), *laws()
             ),
-            "guard of the speed: it counts in samples, and this task acts continuously",
+            "no control 'elbow'",
         ),
     ],
 )
-def test_wrong_guards_and_moves_are_refused(make, message):
+def test_wrong_phases_are_refused(make, message):
     with pytest.raises(ModelError) as caught:
         make()
     assert message in str(caught.value)

@@ -6,12 +6,13 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 import pytest
-from arms import arm, numbers, touching
+from arms import arm, numbers
 from numpy.testing import assert_allclose
 from polishing import (
     CLIMB,
     FAR,
     OVER,
+    PERIOD,
     POLE,
     SPEED,
     WHOLE,
@@ -31,17 +32,16 @@ from drake_dae import (
     ContactMaterial,
     ContactPlant,
     Dwell,
-    FlexibleJoints,
     LoopSettings,
     Move,
     Press,
     Release,
     Retreat,
+    RobotPlant,
     Sampling,
     Task,
     TaskController,
     TrackingLaw,
-    UnilateralRobotPlant,
     open_contact,
     poles,
     simulate,
@@ -57,16 +57,11 @@ TOUCH = FAR / SPEED + OVER / 2.0
 
 @pytest.fixture(scope="module")
 def whole():
-    """The whole task on the ideal plant: loop, context after it, and record."""
+    """The whole task: loop, context after it, and record."""
     loop = task_loop(WHOLE)
     context = started(loop)
-    run_on(loop, context, 2.6, accuracy=1e-8)
+    run_on(loop, context, 2.0)
     return loop, context, loop.record(context)
-
-
-def changes(loop, context):
-    found = loop.changes(context)
-    return {change.phase: change for change in found}
 
 
 @pytest.mark.slow
@@ -78,7 +73,7 @@ def test_phases_follow_each_other_and_say_why(whole):
     assert [change.place for change in found] == list(range(6))
     assert [change.in_contact for change in found] == [False, True, True, True, False, False]
     assert found[1].reason == "after a force of 0.5 N"
-    assert str(found[1]).startswith(f"{TOUCH:.6g} s: Press, after a force of 0.5 N; ")
+    assert str(found[1]).startswith(f"{found[1].time:.6g} s: Press, after a force of 0.5 N; ")
     # A sample at the moment of a change shows what was before.
     places = np.searchsorted([c.time for c in found[1:]], record.time)
     assert_allclose(np.argmax(record["phase"], axis=1), places)
@@ -91,18 +86,14 @@ def test_phases_follow_each_other_and_say_why(whole):
 
 
 def test_it_touches_when_and_as_fast_as_designed(whole):
-    """Reference and motion agree from the start; steps of 1e-8 leave 3e-7 of it."""
+    """A sample of 1 ms later at most, on a wall that takes 0.5 N after 5e-6 m: 0.1 ms."""
     loop, context, record = whole
-    impact = loop.plant.events(loop.plant.GetMyContextFromRoot(context))[0]
-    assert abs(impact.time - TOUCH) < 1e-6
-    before = np.flatnonzero(record.time <= impact.time)[-1]
-    assert_allclose(record["distance"][before], [0.0, -SPEED], atol=1e-6)
-    # The impulse that takes this speed, by MultibodyPlant.
-    found = numbers("two_link", *np.split(record["state"][before], 2))
-    J = found.constraint_jacobian[0]
-    assert_allclose(impact.impulses, SPEED / (J @ np.linalg.solve(found.mass, J)), rtol=1e-5)
-    # The change follows at once, with no step between.
-    assert changes(loop, context)["Press"].time - impact.time < 1e-9
+    press = loop.changes(context)[1]
+    assert TOUCH < press.time < TOUCH + 2.0 * PERIOD
+    before = np.flatnonzero(record["constraint_force"][:, 0] == 0.0)
+    before = before[record.time[before] < press.time][-1]
+    assert_allclose(record["distance"][before], [0.0, -SPEED], atol=SPEED * PERIOD)
+    assert_allclose(record["distance"][before, 1], -SPEED, rtol=1e-3)
 
 
 def test_references_begin_as_those_before_end(whole):
@@ -122,42 +113,33 @@ def test_references_begin_as_those_before_end(whole):
             assert_allclose(new[3:], wanted, atol=1e-12)
 
 
-def test_control_jumps_by_what_the_laws_explain_otherwise_and_no_more(whole):
-    """By M, J and P of MultibodyPlant: at the touch B du = lambda (A M [P; J]^-1 (0, 1) - J')."""
-    loop, context, record = whole
-    law, free = laws()
-    own = loop.controller.GetMyContextFromRoot(context)
-    for before, after in pairwise(loop.controller.segments(own)):
-        time, change = after.change.time, after.change
-        state = record["state"][np.searchsorted(record.time, time)]
-        controls = [
-            (law if one.change.in_contact else free).control(state, one.reference(time))
-            for one in (before, after)
-        ]
-        found = numbers("two_link", *np.split(state, 2))
-        J, P, wanted = found.constraint_jacobian, found.output_jacobian, np.zeros(2)
-        if not before.change.in_contact and change.in_contact:
-            A = (J @ np.linalg.solve(found.mass, J.T)).item()
-            pushed = found.mass @ np.linalg.solve(np.vstack([P, J]), [0.0, 1.0])
-            wanted = change.force * (A * pushed - J[0])
-        elif before.change.in_contact and not change.in_contact:
-            wanted = change.force * J[0]
-            assert change.force <= loop.controller.task.contact_force
-        # The state moves by 1e-9 between the samples and the change.
-        assert_allclose(controls[1] - controls[0], wanted, atol=1e-6)
+def test_control_jumps_by_what_the_laws_explain_otherwise():
+    """By M, J and P of MultibodyPlant, B du = lambda (A M [P; J]^-1 (0, 1) - J') at a touch.
+
+    All outputs are at their references, and the free law presses with lambda.
+    """
+    system, pressed = arm("two_link").model.dae, 7.0
+    law = TrackingLaw(system, poles(POLE))
+    free = TrackingLaw(open_contact(system, "wall.force"), poles(POLE))
+    state = np.array([1.1, -1.5, 0.4, -0.7])
+    found = numbers("two_link", *np.split(state, 2))
+    J, P = found.constraint_jacobian, found.output_jacobian
+    A = (J @ np.linalg.solve(found.mass, J.T)).item()
+    at_rest = free.error_coordinates(state, np.zeros(6), free.system.parameter_values)
+    wanted = np.array([*at_rest[:2], 0.3, *at_rest[2:], -A * pressed])
+    jump = law.control(state, np.array([*at_rest[:2], 0.3, pressed])) - free.control(state, wanted)
+    pushed = found.mass @ np.linalg.solve(np.vstack([P, J]), [0.0, 1.0])
+    assert_allclose(jump, pressed * (A * pushed - J[0]), rtol=1e-9)
 
 
-def test_run_is_as_predicted(whole):
-    """e'' = -K e from each change on, force on its reference; the integrator has 1e-8 a step."""
-    loop, _, record = whole
-    off = record["tracking_error"] - loop.predicted_error(record)
-    assert np.abs(off).max() < 1e-6
-    pressing, places = record["phase"][:, 1] > 0.0, np.argmax(record["phase"], axis=1)
-    assert np.abs(record["tracking_error"][pressing, 1]).max() < 1e-9
-    assert np.abs(record["tracking_error"][:, 0]).max() > 1e-5  # The impact.
-    moved = places >= 3
-    assert_allclose(record["desired_output"][moved, 0], 0.4, atol=1e-12)
-    assert_allclose(record["controlled_output"][-1, 2], 0.03, atol=1e-7)
+def test_outputs_stay_at_their_references(whole):
+    """Measured 0.6 mm at the touch, and 0.03 N once the force has settled."""
+    _, _, record = whole
+    moving = record["phase"][:, 2] > 0.0
+    assert np.abs(record["tracking_error"][:, 0]).max() < 1e-3
+    assert np.abs(record["tracking_error"][moving, 1]).max() < 0.3
+    assert_allclose(record["desired_output"][moving, 1], 20.0, atol=1e-9)
+    assert_allclose(record["controlled_output"][-1, [0, 2]], [0.4, 0.03], atol=1e-4)
 
 
 @pytest.mark.slow
@@ -167,10 +149,10 @@ def test_another_context_is_another_run(whole):
     before = loop.changes(context)
     again = started(loop, distance=0.5 * FAR)
     assert loop.changes(again) == ()
-    run_on(loop, again, 0.4, accuracy=1e-8)
+    run_on(loop, again, 0.4)
     assert loop.changes(context) == before
     times = [change.time for change in loop.changes(again)]
-    assert_allclose(times, [0.0, 0.5 * FAR / SPEED + OVER / 2.0], atol=1e-6)
+    assert_allclose(times, [0.0, 0.5 * FAR / SPEED + OVER / 2.0], atol=2e-3)
     copy = again.Clone()
     run_on(loop, copy, 0.55)
     assert len(loop.changes(copy)) == 3
@@ -191,18 +173,18 @@ def test_lost_contact_leads_to_the_chosen_reaction(reaction):
     assert loop.changes(context)[-1].phase == "Dwell"
     push(loop, context, -40.0)
     if reaction == "fail":
-        with pytest.raises(SimulationError, match=r"the contact of Dwell is lost, at t = 0\.42 s"):
+        with pytest.raises(SimulationError, match=r"the contact of Dwell is lost, at t = 0\.42"):
             run_on(loop, context, 0.5)
         return
     found = run_on(loop, context, 0.5)
     last = loop.changes(context)[-1]
-    assert_allclose(last.time, 0.42, atol=1e-6)
+    assert_allclose(last.time, 0.42, atol=0.01)  # The wall springs back before.
     again = ", retry 1 of 10" if reaction == "approach" else ""
     assert last.reason == f"the contact of Dwell is lost{again}"
     assert last.distance > 0.0
     push(loop, context, 0.0)
     if reaction == "stop":
-        assert_allclose(found.simulated_time, 0.02, atol=1e-6)
+        assert_allclose(found.simulated_time, 0.02, atol=0.01)
         assert last.phase == "held"
         return
     run_on(loop, context, 1.0 if reaction == "approach" else 1.5)
@@ -210,7 +192,7 @@ def test_lost_contact_leads_to_the_chosen_reaction(reaction):
     if reaction == "approach":
         names = [change.phase for change in loop.changes(context)]
         assert names == ["Approach", "Press", "Dwell"] * 2
-        assert_allclose(record["constraint_force"][-1], 10.0, atol=1e-9)
+        assert_allclose(record["constraint_force"][-1], 10.0, atol=0.1)
     else:
         assert (last.phase, last.in_contact) == ("held", False)
         assert record["constraint_force"][-1] == 0.0
@@ -229,21 +211,10 @@ def test_a_task_that_may_not_try_again_ends():
         run_on(loop, context, 0.5)
 
 
-def test_a_force_that_stays_at_the_contact_force_is_felt_once():
-    """By round-off it was above and below all the time, and each event shortened the steps."""
-    phases = (HOLDING, Press(0.5, tolerance=0.05, over=0.1), Dwell(0.1, over=0.05))
-    loop = task_loop(phases, contact_force=0.5, patience=0.05)
-    context = started(loop, distance=0.01)
-    found = run_on(loop, context, 0.6)
-    names = [change.phase for change in loop.changes(context)]
-    assert names == ["Approach", "Press", "Dwell", "done"]
-    assert found.steps < 500
-
-
 @pytest.mark.slow
 def test_patience_goes_on_from_phase_to_phase():
-    """Two phases of 15 ms each are shorter than it; a hand pulls in the first one."""
-    short = [Dwell(0.015, over=0.01), Dwell(0.015, over=0.01, if_lost="hold")]
+    """The first phase lasts for 15 ms, shorter than it; a hand pulls in it."""
+    short = [Dwell(0.015, over=0.01), Dwell(0.05, over=0.01, if_lost="hold")]
     loop = task_loop([HOLDING, Press(10.0, over=0.1), *short], patience=0.02)
     context = started(loop, distance=0.01)
     run_on(loop, context, 0.255)
@@ -252,7 +223,7 @@ def test_patience_goes_on_from_phase_to_phase():
     run_on(loop, context, 0.4)
     last = loop.changes(context)[-1]
     assert (last.phase, last.reason) == ("held", "the contact of Dwell 2 is lost")
-    assert_allclose(last.time, 0.275, atol=1e-6)
+    assert_allclose(last.time, 0.275, atol=0.01)
 
 
 def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
@@ -287,44 +258,19 @@ def test_task_may_begin_in_contact():
     context = started(loop, distance=0.0)
     run_on(loop, context, 0.17)
     record = loop.record(context)
-    assert record["constraint_force"].max() == pytest.approx(5.0, abs=1e-9)
+    assert record["constraint_force"].max() == pytest.approx(5.0, abs=0.2)
     assert loop.changes(context)[-1].phase == "done"
 
 
 @pytest.mark.slow
 def test_robot_rests_after_a_release_as_a_free_one():
-    """It was let go at 0.5 N, and stays where it is."""
+    """It was let go at 0.5 N, 5e-6 m deep, and stays there."""
     loop = task_loop([Press(5.0, over=0.02), Release(over=0.02)])
     context = started(loop, distance=0.0)
     run_on(loop, context, 0.1)
     last = loop.changes(context)[-1]
     assert (last.phase, last.in_contact) == ("done", False)
-    assert_allclose(loop.record(context)["distance"][-1], 0.0, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_arm_with_springs_in_its_joints_touches_and_presses():
-    """Degrees 4 and 2: the force has a derivative, and goes on from it; 1e-8 a step."""
-    model = touching("two_link", [FlexibleJoints(stiffness=8000.0, inertia=0.5)])
-    law = TrackingLaw(model.dae, poles(-20.0))
-    free = TrackingLaw(open_contact(model.dae, "wall.force"), poles(-20.0))
-    assert (law.degrees, free.degrees) == ((4, 2), (4, 4))
-    controller = TaskController(
-        Task([Approach(0.1, over=0.1), Press(20.0, over=0.1), Dwell(0.05)]), law, free
-    )
-    loop = wire_loop(UnilateralRobotPlant(model, {"wall": 0.0}), controller)
-    context = loop.diagram.CreateDefaultContext()
-    loop.set_state(context, controller.rest_state([0.3, 0.005], model.dae.nominal_state))
-    run_on(loop, context, 0.24, accuracy=1e-8)
-    press = loop.changes(context)[1]
-    # The impact bends the springs, and these press: 0.5 N are there some time after it.
-    impact = loop.plant.events(loop.plant.GetMyContextFromRoot(context))[0]
-    assert_allclose(impact.time, 0.005 / 0.1 + 0.05, atol=1e-6)
-    assert_allclose(press.force, 0.5, atol=1e-6)
-    record = loop.record(context)
-    off = (record["tracking_error"] - loop.predicted_error(record))[record.time > press.time]
-    assert np.abs(off).max() < 1e-5
-    assert_allclose(record["constraint_force"][-1], 20.0, atol=1e-4)
+    assert_allclose(loop.record(context)["distance"][-1], 0.0, atol=1e-4)
 
 
 def test_law_may_have_another_wall(whole):
@@ -333,10 +279,10 @@ def test_law_may_have_another_wall(whole):
     context = started(loop)
     own = loop.controller.GetMyMutableContextFromRoot(context)
     loop.controller.set_parameter(own, "wall.position", [1.195, 0.0, 0.0])
-    run_on(loop, context, TOUCH + 0.01, accuracy=1e-8)
+    run_on(loop, context, TOUCH + 0.01)
     touch = loop.changes(context)[1]
-    assert_allclose(touch.time, TOUCH, atol=1e-6)
-    assert_allclose(touch.distance, -0.005, atol=1e-9)
+    assert_allclose(touch.time, TOUCH, atol=2e-3)
+    assert_allclose(touch.distance, -0.005, atol=1e-4)
 
 
 def test_fade_begins_as_given_and_ends_at_rest():
@@ -463,6 +409,13 @@ def test_run_that_has_not_begun_has_no_references(whole):
     controller = whole[0].controller
     with pytest.raises(ModelError, match="has not begun in this context"):
         controller.desired_along(controller.CreateDefaultContext(), [0.0])
+
+
+def test_a_task_on_ideal_constraints_is_refused():
+    """They neither open nor strike."""
+    plant = RobotPlant(arm("two_link").model)
+    with pytest.raises(WiringError, match="CompliantPlant"):
+        wire_loop(plant, TaskController(Task([Approach()]), *laws(), sample_period=PERIOD))
 
 
 def test_discrete_plant_needs_guards_in_samples():

@@ -1,75 +1,62 @@
 """Phases that change within a traced update, against the supervisor in Drake's Simulator."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from arms import error_controlled
 from numpy.testing import assert_allclose
-from polishing import CLIMB, FAR, OVER, SPEED, push, started, task_loop
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from polishing import CLIMB, FAR, OVER, PERIOD, SPEED, push, started, task_loop
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 from runs import some
 
 from drake_dae import (
     Approach,
     ClosedLoop,
+    Condition,
     Dwell,
-    GuardedMove,
     Move,
-    PhaseGuard,
     Press,
     Release,
     Retreat,
-    Sampling,
-    Wait,
 )
 from drake_dae.errors import SimulationError
 from drake_dae.systems.blocks.traced import HELD as NUMBERS
 from drake_dae.systems.blocks.traced import PARAMETERS, TIME, Computation
 
-PERIOD = 0.01
 TOUCH, PRESS = Approach(SPEED, over=OVER, name="touch"), Press(10.0, over=0.05)
-GENTLE = PhaseGuard("force", 8.0, samples=3)
-FEEL = GuardedMove(0.004, SPEED, over=0.02, name="feel")
+GENTLE = Condition("force", above=8.0)
+CLOSER = Move(
+    {"wall.distance": -0.1},
+    until=[Condition("force", above=2.0)],
+    guards=[Condition("travel", above=0.004)],
+    over=0.5,
+    name="feel",
+)
 AWAY = Retreat(0.01, over=0.2, tolerance=0.005)
-
-
-@dataclass(frozen=True)
-class Until(Dwell):
-    """It rests until its contact is lost, as a `Search` does at an edge."""
-
-    ends_by_loss, ends_in_contact, begins_in_contact = True, False, True
 
 
 TASKS = {
     "all succeed": [TOUCH, PRESS, Move({"tool.z": CLIMB}, 0.3, over=0.1), Release(over=0.1), AWAY],
     "rest in contact": [TOUCH, PRESS, Dwell(0.1)],
-    "a guard of three samples": [
+    "a guard of force": [
         TOUCH,
         Press(10.0, 3.0, over=0.1, guards=[GENTLE], on_failure="leave"),
     ],
-    "a guard of work": [
-        TOUCH,
-        PRESS,
-        Move({"tool.z": CLIMB}, 0.5, guards=[PhaseGuard("work", 0.05)], on_failure="hold"),
-    ],
     "a guard of control": [
         TOUCH,
-        Press(30.0, guards=[PhaseGuard("control", 31.0)], on_failure="stop"),
+        Press(30.0, guards=[Condition("control", above=31.0)], on_failure="stop"),
     ],
-    "late, twice again, then stop": [
-        GuardedMove(
-            0.004, SPEED, over=0.02, name="feel", on_failure="feel", retries=2, if_spent="stop"
-        )
+    "a guard of travel, twice again, then stop": [
+        replace(CLOSER, on_failure="feel", retries=2, if_spent="stop")
     ],
-    "late, then another phase": [
-        GuardedMove(
-            0.004, SPEED, over=0.02, retries=1, on_failure="GuardedMove", if_spent="Retreat"
-        ),
+    "a guard of travel, then another phase": [
+        replace(CLOSER, on_failure="feel", retries=1, if_spent="Retreat", on_success="Press"),
+        PRESS,
         Dwell(0.1, on_success="done"),
         AWAY,
     ],
+    "late": [Approach(0.01, within=0.1, if_late="stop")],
     "lost, once back": [TOUCH, PRESS, Dwell(2.0, if_lost="approach")],
     "lost, to another phase": [
         TOUCH,
@@ -78,9 +65,14 @@ TASKS = {
         Retreat(0.03, over=0.2, name="back"),
     ],
     "lost, at rest": [TOUCH, PRESS],
-    "lost, as it should": [TOUCH, PRESS, Until(2.0), Retreat(0.04, over=0.2)],
-    "a signal that never comes": [Wait("ready", within=0.1, if_late="hold")],
-    "fails": [FEEL],
+    "until a distance": [
+        Move({"wall.distance": 0.01}, over=0.3, until=[Condition("distance", below=0.015)]),
+        TOUCH,
+    ],
+    "a signal that never comes": [
+        Dwell(until=[Condition("signal", above=0.5, name="ready")], within=0.1, if_late="hold")
+    ],
+    "fails": [CLOSER],
 }
 """Phases; those whose contact is lost have a hand that pulls from 0.9 s to 1.3 s."""
 
@@ -112,17 +104,15 @@ def state(loop: ClosedLoop, root: Context) -> np.ndarray:
 def test_each_sample_has_the_numbers_of_the_supervisor(name):
     """Also at changes of phases: the same formulas, so that only the order of sums differs."""
     tare_time = 0.05 * (name == "all succeed")
-    loop = task_loop(TASKS[name], Sampling(PERIOD), tare_time=tare_time, retries=1)
+    loop = task_loop(TASKS[name], tare_time=tare_time, retries=1)
     context = started(loop, FAR)
     reaction = loop.controller.supervisor.traced().guard.reaction()
     simulator = Simulator(loop.diagram, context)
-    ApplySimulatorConfig(error_controlled(1e-6), simulator)
-    context.SetAccuracy(1e-6)
     begun = numbers(loop, context, reaction.begin)
     simulator.Initialize()
     assert_allclose(begun, state(loop, context), rtol=0, atol=1e-12)
     places = set[float]()
-    for tick in range(1, 160):
+    for tick in range(1, 1600):
         pulls = "lost" in name and 0.9 < tick * PERIOD < 1.3
         push(loop, context, -60.0 if pulls else 0.0)
         simulator.AdvanceTo(tick * PERIOD)

@@ -1,15 +1,14 @@
-"""The phases of a task: touch, press, move, wait, let go."""
+"""The phases of a task: touch, press, move, dwell, let go."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Self
+from dataclasses import dataclass, field
+from math import inf
 
 import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.references import LineReference, PathLimits, Reference
-from drake_dae.dae.references.paced import PacedReference
 from drake_dae.errors import ModelError
 from drake_dae.systems.task.phases.phase import Moment, Phase
 
@@ -56,12 +55,13 @@ class Approach(Phase):
                     "name, hold, leave, stop or fail"
                 )
 
-    def at_pace(self, pace: float) -> Self:
-        return replace(self, over=self.over / pace, speed=self.speed_of_approach * pace)
-
     @property
     def speed_of_approach(self) -> float:
+        """The speed of the touch, in m/s."""
         return _SPEED if self.speed is None else self.speed
+
+    def rates(self, contact_output: str) -> Mapping[str, float]:
+        return {contact_output: -self.speed_of_approach}
 
     def remaining(self, now: Moment) -> float:
         remaining: float = ca.fmin(super().remaining(now), now.distance + self.behind)
@@ -72,11 +72,8 @@ class Approach(Phase):
             return super().lateness(now, contact_force)
         return (
             f"{self.name} is {-now.distance:.3g} m behind the surface of the model without "
-            f"{self.awaited(contact_force)}"
+            f"{self.awaits(contact_force)}"
         )
-
-    def needed(self, contact_force: float) -> Mapping[str, float]:
-        return {"force": contact_force}
 
     def margin(self, now: Moment, contact_force: float) -> float:
         return contact_force - now.force
@@ -88,13 +85,11 @@ class Approach(Phase):
 @checked(ModelError)
 @dataclass(frozen=True)
 class Press(Phase):
-    """The force goes smoothly to a goal, and the moments of a face to zero.
+    """The force goes smoothly to a goal; of several points, the differences of forces to zero.
 
     Attributes:
         force: The goal, in N: a positive number, or a reference, whose time starts with the phase.
         tolerance: The largest error of the force at which the phase ends, in N.
-        eccentricity: The largest eccentricity of a face at which it ends, a pure number from 0 to
-            1; see `PhaseGuard`.
         over: The duration of the transition from the previous references, in s.
         within: The largest duration of the phase, in s.
         if_late: The successor if it lasts longer; on_failure if left out.
@@ -103,7 +98,6 @@ class Press(Phase):
 
     force: float | Reference
     tolerance: float = 1.0
-    eccentricity: float = 0.5
     within: float = field(default=60.0, kw_only=True)
     if_late: str | None = field(default=None, kw_only=True)
     if_lost: str | None = field(default=None, kw_only=True)
@@ -112,8 +106,7 @@ class Press(Phase):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("tolerance", "eccentricity"):
-            positive(f"Press: {name}", getattr(self, name))
+        positive("Press: tolerance", self.tolerance)
         if not isinstance(self.force, Reference):
             positive("Press: force", self.force)
 
@@ -123,141 +116,83 @@ class Press(Phase):
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: self.force}
 
-    def needed(self, contact_force: float) -> Mapping[str, float]:
-        pressed = 0.0 if isinstance(self.force, Reference) else self.force - self.tolerance
-        return {"time": self.over, "force": pressed}
-
     def margin(self, now: Moment, contact_force: float) -> float:
-        off, tipped = abs(now.force - now.wanted), now.eccentricity - self.eccentricity
-        margin: float = ca.fmax(ca.fmax(self.over - now.time, off - self.tolerance), tipped)
+        off = abs(now.force - now.wanted)
+        margin: float = ca.fmax(self.over - now.time, off - self.tolerance)
         return margin
-
-    def lateness(self, now: Moment, contact_force: float) -> str:
-        if now.eccentricity <= self.eccentricity:
-            return super().lateness(now, contact_force)
-        return (
-            f"{self.name} has waited {self.within:g} s for all points of its face, and has an "
-            f"eccentricity of {now.eccentricity:.3g}, more than {self.eccentricity:g}"
-        )
 
     def awaited(self, contact_force: float) -> str:
         return f"a force within {self.tolerance:g} N of its reference"
 
 
-@checked(ModelError)
-@dataclass(frozen=True)
-class Close(Phase):
-    """A latch comes into its place, and a command closes it.
-
-    The distances and angles of the latch go smoothly to zero. What is left of its velocities ends
-    by an inelastic impact when it closes.
-
-    Attributes:
-        tolerance: The largest distance in m, and the largest angle in rad, at which it closes.
-        speed: The largest velocity in m/s, and the largest angular velocity in rad/s, at which it
-            closes.
-        over: The duration of the transition from the previous references, in s.
-        within: The largest duration of the phase, in s.
-        if_late: The successor if it lasts longer; on_failure if left out.
-    """
-
-    tolerance: float = 1e-4
-    speed: float = 1e-3
-    within: float = field(default=60.0, kw_only=True)
-    if_late: str | None = field(default=None, kw_only=True)
-    begins_in_contact, ends_in_contact = False, True
-    for_contact, for_latch = False, True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive("Close: tolerance", self.tolerance)
-        positive("Close: speed", self.speed)
-
-    def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
-        return {contact_output: 0.0}
-
-    def at_pace(self, pace: float) -> Self:
-        return replace(super().at_pace(pace), speed=self.speed)  # It is a tolerance.
-
-    def needed(self, contact_force: float) -> Mapping[str, float]:
-        return {"time": self.over}
-
-    def margin(self, now: Moment, contact_force: float) -> float:
-        off = ca.fmax(now.distance - self.tolerance, now.rate - self.speed)
-        margin: float = ca.fmax(self.over - now.time, off)
-        return margin
-
-    def lateness(self, now: Moment, contact_force: float) -> str:
-        return (
-            f"{super().lateness(now, contact_force)}, and is {now.distance:.3g} m or rad off with "
-            f"{now.rate:.3g} m/s or rad/s"
-        )
-
-    def awaited(self, contact_force: float) -> str:
-        return f"a latch within {self.tolerance:g} m or rad and {self.speed:g} m/s or rad/s"
-
-
 class _Lasting(Phase):
     """A phase that ends after its `duration`."""
 
-    duration: float
-    for_latch = True
+    duration: float | None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive(f"{self.name}: duration", self.duration)
-
-    def needed(self, contact_force: float) -> Mapping[str, float]:
-        return {"time": self.duration}
+        if self.duration is not None:
+            positive(f"{self.name}: duration", self.duration)
+        elif not self.until:
+            raise ModelError(f"{self.name}: give a duration, or conditions as until")
 
     def margin(self, now: Moment, contact_force: float) -> float:
-        return self.duration - now.time
+        return (self.duration or 0.0) - now.time
+
+    def remaining(self, now: Moment) -> float:
+        return super().remaining(now) if self.until else inf
 
     def awaited(self, contact_force: float) -> str:
-        return f"the end of {self.duration:g} s"
+        return f"the end of {self.duration or 0.0:g} s"
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class Move(_Lasting):
-    """Outputs follow references for some time, in contact or not, as the phase before.
+    """Outputs follow references, in contact or not, as the phase before.
+
+    With `until: [{of: force, above: 2.0}]` it feels for a surface, wherever that is.
 
     Attributes:
         references: Name -> reference, whose time starts with the phase, or a number; names as those
             of `references_by_name`. They may include the force or the distance.
-        duration: The duration of the phase, in s.
+        duration: The duration of the phase, in s; not needed with `until`, which then ends it
+            alone.
         over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it lasts longer; on_failure if left out.
         if_lost: The successor if the contact is lost; on_failure if left out.
     """
 
     references: Mapping[str, Reference | float]
-    duration: float
+    duration: float | None = None
+    within: float = field(default=60.0, kw_only=True)
+    if_late: str | None = field(default=None, kw_only=True)
     if_lost: str | None = field(default=None, kw_only=True)
     holds_contact = True
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return self.references
 
-    def at_pace(self, pace: float) -> Self:
-        paced = {
-            name: PacedReference(goal, pace) if isinstance(goal, Reference) else goal
-            for name, goal in self.references.items()
-        }
-        return replace(super().at_pace(pace), duration=self.duration / pace, references=paced)
-
 
 @checked(ModelError)
 @dataclass(frozen=True)
 class Dwell(_Lasting):
-    """All outputs, including the force, come to rest for some time.
+    """All outputs, including the force, come to rest for some time, or until a signal is present.
 
     Attributes:
-        duration: The duration of the phase, in s.
+        duration: The duration of the phase, in s; not needed with `until`, which then ends it
+            alone.
         over: The duration of the transition from the previous references, in s.
+        within: The largest duration of the phase, in s.
+        if_late: The successor if it lasts longer; on_failure if left out.
         if_lost: The successor if the contact is lost; on_failure if left out.
     """
 
-    duration: float
+    duration: float | None = None
+    within: float = field(default=60.0, kw_only=True)
+    if_late: str | None = field(default=None, kw_only=True)
     if_lost: str | None = field(default=None, kw_only=True)
     holds_contact = True
 
@@ -269,8 +204,6 @@ class Release(Phase):
 
     If it has not ended after `over`, a model error holds the tool, such as an unknown weight or an
     integral that is held: then the reference goes on to fall, by 0.5 N/s, until the contact opens.
-
-    All forces and moments of a latch go to zero; then a command opens it.
 
     The phase is also late if the tool is 20 mm away and a force is still measured, which is then
     the bias of a sensor.
@@ -284,13 +217,9 @@ class Release(Phase):
     within: float = field(default=60.0, kw_only=True)
     if_late: str | None = field(default=None, kw_only=True)
     begins_in_contact, ends_in_contact = True, False
-    for_latch = True
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: LineReference([0.0], [_LEAST], _FALL, self.over, order=6)}
-
-    def goals_of_latch(self, contact_output: str) -> Mapping[str, Reference | float]:
-        return {contact_output: 0.0}
 
     def margin(self, now: Moment, contact_force: float) -> float:
         return now.force - contact_force
@@ -337,9 +266,6 @@ class Retreat(Phase):
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: self.distance}
-
-    def needed(self, contact_force: float) -> Mapping[str, float]:
-        return {"time": self.over}
 
     def margin(self, now: Moment, contact_force: float) -> float:
         off = abs(now.distance - self.distance)

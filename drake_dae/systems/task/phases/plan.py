@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.systems.task.phases.guards import UNITS
 from drake_dae.systems.task.phases.members import Release
 from drake_dae.systems.task.phases.phase import (
     APPROACH,
@@ -16,10 +15,8 @@ from drake_dae.systems.task.phases.phase import (
     LEAVE,
     NEXT,
     STOP,
-    ContactMode,
     Outcome,
     Phase,
-    modes_of,
 )
 
 OUTCOMES: tuple[Outcome, ...] = ("success", "guard", "late", "lost")
@@ -76,10 +73,7 @@ class PhasePlan:
 
     Attributes:
         phases: The same, followed by the Release for "leave" if it may be needed.
-        modes: The mode in which each phase begins; last the mode in which the last one ends.
         contacts: Whether each phase begins in contact; last whether the last one ends in contact.
-        pairs: For each contact beside other closed ones its name and their names.
-        latches: The names of the latches; empty in a task with one contact.
         last: The number of phases that were given.
         retries: The argument.
 
@@ -93,17 +87,12 @@ class PhasePlan:
         self._names = [phase.name for phase in phases]
         self.retries, self.last = retries, len(phases)
         self.phases: tuple[Phase, ...] = tuple(phases)
-        self.modes = modes_of(phases)
-        self.contacts = tuple(mode.is_closed for mode in self.modes)
-        self.pairs = tuple(dict.fromkeys((each.contact, each.others) for each in self.modes[:-1]))
-        self.latches = tuple(dict.fromkeys(name for name, _ in self.pairs if name))
-        self._check_latches()
+        self.contacts = _contacts_of(phases)
         if self._leaves():
             # A model error may be larger than the task's contact_force, and holds the tool.
             leave = Release(name=LEAVE, within=5.0, on_success=STOP, on_failure=STOP)
             self.phases = (*phases, leave)
             self.contacts = (*self.contacts[:-1], True, False)
-            self.modes = tuple(ContactMode("", is_closed) for is_closed in self.contacts)
         self._edges = {place: self._all_from(place) for place in range(self.last)}
         self._check_reached()
         self._check_ends()
@@ -116,8 +105,7 @@ class PhasePlan:
     def last_approach(self, index: int) -> int | None:
         """The index of the last phase up to this one that leads into contact; None if none does."""
         for place in range(index, -1, -1):
-            phase = self.phases[place]
-            if phase.ends_in_contact and not phase.begins_in_contact:
+            if self.ends_in_contact(place) and not self.contacts[place]:
                 return place
         return None
 
@@ -156,25 +144,9 @@ class PhasePlan:
             place, word = to, FAIL if word == APPROACH and phase.retries is None else phase.if_spent
         return Successor(FAIL, None, "; ".join(remarks))
 
-    def law_of(self, place: int) -> int:
-        """The number of the law of a phase: twice that of its pair, and 1 more if it is closed."""
-        mode = self.modes[place]
-        return 2 * self.pairs.index((mode.contact, mode.others)) + int(mode.is_closed)
-
-    def closed_by(self, law: int) -> frozenset[str]:
-        """The names of the latches that are closed while a law acts."""
-        contact, others = self.pairs[law // 2]
-        return ContactMode(contact, bool(law % 2), others).closed
-
-    @property
-    def latch_sets(self) -> set[frozenset[str]]:
-        """The sets of latches that are closed together; empty without latches."""
-        return {self.closed_by(law) for law in range(2 * len(self.pairs)) if self.latches}
-
     def ends_in_contact(self, place: int) -> bool:
         """Whether a phase that succeeds ends in contact."""
-        ends = self.phases[place].ends_in_contact
-        return self.contacts[place] if ends is None else ends
+        return self.phases[place].in_contact_after(self.contacts[place])
 
     def _leaves(self) -> bool:
         """Whether a phase in contact may lead to "leave"."""
@@ -198,30 +170,13 @@ class PhasePlan:
 
     # The checks.
 
-    def _check_latches(self) -> None:
-        """Refuses phases that do not fit their contact."""
-        for place, phase in enumerate(self.phases):
-            name = self.modes[place].contact
-            text = ""
-            if self.latches and not name:
-                text = f"contact: needed, since later phases name {', '.join(self.latches)}"
-            elif name and not phase.for_latch:
-                text = f"it serves a contact that pushes, and '{name}' is a latch"
-            elif not name and not phase.for_contact:
-                text = "contact: needed, the name of a latch"
-            words = {phase.chosen(outcome) for outcome in OUTCOMES} | {phase.if_spent}
-            if name and LEAVE in words:
-                text = "leave does not say which latch to open; name a Release"
-            if text:
-                raise ModelError(f"{self.where(place)}: {text}")
-
     def _all_from(self, place: int) -> list[tuple[str, int]]:
         """The key words and phases that may follow a phase, each checked."""
         phase, edges = self.phases[place], list[tuple[str, int]]()
         if phase.retries is not None:
             self._check_word(place, "if_spent", phase.if_spent)
         outcomes: list[Outcome] = ["success", "guard", "late"]
-        if phase.holds_contact and self.contacts[place] and not phase.ends_by_loss:
+        if phase.holds_contact and self.contacts[place]:
             outcomes.append("lost")
         for outcome in outcomes:
             at, key, word, tried = place, phase.key_of(outcome), phase.chosen(outcome), set[int]()
@@ -253,13 +208,7 @@ class PhasePlan:
         way = "" if is_next else f", after {self.phases[place].name} by {key}"
         begins, ends = self.contacts[to], self.ends_in_contact(to)
         in_contact = self.ends_in_contact(place) if outcome == "success" else self.contacts[place]
-        closed = replace(self.modes[place], is_closed=in_contact).closed
-        if self.latches and closed != (needs := self.modes[to].closed):
-            has, wants = (", ".join(sorted(names)) or "none" for names in (closed, needs))
-            text = f"it begins with these latches closed: {wants}; but then closed: {has}"
-        elif self.latches:
-            text = ""
-        elif outcome == "lost" and begins and ends:
+        if outcome == "lost" and begins and ends:
             text = "it begins in contact, but the contact is lost; choose another one by if_lost"
         elif begins and not in_contact:
             text = "it begins in contact, but the robot is free; an Approach must lead there"
@@ -323,28 +272,36 @@ class PhasePlan:
             follow(place, ())
 
 
-def check_guards(phases: Sequence[Phase], contact_force: float) -> None:
-    """Refuses guards that trip before their phase can succeed.
+def _contacts_of(phases: Sequence[Phase]) -> tuple[bool, ...]:
+    """Whether each phase begins in contact; last whether the last one ends in contact.
+
+    At the start the robot is in contact if the first phase that says so begins in contact. One
+    without a say that ends by a force begins without it.
+    """
+    known = (
+        bool(phase.begins_in_contact)
+        for phase in phases
+        if phase.begins_in_contact is not None or phase.in_contact_after(False)
+    )
+    is_closed, contacts = next(known, False), []
+    for phase in phases:
+        if phase.begins_in_contact is not None:
+            is_closed = phase.begins_in_contact
+        contacts.append(is_closed)
+        is_closed = phase.in_contact_after(is_closed)
+    return (*contacts, is_closed)
+
+
+def check_forces(phases: Sequence[Phase], contact_force: float) -> None:
+    """Refuses phases that touch or press with a force that counts as none.
 
     Raises:
-        ModelError: A guard does, two watch the same quantity, or the force of a phase is below
-            `contact_force`.
+        ModelError: The force of a phase is below `contact_force`.
     """
     for index, phase in enumerate(phases):
-        where, needed = f"phase {index + 1} of the task, {phase.name}", phase.needed(contact_force)
-        if phase.felt(contact_force) < contact_force:
+        if (force := phase.felt(contact_force)) < contact_force:
             raise ModelError(
-                f"{where}: force: {phase.felt(contact_force):g} N counts as no force, since it is "
-                f"less than the contact_force of {contact_force:g} N; give more, or a smaller "
-                "contact_force"
+                f"phase {index + 1} of the task, {phase.name}: force: {force:g} N counts as no "
+                f"force, since it is less than the contact_force of {contact_force:g} N; give "
+                "more, or a smaller contact_force"
             )
-        watched = [guard.of for guard in phase.guards]
-        for number, guard in enumerate(phase.guards):
-            if guard.of in watched[:number]:
-                raise ModelError(f"{where}: two guards watch the {guard.of}; leave one out")
-            if guard.most <= needed.get(guard.of, 0.0):
-                unit = f" {UNITS[guard.of]}".rstrip()
-                raise ModelError(
-                    f"{where}: its guard ends it at a {guard.of} of {guard.most:g}{unit}, and it "
-                    f"needs {needed[guard.of]:g}{unit} to succeed; give more"
-                )

@@ -431,7 +431,7 @@ def test_gains_of_a_continuous_contact_need_a_period():
 
 @pytest.mark.slow
 def test_a_task_on_a_continuous_contact_is_sampled():
-    settings = ("plant=!CompliantContact {time_step: 0}", "sampling=null", "gains={all: [-25]}")
+    settings = ("plant=!CompliantContact {time_step: 0}", "gains={all: [-25]}")
     found = scenario("wall_polish", *settings)
     with pytest.raises((ScenarioError, WiringError), match=r"in a scenario: sampling"):
         build_scenario(found)
@@ -442,7 +442,6 @@ def test_a_task_on_a_continuous_contact_is_sampled():
     "name",
     [
         "wall_point_contact",
-        pytest.param("wall_flexible_contact", marks=pytest.mark.thorough),
     ],
 )
 def test_a_run_of_a_shipped_scenario_is_that_of_drakes_plant(name):

@@ -1,0 +1,103 @@
+"""No result changes unless it is meant to: records of runs, of theory and of advice.
+
+Steps are fixed: with error control two correct versions differ by 1e-5. `recording.py` writes the
+records anew; the commit that does so says why, and by how much they moved.
+"""
+
+import json
+import shutil
+from importlib.metadata import version
+
+import numpy as np
+import pytest
+from golden.cases import CASES, FIXTURE
+from golden.recording import analysis_of, gains_found, rollout_of, run_of, values_at
+from runs import DEAR, some
+
+KEPT = np.load(FIXTURE)
+
+OTHER_DRAKE = str(KEPT["drake"]) != version("drake")
+
+IDEAL, CONTACT = 1e-10, 1e-6
+"""Of the largest value of each signal: round-off that some hundred steps amplify; and what the
+iterations of Drake's contact solver leave."""
+
+
+def params(names):
+    return [pytest.param(name, marks=[pytest.mark.slow] * CASES[name].is_slow) for name in names]
+
+
+def assert_near(found, wanted, tolerance):
+    """Column by column; a column that is round-off is compared with the largest of all."""
+    size = np.maximum(np.max(np.abs(wanted), axis=0), 1e-3 * np.max(np.abs(wanted)))
+    off = np.max(np.abs(found - wanted) / size)
+    assert off < tolerance, f"moved by {off:.2g}"
+
+
+@pytest.mark.parametrize("name", params(CASES))
+def test_runs_are_as_recorded(name):
+    case = CASES[name]
+    if case.contact and OTHER_DRAKE:
+        pytest.skip(f"recorded with Drake {KEPT['drake']}, whose contact solver makes the steps")
+    loose = case.contact or case.amplifies
+    assert_near(run_of(case), KEPT[f"run/{name}"], CONTACT if loose else IDEAL)
+
+
+@pytest.mark.parametrize("name", params(name for name, case in CASES.items() if case.rolls))
+@pytest.mark.parametrize("compiled", [False, True])
+def test_rollouts_are_as_recorded(name, compiled):
+    if compiled and shutil.which("cc") is None:
+        pytest.skip("there is no C compiler")
+    assert_near(
+        rollout_of(CASES[name], compiled),
+        KEPT[f"run/{name}"],
+        CONTACT if CASES[name].amplifies else 1e-9,
+    )
+
+
+@pytest.mark.parametrize(
+    "name", params(name for name, case in CASES.items() if f"analysis/{name}" in KEPT)
+)
+def test_the_theory_is_as_recorded(name):
+    """A, B, alpha, beta, the law and residual at 20 consistent states."""
+    kept = {key.rsplit("/", 1)[1]: KEPT[key] for key in KEPT.files if key.startswith(f"at/{name}/")}
+    found = values_at(CASES[name], kept["states"])
+    for key, wanted in kept.items():
+        size = np.max(np.abs(wanted), initial=1e-300)
+        np.testing.assert_allclose(found[key], wanted, rtol=0, atol=1e-11 * size, err_msg=key)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", some(sorted(n for n in CASES if f"analysis/{n}" in KEPT), of=8, dear=DEAR)
+)
+def test_the_analysis_is_as_recorded(name):
+    wanted = dict(leaves(json.loads(str(KEPT[f"analysis/{name}"]))))
+    found = dict(leaves(analysis_of(name)))
+    assert found.keys() == wanted.keys()
+    for key, value in wanted.items():
+        if isinstance(value, float):  # Searched along paths, in steps.
+            assert found[key] == pytest.approx(value, rel=1e-6, abs=1e-9), key
+        else:
+            assert found[key] == value, key
+
+
+@pytest.mark.slow
+def test_computed_gains_are_as_recorded():
+    wanted, found = json.loads(str(KEPT["gains"])), gains_found()
+    assert found.keys() == wanted.keys()
+    for key, values in wanted.items():
+        np.testing.assert_allclose(found[key], values, rtol=1e-9, err_msg=key)
+
+
+def leaves(value, path=""):
+    """The entries of nested lists and dictionaries, by their path."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield from leaves(part, f"{path}.{key}")
+    elif isinstance(value, list):
+        yield f"{path}.length", len(value)
+        for index, part in enumerate(value):
+            yield from leaves(part, f"{path}.{index}")
+    else:
+        yield path, value
