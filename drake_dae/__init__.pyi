@@ -132,7 +132,6 @@ from .systems.control.limits import ControlLimits as ControlLimits
 from .systems.control.phase_change import PhaseChange as PhaseChange
 from .systems.control.references import ReferenceGenerator as ReferenceGenerator
 from .systems.control.sampling import ControlHold as ControlHold
-from .systems.control.sampling import Packets as Packets
 from .systems.control.sampling import Sampling as Sampling
 from .systems.observing.estimator import StateEstimator as StateEstimator
 from .systems.observing.observer import DisturbanceObserver as DisturbanceObserver
@@ -153,7 +152,6 @@ from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralR
 from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor
 from .systems.sensing.force_sensor import ForceSensor as ForceSensor
-from .systems.sensing.tolerances import Tolerances as Tolerances
 from .systems.task.contacts.open_contact import open_contact as open_contact
 from .systems.task.controller import TaskController as TaskController
 from .systems.task.phases import Approach as Approach

@@ -82,9 +82,6 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
     loop.set_seed(context, scenario.force_feedback.seed)
     if loop.encoders is not None and scenario.encoders is not None:
         loop.encoders.set_seed(context, scenario.encoders.seed)
-    for link in (loop.link, loop.packets):
-        if link is not None and scenario.sampling is not None:
-            link.set_seed(context, scenario.sampling.seed)
 
 
 def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:

@@ -84,7 +84,7 @@ def report_run(
     job = judge_job(
         record,
         predicted,
-        {} if scenario.tolerances is None else scenario.tolerances.outputs,
+        scenario.tolerances,
         [
             *shortfalls(record, limits),
             *exceeded,
@@ -157,12 +157,6 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
-        "controls are late or lost on their way (sampling)": not (
-            scenario.sampling is None or scenario.sampling.is_exact
-        ),
-        "measurements are late or lost on their way (sampling.measurements)": (
-            scenario.sampling is not None and scenario.sampling.measurements is not None
-        ),
     }
     return [reason for reason, holds in reasons.items() if holds]
 
