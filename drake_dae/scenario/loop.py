@@ -58,13 +58,6 @@ def build_loop(
         ScenarioError: Something does not fit; the message names its key.
     """
     # The law, and its exogenous signals.
-    if model.stages and model.friction.signals:
-        text = (
-            f"'{model.friction.owner}' has presliding, and the law behind springs and motors "
-            "differentiates friction, which bristles at rest do not allow: leave presliding out, "
-            "or leave the actuation out"
-        )
-        raise ScenarioError(("presliding", text))
     task, sampling = scenario.task, scenario.sampling
     opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
     observed = observed_structure(scenario, model, structure)

@@ -110,9 +110,9 @@ def peg_in_hole(contact: Constraint, peg: Peg, model: RobotModel) -> PegInHole:
             f"peg: its radius of {peg.radius:g} m leaves no clearance in the hole of "
             f"'{contact.name}', whose radius is {hole.radius:g} m; make it thinner"
         )
-    if contact.presliding is not None or contact.viscous_friction is not None:
+    if contact.viscous_friction is not None:
         raise ModelError(
-            f"peg: '{contact.name}' has presliding or viscous friction, which the sides of a hole "
+            f"peg: '{contact.name}' has viscous friction, which the sides of a hole "
             "do not have; leave them out"
         )
     c, w = hole.radius - peg.radius, hole.chamfer
@@ -229,7 +229,7 @@ def _opening(
         skin = moved(point + arm)
         velocity = ca.mtimes(skin, links.v) - contact.surface_velocity(point + arm)
         sliding = velocity - normal * ca.dot(normal, velocity)
-        pull = Friction.of(contact.name, contact.parameters, sliding, None).pull
+        pull = Friction.of(contact.name, contact.parameters, sliding).pull
         push += ca.mtimes(skin.T, pull)
     return Opening(
         name=name,
