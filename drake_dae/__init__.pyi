@@ -90,8 +90,7 @@ from .robots.outputs import PointCoordinates as PointCoordinates
 from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
 from .robots.outputs import TiltFromNormal as TiltFromNormal
 from .robots.surfaces.implicit import ImplicitSurface as ImplicitSurface
-from .robots.surfaces.maps import HeightMap as HeightMap
-from .robots.surfaces.maps import MeshSurface as MeshSurface
+from .robots.surfaces.measured import MeasuredSurface as MeasuredSurface
 from .robots.surfaces.plate import Hole as Hole
 from .robots.surfaces.plate import Plate as Plate
 from .robots.surfaces.surfaces import Cylinder as Cylinder

@@ -17,7 +17,6 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.layer import Layer
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Vector
 
@@ -291,7 +290,7 @@ class Constraint(ABC):
 
     def layer(
         self, values: FloatArray, point: FloatArray, size: float, depth: float
-    ) -> Layer | None:
+    ) -> PosedShape | None:
         """A mesh below a piece of the surface, for hydroelastic contact; None without a surface.
 
         Args:

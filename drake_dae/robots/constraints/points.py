@@ -1,7 +1,7 @@
 """Points on a surface, and points at a fixed distance."""
 
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import casadi as ca
@@ -15,7 +15,6 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
 from drake_dae.robots.constraints.friction import Friction, friction_parameters
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.layer import Layer
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
 from drake_dae.trace.smoothness import length_of
@@ -231,10 +230,9 @@ class PointOnSurface(Constraint):
         pose = self.placement(values)
         return tuple(solid.moved(pose) for solid in self.surface.solids())
 
-    def layer(self, values: FloatArray, point: FloatArray, size: float, depth: float) -> Layer:
+    def layer(self, values: FloatArray, point: FloatArray, size: float, depth: float) -> PosedShape:
         pose = self.placement(values)
-        layer = self._shaped(values).layer(pose.inverse() @ point, size, depth)
-        return replace(layer, solid=layer.solid.moved(pose))
+        return self._shaped(values).layer(pose.inverse() @ point, size, depth).moved(pose)
 
 
 @checked(ModelError)

@@ -12,7 +12,7 @@ from drake_dae.dae import references
 from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
 from drake_dae.robots import constraints as contact
 from drake_dae.robots.constraints import friction
-from drake_dae.robots.surfaces import implicit, maps, plate, surface, surfaces
+from drake_dae.robots.surfaces import implicit, measured, plate, surface, surfaces
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
@@ -40,8 +40,7 @@ Surface = Annotated[
     | surfaces.Ellipsoid
     | surfaces.Torus
     | implicit.ImplicitSurface
-    | maps.HeightMap
-    | maps.MeshSurface,
+    | measured.MeasuredSurface,
     Choice({**_WRITTEN, Callable[..., SX] | str: str, plate.Hole: _Hole}),
 ]
 Constraint = Annotated[

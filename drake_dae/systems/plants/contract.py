@@ -90,7 +90,6 @@ class Plant(System):
     normals: tuple[int, ...] = ()
     projects: bool = False
     is_ideal: bool = True
-    remarks: tuple[str, ...] = ()
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:

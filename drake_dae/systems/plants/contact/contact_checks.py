@@ -8,7 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray, numbers, show, unknown_name
+from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.robots.constraints.constraint import Constraint
@@ -72,8 +72,8 @@ def check_pegs(model: RobotModel, material: PointMaterial) -> None:
 
 def solids_of(
     constraint: Constraint, values: FloatArray, point: FloatArray, material: ContactMaterial
-) -> tuple[tuple[PosedShape, ...], str]:
-    """The solids of a constraint in the world, and a remark on their deviation from its surface.
+) -> tuple[PosedShape, ...]:
+    """The solids of a constraint in the world.
 
     Args:
         constraint: The contact.
@@ -87,7 +87,7 @@ def solids_of(
     solids = constraint.solids(values)
     exact = solids and all(isinstance(solid.form, HalfSpace | Sphere) for solid in solids)
     if material.contact_model == "point" or exact:
-        return solids, ""
+        return solids
     # Drake's own mesh of a long cylinder is too coarse: 2 N of ripple in a force of 20 N.
     try:
         layer = constraint.layer(values, point, material.piece, material.thickness)
@@ -95,7 +95,7 @@ def solids_of(
         raise ModelError(f"{constraint.name}: {error}") from None
     if layer is None:
         raise ModelError(f"'{constraint.name}' is no contact with a surface: use an ideal plant")
-    return (layer.solid,), f"{constraint.name} around {show(point)} m is {layer}"
+    return (layer,)
 
 
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:
