@@ -45,8 +45,6 @@ from drake_dae.simulation.records.record import Recorded
 from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.systems.plants.contact_events import ContactChange
 
-FOLDER = Path(__file__).parent / "made"
-
 
 @cache
 def loop() -> dd.ClosedLoop:
