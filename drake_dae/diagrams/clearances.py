@@ -8,7 +8,6 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.robots.geometry.clearances import (
     LinkBehind,
     links_behind,
-    points_inside,
     surface_distances,
 )
 from drake_dae.robots.geometry.shapes import (
@@ -40,8 +39,6 @@ def links_in_the_way(
 ) -> tuple[LinkBehind | Collision, ...]:
     """Finds the links that were behind a surface in a run, and links that collided.
 
-    With an ideal plant also contact points that came into a body by its sides.
-
     Args:
         loop: The closed loop.
         record: The run.
@@ -52,8 +49,6 @@ def links_in_the_way(
     shapes, states = LinkShapes(model, loop.scene_graph), record["state"]
     parameters = loop.plant_parameters(record, context)
     behind = links_behind(model, record.time, states, parameters, shapes)
-    if loop.plant.is_ideal:
-        behind += points_inside(model, record.time, states, parameters)
     return *behind, *collisions(shapes, record.time, states)
 
 

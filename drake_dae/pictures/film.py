@@ -284,9 +284,6 @@ class _Scene:
         for row in range(len(ends)):
             for points, color in ((self._desired, DESIRED), (self._points[: number + 1], ACTUAL)):
                 axis.plot(*self._camera.project(points[:, row]).T, color=color, linewidth=1.6)
-            if brightness := course.flashes[number, row]:
-                x, y = ends[row][0]
-                axis.scatter(x, y, s=900.0 * brightness, marker="*", color=IMPACT, zorder=3)
         within = (0.0, _TOP * _HEIGHT, _WIDTH, _HEIGHT)
         for row in with_arrow:
             head, tail = ends[row]

@@ -22,10 +22,7 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.controllers.task_controller import (
-    opening_contact,
-    task_controller,
-)
+from drake_dae.scenario.controllers.task_controller import task_controller
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.observed import latency_of, law_robot, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
@@ -71,7 +68,6 @@ def build_loop(
         )
         raise ScenarioError(("presliding", text))
     task, sampling = scenario.task, scenario.sampling
-    opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
     observed = observed_structure(scenario, *law_robot(scenario, model, structure))
     law = _law(scenario, observed, latency_of(scenario, model))
     references = [] if task is not None else _references(scenario.references, law)
@@ -85,11 +81,11 @@ def build_loop(
     of_plant = own_model(scenario, model.links) if plant is None else None
     plant_exogenous = None
     if of_plant is not None:
-        plant = make_plant(scenario, of_plant.model, of_plant.structure, opens=opens)
+        plant = make_plant(scenario, of_plant.model, of_plant.structure)
         scene_graph = of_plant.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(of_plant.scenario, plant.dae, degrees)
-    plant = plant or make_plant(scenario, model, structure, feedback, opens)
+    plant = plant or make_plant(scenario, model, structure, feedback)
 
     # The parts between plant and law; errors get the key of the part.
     with at("force_feedback"):
@@ -145,7 +141,6 @@ def make_plant(
     model: RobotModel,
     structure: Structure,
     feedback: bool = False,
-    opens: Sequence[str] = (),
 ) -> Plant:
     """Makes the plant of a scenario.
 
@@ -154,7 +149,6 @@ def make_plant(
         model: The robot, with payloads if the plant does not add them itself.
         structure: The structure of the model's system.
         feedback: Whether the plant may evaluate the law itself.
-        opens: The contacts that a task opens and closes; empty without a task.
 
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
@@ -164,7 +158,6 @@ def make_plant(
         model,
         structure,
         feedback,
-        opens,
         partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
         scenario.plant_parameters,
         scenario.plant_disturbances,

@@ -24,8 +24,6 @@ NEARER = 1.1
 """A link counts if its distance from the contact is below this many times its distance from the
 nearest fixed link."""
 
-POINT_DEPTH = 1e-6
-"""The same depth for an ideal contact point inside a body that ends, in m: far above round-off."""
 
 MOST_ORIGIN_STATES = 300
 """The largest number of examined states of a motion for origins of links."""
@@ -119,26 +117,6 @@ def links_behind(
     return tuple(deepest)
 
 
-def points_inside(
-    model: RobotModel, times: FloatArray, states: FloatArray, parameters: FloatArray
-) -> tuple[LinkBehind, ...]:
-    """The contact points that are inside a body that ends, such as a `Plate`, along a motion.
-
-    An ideal contact has the face of such a body alone, so a point may come in through its sides.
-
-    Args:
-        model, times, states, parameters: As for `links_behind`.
-    """
-    chosen, found = sampled(len(times)), list[LinkBehind]()
-    for constraint in model.constraints if len(times) else ():
-        touch = constraint.touch(model.links) if constraint.ends else None
-        if touch is not None:
-            surface = _Surface(model, constraint.name, touch)
-            deepest = surface.deepest_point(times[chosen], states[chosen], parameters[chosen])
-            found += [deepest] if deepest is not None else []
-    return tuple(found)
-
-
 def _surfaces(model: RobotModel, times: FloatArray) -> Iterator["_Surface"]:
     """The surfaces that a robot touches; none for a motion without times."""
     for constraint in model.constraints if len(times) else ():
@@ -192,27 +170,6 @@ class _Surface:
                 _distances([point], self._fixed),
                 ca.mmax(ca.vertcat(-ca.inf, *fixed_depths)),
             ],
-        )
-
-    def deepest_point(
-        self, times: FloatArray, states: FloatArray, parameters: FloatArray
-    ) -> LinkBehind | None:
-        """The contact point where it is deepest; None if it is never inside."""
-        depth = ca.Function(
-            "depth", [*self._inputs.values()], [-self._touch.clearance(self._contact)]
-        )
-        positions = states[:, : self._nq].T
-        depths = depth.map(len(times))(positions, parameters.T).full()[0]
-        is_inside = depths > POINT_DEPTH
-        if not is_inside.any():
-            return None
-        row, first = int(np.argmax(depths)), int(np.argmax(is_inside))
-        return LinkBehind(
-            self._name,
-            self._touch.frame,
-            float(depths[row]),
-            float(times[row]),
-            float(times[first]),
         )
 
     def deepest(

@@ -183,7 +183,7 @@ def _runs(
     else:
         run = partial(interpreted.run, functions_of(program), settings)
     if program.compiled.changes:
-        run = partial(run_with_changes, functions_of(program), run, settings.tableau)
+        run = partial(run_with_changes, functions_of(program), run)
     if program.compiled.has_stepped:
         run = partial(run_beside, functions_of(program), code, settings=settings)
     if code is None or len(problems) == 1 or program.compiled.has_stepped:

@@ -17,7 +17,6 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.block import check_context
-from drake_dae.systems.plants.contact_events import ContactEvent
 from drake_dae.trace.functions import TracedFunction
 
 if TYPE_CHECKING:
@@ -43,7 +42,7 @@ class Plant(System):
        `constraint_force`, `constraint_residual` and `controlled_output` have the entries of
        `dae.state_signals`, `dae.force_signals`, `structure.manifold.residual_signals` and
        `dae.output_signals`.
-    2. System. `dae` is the system, and `structure` its structure with all contacts closed.
+    2. System. `dae` is the system, and `structure` its structure.
     3. Robots. `model` is the robot of the system `dae`; then the output port `link_state` is (q, v)
        of its links. It is None for other plants.
     4. State and steps. `time_step` is the time between its steps in s, 0 for a continuous plant.
@@ -63,21 +62,16 @@ class Plant(System):
        refuses. `further_parameters` are those that follow them in numeric parameter 0 and may be
        identified, each with its place there.
     9. Starts. `set_state` sets x as given. `set_consistent_state` sets the state on N* next to a
-       guess, with all contacts closed, and returns it. Both refuse wrong shapes.
-    10. Opening contacts. `contacts` names the contacts that open and close, in the order of the
-        output port `mode`, whose entries are 1 for closed and 0 for open; `normals` are the indices
-        of their forces in `constraint_force`. While one is open its force is zero, and the integral
-        of its error in a law is not updated. `events` are their events in a run. A plant without
-        such contacts has empty lists.
-    11. Projection. `projects` says whether the state is projected onto N* after each step; a record
+       guess, and returns it. Both refuse wrong shapes.
+    10. Projection. `projects` says whether the state is projected onto N* after each step; a record
         then has the state before the projection.
-    12. Feedback. A plant that can compute its control itself has an input port `feedback`, which
+    11. Feedback. A plant that can compute its control itself has an input port `feedback`, which
         takes a law as a value; see `DaePlant`. `laws_along` are the parameters of that law at the
         times of a run, or None.
-    13. Contact. `is_ideal` says whether the constraints hold exactly while contacts are closed.
-    14. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
+    12. Contact. `is_ideal` says whether the constraints hold exactly.
+    13. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
         surfaces and constraint forces.
-    15. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
+    14. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
         the law may not know; not negative.
     """
 
@@ -90,8 +84,6 @@ class Plant(System):
     functions: Collection[str] = ()
     exogenous_layout: DerivativeLayout = DerivativeLayout(())
     exogenous_places: list[int] = NOWHERE
-    contacts: tuple[str, ...] = ()
-    normals: tuple[int, ...] = ()
     projects: bool = False
     is_ideal: bool = True
     remarks: tuple[str, ...] = ()
@@ -178,10 +170,6 @@ class Plant(System):
         state = self.structure.manifold.settle(guess, self.current_parameters(context))
         self.set_state(context, state)
         return state
-
-    def events(self, context: Context) -> tuple[ContactEvent, ...]:
-        """The events of contacts since the start of the run of a context."""
-        return ()
 
     def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
         """The parameters of the law at `feedback`, one row for each time; None without one."""
