@@ -267,8 +267,9 @@ def _largest_controls(record: Record, limits: Limits) -> FloatArray:
 
 
 def _pulls(record: Record, signal: Signal, values: FloatArray, limits: Limits) -> bool:
-    """Whether an ideal contact would have to pull; a compliant one, whose whole force is recorded,
-    cannot.
+    """Whether an ideal contact would have to pull.
+
+    A compliant one, whose whole force is recorded, cannot.
     """
     is_ideal = "contact_force" not in record
     return is_ideal and bool(np.min(values) < 0.0) and not limits.can_pull(signal)
