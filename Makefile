@@ -74,11 +74,9 @@ benchmark: $(VENV)/installed-benchmark
 
 campaign: $(VENV)/installed-dev
 	$(BIN)/python tests/campaign/run.py --count 1600 --files 2000 --several 800 \
-		--robots 520 --drops 1000 --seed $(SEED)
+		--robots 520 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
 	$(PYTEST) -m thorough
-	$(BIN)/python tests/support/woodpecker.py
-	$(BIN)/python tests/campaign/polish.py
 	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_tasks.py --count 1000 --seed $(SEED)
 
 # Those of example-robot-data, and of pybullet_data and robosuite where these are installed.

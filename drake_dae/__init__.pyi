@@ -13,8 +13,6 @@ from .dae.beyond.disturbance import with_disturbance as with_disturbance
 from .dae.beyond.one_direction import SensorNoise as SensorNoise
 from .dae.beyond.sampled import sampled_poles as sampled_poles
 from .dae.beyond.sampled import sampling_error as sampling_error
-from .dae.beyond.spring_loop import SpringLoop as SpringLoop
-from .dae.beyond.spring_loop import spring_loop as spring_loop
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
 from .dae.extension.extension import Extension as Extension
 from .dae.extension.extension import extend as extend
@@ -83,7 +81,6 @@ from .robots.force_outputs import Squeeze as Squeeze
 from .robots.joint_friction import JointFriction as JointFriction
 from .robots.known_forces import KnownForce as KnownForce
 from .robots.known_forces import KnownWrench as KnownWrench
-from .robots.link_side import link_side as link_side
 from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
 from .robots.links.textbook import LinkExpressions as LinkExpressions
 from .robots.model import RobotModel as RobotModel
@@ -123,7 +120,6 @@ from .studies.variations import grid_variations as grid_variations
 from .studies.variations import listed_variations as listed_variations
 from .studies.variations import random_variations as random_variations
 from .symbolic import from_symbolic as from_symbolic
-from .systems.cascade.cascade import SpringCascade as SpringCascade
 from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
 import casadi as ca
 import numpy as np
 import pytest
-from actuated import actuated
 from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -90,16 +89,6 @@ def observed_law() -> dd.TrackingLaw:
 
 
 @cache
-def springy() -> dd.RobotModel:
-    return actuated("two_link", "flexible").model
-
-
-@cache
-def links_law() -> dd.TrackingLaw:
-    return dd.TrackingLaw(dd.link_side(springy()).dae, dd.poles(-4.0))
-
-
-@cache
 def observer() -> dd.DisturbanceObserver:
     return dd.DisturbanceObserver(observed_law(), dd.Observing(10.0), 0.01)
 
@@ -107,11 +96,6 @@ def observer() -> dd.DisturbanceObserver:
 @cache
 def estimator() -> dd.StateEstimator:
     return dd.StateEstimator(observed_law(), dd.Observing(10.0, state_rate=40.0), 0.01)
-
-
-@cache
-def cascade() -> dd.SpringCascade:
-    return dd.SpringCascade(links_law(), springy(), dd.SpringLoop(60.0, motor_rate=60.0), 0.01)
 
 
 def sensed() -> dd.SensedContact:
@@ -223,11 +207,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.DisturbanceObserver: observer,
     dd.StateEstimator: estimator,
     dd.SensedContact: sensed,
-    dd.SpringLoop: lambda: dd.SpringLoop(60.0, motor_rate=60.0),
-    dd.SpringCascade: cascade,
-    "law of SpringCascade": links_law,
-    "model of SpringCascade": springy,
-    "model of link_side": springy,
     "end": lambda: 0.5,
     dd.SensorNoise: lambda: dd.SensorNoise(),
     dd.AdvisedGains: lambda: dd.advised_gains(sensed(), 1.0),

@@ -220,7 +220,7 @@ def _trace_dependencies(expressions: Expressions, outputs: Sequence[Port]) -> No
                 expressions.call(block, block.guard.computation)
             if block.stepped is not None:
                 expressions.source(block, HELD)
-                expressions.source(block, block.stepped.reads)
+                expressions.source(block, block.stepped.into)
             if block.initial is not None:
                 expressions.call(block, block.initial)
 
@@ -286,7 +286,7 @@ def _rates(
         rates.append((UpdateRate(*key, function, places), values))
     for block in blocks.values():
         if (stepped := block.stepped) is not None:
-            values = expressions.checked(partial(stepped_input, block, stepped.reads))
+            values = expressions.checked(partial(stepped_input, block, stepped.into))
             function = dense_function("update", arguments, expressions.expanded(values))
             count = sum(stepped.system.GetOutputPort(name).size() for name in stepped.ports)
             places = tuple(parts[block.system][:count])

@@ -40,8 +40,7 @@ def add_observer(
         observing: The rates of the observer.
         state: The measured state.
         sampling: The sampling of the hold after the controller.
-        control: The control at the plant. If the controller has `observed` ports, they replace
-            state and control.
+        control: The control at the plant.
         reference: R(t).
         limits: What keeps the limits of the drives; None if nothing does.
         encoders: What measures the state; None if it is exact.
@@ -73,21 +72,12 @@ def add_observer(
         )
     late = 0.0 if sampling is None else sampling.mean_delay + step
     lag, delay = control_lag(plant, sampling), late + period / 2.0
-    observed_state = state
-    if controller.observed is not None:
-        observed_state, control = (controller.GetOutputPort(name) for name in controller.observed)
-        lag = 0.5  # The mean of the measurements at both ends of a sample.
     observer: Observer
     if observing.state_rate is None:
         observer = builder.AddSystem(
             DisturbanceObserver(controller.law, observing, period, lag, delay, plant.is_ideal)
         )
-        builder.Connect(observed_state, observer.GetInputPort("estimated_state"))
-    elif controller.observed is not None:
-        raise WiringError(
-            f"a state_rate is for robots with rigid joints, and {controller.get_name()} has "
-            "springs; leave it out, and measure the velocities"
-        )
+        builder.Connect(state, observer.GetInputPort("estimated_state"))
     else:
         timing = period, lag, delay
         observer = builder.AddSystem(_estimator(controller.law, observing, timing, step, encoders))

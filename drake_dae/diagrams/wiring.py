@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 
-from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
@@ -36,7 +35,6 @@ from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.drake_references import SystemReference
 from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.plants.contract import Plant
 
 
@@ -91,18 +89,7 @@ def make_closed_loop(
         outputs = law.layout.values(reference.reference(settings.start_time))
     except DrakeDaeError:
         outputs = None  # A trajectory that starts later.
-    is_fed_back = (
-        reference.is_by_time
-        and plant.HasInputPort("feedback")
-        and can_be_fed_back(law, settings.sampling, settings.control_limits)
-    )
-    controller = TrackingController(
-        law,
-        outputs,
-        sample_period=period,
-        references=reference if is_fed_back else None,
-        feedback=is_fed_back,
-    )
+    controller = TrackingController(law, outputs, sample_period=period)
     return wire_loop(
         plant, controller, reference, settings, scene_graph=scene_graph, meshcat=meshcat
     )
@@ -154,19 +141,13 @@ def wire_loop(
     if observing is None:
         builder.Connect(state, controller.GetInputPort("estimated_state"))
 
-    # Its control goes to the plant, held between samples and limited by drives; or the plant uses
-    # the law itself.
+    # Its control goes to the plant, held between samples and limited by drives.
     sampling = None if parts.sampling is None else hold_before(plant, parts.sampling)
     control = controller.GetOutputPort("control")
     control, link, limits = add_drives(builder, plant, control, sampling, parts.control_limits)
-    if controller.HasOutputPort("feedback"):
-        builder.Connect(controller.GetOutputPort("feedback"), plant.GetInputPort("feedback"))
-    else:
-        builder.Connect(control, plant.GetInputPort("control"))
-        if goal is not None and controller.HasInputPort("reference"):
-            builder.Connect(goal, controller.GetInputPort("reference"))
-    if controller.HasInputPort("acting_control"):
-        builder.Connect(control, controller.GetInputPort("acting_control"))
+    builder.Connect(control, plant.GetInputPort("control"))
+    if goal is not None and controller.HasInputPort("reference"):
+        builder.Connect(goal, controller.GetInputPort("reference"))
 
     # Exogenous signals go to the plant, and to the law as known there.
     moving, known = add_exogenous(builder, plant, controller, parts)
@@ -235,16 +216,3 @@ def wire_loop(
         link,
         packets,
     )
-
-
-def can_be_fed_back(
-    law: TrackingLaw, sampling: Sampling | None, control_limits: ArrayLike | None
-) -> bool:
-    """Whether a plant can evaluate the law itself instead of an input `control`; see `DaePlant`.
-
-    The law must be continuous, without control limits, and depend on state and references only.
-    The arguments are those of `LoopSettings`.
-    """
-    takes_more = law.measured_force or law.integral.outputs or law.exogenous_degrees
-    is_direct = sampling is None and control_limits is None
-    return is_direct and law.system.num_controls > 0 and not takes_more

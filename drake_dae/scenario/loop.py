@@ -15,23 +15,18 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import hold_before
-from drake_dae.diagrams.observing import control_lag
 from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.diagrams.sources import make_generator
 from drake_dae.diagrams.state_feedback import make_sensor
-from drake_dae.diagrams.wiring import can_be_fed_back, make_closed_loop, wire_loop
+from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.controllers.task_controller import task_controller
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.observed import latency_of, law_robot, observed_structure
+from drake_dae.scenario.observed import latency_of, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
-from drake_dae.scenario.parts.parts import Tracking
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.cascade.cascade import SpringCascade
-from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
 
 
@@ -68,7 +63,7 @@ def build_loop(
         )
         raise ScenarioError(("presliding", text))
     task, sampling = scenario.task, scenario.sampling
-    observed = observed_structure(scenario, *law_robot(scenario, model, structure))
+    observed = observed_structure(scenario, model, structure)
     law = _law(scenario, observed, latency_of(scenario, model))
     references = [] if task is not None else _references(scenario.references, law)
     exogenous = []
@@ -77,7 +72,6 @@ def build_loop(
     limits = _limits(scenario, model)
 
     # The plant, which may have further exogenous signals.
-    feedback = task is None and can_be_fed_back(law, sampling, limits)
     of_plant = own_model(scenario, model.links) if plant is None else None
     plant_exogenous = None
     if of_plant is not None:
@@ -85,7 +79,7 @@ def build_loop(
         scene_graph = of_plant.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(of_plant.scenario, plant.dae, degrees)
-    plant = plant or make_plant(scenario, model, structure, feedback)
+    plant = plant or make_plant(scenario, model, structure)
 
     # The parts between plant and law; errors get the key of the part.
     with at("force_feedback"):
@@ -106,12 +100,11 @@ def build_loop(
     _check_parts(settings, plant)
 
     # The connections.
-    with at("law" if task is None else "task"):
-        controller = _controller(scenario, model, law, plant)
-        if controller is not None:
-            generator = None if task is not None else make_generator(references, law, settings)
+    if task is not None:
+        with at("task"):
+            controller = task_controller(scenario, model, law, settings.period(plant.time_step))
             return wire_loop(
-                plant, controller, generator, settings, scene_graph=scene_graph, meshcat=meshcat
+                plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
             )
     keys = ["observer"] if scenario.observer is not None else []
     keys += ["force_feedback"] if scenario.force_feedback.is_measured or keys else []
@@ -121,26 +114,10 @@ def build_loop(
         )
 
 
-def _controller(
-    scenario: Scenario, model: RobotModel, law: TrackingLaw, plant: Plant
-) -> Controller | None:
-    """The controller of a task or a cascade; None for the tracking law."""
-    sampling = scenario.sampling
-    period = plant.time_step if sampling is None else sampling.period
-    if scenario.task is not None:
-        return task_controller(scenario, model, law, period)
-    if scenario.spring_loop is None:
-        return None
-    assert sampling is not None  # law_robot.
-    lag = control_lag(plant, hold_before(plant, sampling))
-    return SpringCascade(law, model, scenario.spring_loop, period, lag, sampling.mean_delay)
-
-
 def make_plant(
     scenario: Scenario,
     model: RobotModel,
     structure: Structure,
-    feedback: bool = False,
 ) -> Plant:
     """Makes the plant of a scenario.
 
@@ -148,7 +125,6 @@ def make_plant(
         scenario: The scenario.
         model: The robot, with payloads if the plant does not add them itself.
         structure: The structure of the model's system.
-        feedback: Whether the plant may evaluate the law itself.
 
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
@@ -157,7 +133,6 @@ def make_plant(
     robot = RobotToSimulate(
         model,
         structure,
-        feedback,
         partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
         scenario.plant_parameters,
         scenario.plant_disturbances,
@@ -173,12 +148,11 @@ def _law(scenario: Scenario, structure: Structure, latency: float) -> TrackingLa
     force, damping = scenario.force_feedback, scenario.constraint_damping
     keys = ["force_feedback", "gains"] if force.is_measured else ["gains"]
     keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
-    stiffness = scenario.law.contact_stiffness if isinstance(scenario.law, Tracking) else None
-    if stiffness is not None:
-        keys = ["law", *keys]
+    if scenario.contact_stiffness is not None:
+        keys = ["contact_stiffness", *keys]
         if scenario.task is not None:
             text = "is not for scenarios with `task`; leave it out"
-            raise ScenarioError(("law.contact_stiffness", text))
+            raise ScenarioError(("contact_stiffness", text))
     with at(" or ".join(keys)):
         assert scenario.gains is not None  # advised.
         return TrackingLaw(
@@ -189,7 +163,7 @@ def _law(scenario: Scenario, structure: Structure, latency: float) -> TrackingLa
             force_gain=force.gain,
             constraint_damping=None if damping is None else damping.design(),
             integral=scenario.integral or (),
-            contact_stiffness=stiffness,
+            contact_stiffness=scenario.contact_stiffness,
             latency=latency,
         )
 

@@ -3,46 +3,9 @@
 from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.cascade.torque_loop import stages_of
-
-
-def law_robot(
-    scenario: Scenario, model: RobotModel, structure: Structure
-) -> tuple[RobotModel, Structure]:
-    """The model on which the law of a scenario is based, and the structure of its system.
-
-    Args:
-        scenario: The scenario.
-        model: Its robot.
-        structure: The structure of the robot's system.
-
-    Returns:
-        The model and structure given; for a cascade those of the links without springs and motors.
-
-    Raises:
-        ScenarioError: The cascade does not fit the scenario; the message names the key.
-    """
-    if not scenario.is_cascade:
-        return model, structure
-    with at("law"):
-        for key in ("task", "compliances", "control_weights", "parameters"):
-            value = getattr(scenario, key)
-            if value or (key == "compliances" and value is not None):
-                raise ModelError(
-                    f"a cascade does not know `{key}`: leave it out, or take !Tracking"
-                )
-        if scenario.sampling is None:
-            raise ModelError(
-                "a cascade is sampled; give the scenario a sampling, for example "
-                "sampling: {period: 0.001, delay: 0.001}"
-            )
-        stages_of(model)
-        links = link_side(model)
-        return links, find_structure(links.dae)
 
 
 def latency_of(scenario: Scenario, model: RobotModel) -> float:

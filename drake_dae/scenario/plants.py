@@ -32,7 +32,6 @@ class RobotToSimulate:
 
     Attributes:
         model, structure: The robot, and the structure of its system.
-        feedback: Whether the plant may evaluate the law itself.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
@@ -40,7 +39,6 @@ class RobotToSimulate:
 
     model: RobotModel
     structure: Structure
-    feedback: bool
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
@@ -96,7 +94,7 @@ class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        return RobotPlant(robot.model, structure=robot.structure, feedback=robot.feedback)
+        return RobotPlant(robot.model, structure=robot.structure)
 
 
 @checked(ModelError)

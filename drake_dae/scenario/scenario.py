@@ -14,7 +14,6 @@ from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
-from drake_dae.dae.beyond.spring_loop import SpringLoop
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -30,7 +29,6 @@ from drake_dae.scenario.parts.families import (
     FrictionCone,
     Gains,
     LargestErrors,
-    Law,
     Load,
     Observer,
     Output,
@@ -115,14 +113,13 @@ class Scenario:
         compliances: Constraint force -> its relative compliance, for redundant constraints: their
             forces are shared by least squares. {} is equal compliances; if left out, constraints
             must not be redundant.
-        law: The tracking law (28) of the whole robot, or a cascade for springs in the joints. By
-            default the tracking law; with springs in Drake's own contact and without `gains` the
-            cascade.
+        contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
+            of forces change within periods of the contact: its deflection is then fed ahead. It
+            needs rigid joints, and references, no task.
         gains: The gains of the tracking law (28). If left out: poles at -4 1/s with ideal
             constraints. With Drake's own contact gains are computed, see `advised`, together with
             `integral`, `constraint_damping`, `observer` and measured force if these are left out;
-            the scenario in the folder of the run contains them. With `actuation` the law must be
-            the cascade.
+            the scenario in the folder of the run contains them; not with `actuation`.
         integral: Names of outputs whose errors are integrated as well, with one more pole:
             positions, and forces if `force_feedback` is measured; none if left out while `gains`
             are given.
@@ -177,7 +174,7 @@ class Scenario:
     bounds: dict[str, Interval] = field(default_factory=dict)
     friction_cones: list[FrictionCone] = field(default_factory=list)
     compliances: dict[str, float] | None = None
-    law: Law | None = None
+    contact_stiffness: float | None = None
     gains: Gains | None = None
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
@@ -210,18 +207,6 @@ class Scenario:
             object.__setattr__(self, "gains", parts.Poles(all=[-4.0]))
         if self.integral is None:
             object.__setattr__(self, "integral", [])
-
-    @property
-    def is_cascade(self) -> bool:
-        """Whether the law is a cascade for springs."""
-        if self.law is not None:
-            return self.law.is_cascade
-        return self.is_advised and any(stage.is_spring for stage in self.actuation)
-
-    @property
-    def spring_loop(self) -> SpringLoop | None:
-        """The loop around the springs of a cascade, if all of its numbers are known; else None."""
-        return None if self.law is None else self.law.loop()
 
     @property
     def is_advised(self) -> bool:

@@ -17,8 +17,6 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
 
-_ADDED = "springs add: at most, after transients, with an exact model (singular perturbation)"
-
 WIDTH = 100
 """The width of a paragraph, in characters."""
 
@@ -72,7 +70,6 @@ def summary(
     failure: str = "",
     accuracy: float | None = None,
     reasons: Sequence[str] = (),
-    bound: FloatArray | None = None,
 ) -> str:
     """A summary of a run in plain text: its figures, compared with the prediction.
 
@@ -87,12 +84,10 @@ def summary(
         failure: The reason of the failure.
         accuracy: The accuracy of error control; None with fixed steps.
         reasons: Reasons for a deviation from the prediction, such as "the law is sampled".
-        bound: A bound of the errors that the controller adds to the prediction by design, shape
-            (p,); None if it adds none.
     """
     limits = limits or Limits()
     sections = [
-        _errors(record, predicted, bound),
+        _errors(record, predicted),
         _phases(record),
         _forces(record, limits),
         _controls(record, limits),
@@ -122,7 +117,7 @@ def summary(
     return "\n\n".join("\n".join(lines) for lines in [*sections, notes, verdict] if lines)
 
 
-def _errors(record: Record, predicted: FloatArray, bound: FloatArray | None) -> list[str]:
+def _errors(record: Record, predicted: FloatArray) -> list[str]:
     signals = record.signals["tracking_error"].signals
     if not signals:
         return []
@@ -141,10 +136,6 @@ def _errors(record: Record, predicted: FloatArray, bound: FloatArray | None) -> 
         "off prediction by: the largest deviation from the predicted error, which decays",
         "from its initial value by the gains alone",
     ]
-    if bound is not None:
-        head.append("springs add")
-        rows = [[*row, f"{number:.2g}"] for row, number in zip(rows, bound.tolist(), strict=True)]
-        notes.append(_ADDED)
     return [*Table(head, rows, left=2).lines(), *notes]
 
 

@@ -3,9 +3,9 @@
     python examples/unknown_friction [--robot FILE.urdf] [--only WORD]
 
 Every row is a run of 6 s at 1 kHz with one sample of delay, with the gains that are recommended
-(behind flexible joints for the cascade, and those of the scenario for the tracking law), and from a
-coefficient of friction of 0; the figures are root mean squares after 2 s: the distance from the
-path, the force error, and how much the torques change from sample to sample.
+(behind flexible joints those of the scenario), and from a coefficient of friction of 0; the figures
+are root mean squares after 2 s: the distance from the path, the force error, and how much the
+torques change from sample to sample.
 All have 2 s of motion to identify friction in, but "from rest to rest": that breaks away at 2.5 s
 for the first time. Beside them are the same law on the ideal plant, whose friction of 0.3 it does
 not know either, and the law of version 0.1 on points: poles at -8, and nothing else.
@@ -41,7 +41,6 @@ UNKNOWN = (
     POINT,
     LATE,
 )
-CASCADE = ("law=!SpringCascade {}", "gains=", "integral=", "observer=")
 TILTED = (
     "constraints.0.surface.normal=[-0.965925826, -0.258819045, 0.0]",
     "references={tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [1.0]},"
@@ -135,7 +134,6 @@ OTHERS = (
     Condition("a sphere", "seven_joint_dome", (*UNKNOWN, "start.errors={}")),
     Condition("two-link arm", "two_link_wall", (*UNKNOWN, "start.errors={}")),
     Condition("flexible joints", "wall_flexible_contact"),
-    Condition("flexible joints, a cascade", "wall_flexible_contact", CASCADE),
     Condition("the ideal plant", is_ideal=True),
 )
 FIRST = Condition("version 0.1", settings=("gains={all: [-8.0]}",), position=np.inf, force=np.inf)

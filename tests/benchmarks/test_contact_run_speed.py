@@ -73,7 +73,6 @@ def plant_alone(name, record):
     [
         ("wall_point_contact", "wall_point_contact", 2.5),
         ("wall_hydroelastic", "wall_hydroelastic", 1.3),
-        ("wall_flexible_contact", "wall_point_contact", 4.0),
     ],
 )
 def test_a_run_beside_its_plant(name, beside, wanted, compare):

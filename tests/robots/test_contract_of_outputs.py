@@ -74,12 +74,15 @@ def test_rows_are_independent_functions_of_the_positions(output):
 @pytest.mark.parametrize(
     ("output", "message"),
     [
-        (PointCoordinates("tol"), r"no frame 'tol'; did you mean 'tool'\?"),
-        (AxisCoordinates("tol", "z", "xy"), r"no frame 'tol'; did you mean 'tool'\?"),
-        (JointPositions(["joint9"]), r"no joint position 'joint9'; did you mean 'joint\d'\?"),
-        (TiltFromNormal(PointOnSurface("tol", WALL.surface), "z"), r"no frame 'tol'"),
-        (TiltFromNormal(CoincidentPoints("world", (0, 0, 0), "tool", (0, 0, 0)), "z"), "no normal"),
-        (SurfaceCoordinates(PointOnSurface("tol", WALL.surface)), r"no frame 'tol'"),
+        (PointCoordinates("tol"), "'tol'.*'tool'"),
+        (AxisCoordinates("tol", "z", "xy"), "'tol'"),
+        (JointPositions(["joint9"]), "'joint9'"),
+        (TiltFromNormal(PointOnSurface("tol", WALL.surface), "z"), "'tol'"),
+        (
+            TiltFromNormal(CoincidentPoints("world", (0, 0, 0), "tool", (0, 0, 0)), "z"),
+            "'pin'",
+        ),
+        (SurfaceCoordinates(PointOnSurface("tol", WALL.surface)), "'tol'"),
     ],
 )
 def test_what_is_unknown_is_named(output, message):
@@ -91,9 +94,9 @@ def test_what_is_unknown_is_named(output, message):
     ("axis", "components", "message"),
     [
         ("q", "", "axis"),
-        ("xy", "", "axis must be one of x, y, z, got 'xy'"),
-        ("z", "xz", "components must be of x and y, the axes normal to z, got 'xz'"),
-        ("z", "xx", "components"),
+        ("xy", "", "'xy'"),
+        ("z", "xz", "'xz'"),
+        ("z", "xx", "'xx'"),
     ],
 )
 def test_a_tilt_has_one_axis_and_components_across_it(axis, components, message):

@@ -74,11 +74,11 @@ def test_a_discrete_plant_takes_friction_implicitly():
     ("joints", "more", "message"),
     [
         (["joint9"], {}, "joint9"),
-        ([], {}, "each once"),
-        (["joint1", "joint1"], {}, "each once"),
-        (["joint1"], {"coulomb": -1.0}, "negative"),
-        (["joint1"], {"coulomb": [1.0, 2.0]}, "each of the 1 joints"),
-        (["joint1"], {"stiction_tolerance": 0.0}, "positive"),
+        ([], {}, "joints"),
+        (["joint1", "joint1"], {}, "joint1"),
+        (["joint1"], {"coulomb": -1.0}, "coulomb"),
+        (["joint1"], {"coulomb": [1.0, 2.0]}, "coulomb"),
+        (["joint1"], {"stiction_tolerance": 0.0}, "stiction_tolerance"),
     ],
 )
 def test_friction_that_makes_no_sense_is_refused(joints, more, message):

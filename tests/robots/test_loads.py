@@ -132,10 +132,10 @@ def test_a_law_that_knows_a_force_compensates_it(actuation):
 
 
 def test_frames_that_are_not_there_are_named():
-    with pytest.raises(ModelError, match="no frame 'tol'; did you mean 'tool'"):
+    with pytest.raises(ModelError, match="'tol'"):
         pushed(frame="tol")
     settings = ["known_forces=[{frame: tol}]"]
-    with pytest.raises(ScenarioError, match=r"known_forces.0: no frame 'tol'; did you mean 'tool'"):
+    with pytest.raises(ScenarioError, match=r"known_forces.0: .*'tol'"):
         build_scenario(load_scenario(find_scenario("two_link_wall"), settings))
 
 

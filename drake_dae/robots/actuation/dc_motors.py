@@ -55,10 +55,6 @@ class DcMotors(Stage):
                 raise ModelError(f"{parameter.name} must {rule}, got {parameter.value}")
         current = ca.SX.sym("I", p)
 
-        def drive_for(force: ca.SX, velocity: ca.SX, rate: ca.SX) -> ca.SX:
-            rule = force / (n * k_m)
-            return r * current + k_m * n * velocity + l * rate * (rule - current)
-
         return AttachedStage(
             state=current,
             state_signals=tuple(Signal(f"{name}.current", "A") for name in names),
@@ -69,5 +65,4 @@ class DcMotors(Stage):
             force=lambda position, velocity: n * k_m * current,  # (74)
             ports={"motor_current": slice(0, p)},
             parameters=(constant, inductance, resistance, gears),
-            drive_for=drive_for,
         )

@@ -1,7 +1,6 @@
 """Elastic transmissions.                                                   (64)-(65)"""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -11,7 +10,7 @@ from drake_dae.arguments import checked
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.numbers import full_matrix, matrix_parameter
-from drake_dae.robots.actuation.stage import AttachedStage, Spring, Stage
+from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links
 
 
@@ -30,8 +29,7 @@ class FlexibleJoints(Stage):
     the model has an acceleration a that the tool does not have, with a'' + K_i4 a' + (K_i3 - kappa)
     a = 0, the gains of (32) and the eigenvalues kappa of P M^-1 K_2 M^-1 P^T (P M^-1 P^T)^-1 for
     the Jacobian P of the held directions; so K_i3 = W^2 + 4 W w + w^2 must be above kappa. Model
-    springs that are too stiff for the sample time as rigid joints. A `SpringCascade` is a law that
-    needs no derivatives of the model.
+    springs that are too stiff for the sample time as rigid joints.
 
     The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4 for
     positions and 2 for forces; 3 and 1 with damping. Damping adds zero dynamics of dimension p,
@@ -58,7 +56,6 @@ class FlexibleJoints(Stage):
     damping: ArrayLike = 0.0
     friction: ArrayLike | None = None
     stiction_tolerance: float = 0.01
-    is_spring: ClassVar[bool] = True
 
     def attach(self, links: Links) -> AttachedStage:
         names = [signal.name for signal in links.actuator_signals]
@@ -114,7 +111,6 @@ class FlexibleJoints(Stage):
             carries_rotors=True,
             ports={"motor_state": slice(0, 2 * p)},
             parameters=tuple(parameters),
-            spring=Spring(k, d, m_2),
         )
 
     def _friction(self, p: int, rotary: bool) -> tuple[Parameter, Parameter]:

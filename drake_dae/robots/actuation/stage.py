@@ -8,26 +8,11 @@ by the control. All positions, velocities and forces are on the joints' side of 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import casadi as ca
 
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.robots.links.links import Links
-
-
-@dataclass(frozen=True, eq=False)
-class Spring:
-    """The springs between a load and a shaft: a force K (q_2 - q) + D (q_2' - q') on the load.
-
-    Attributes:
-        stiffness, damping: K and D, shape (p, p).
-        inertia: That of the shafts, B, shape (p, p).
-    """
-
-    stiffness: ca.SX
-    damping: ca.SX
-    inertia: ca.SX
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +31,6 @@ class AttachedStage:
         ports: Output port of the plant -> its entries of s.
         shaft: Position and velocity of the shaft that a next stage drives; None without a shaft.
         carries_rotors: Whether the plant's rotors move with it instead of the links.
-        spring: The springs, of a stage that is nothing else; else None.
-        drive_for: Takes a wanted force on the load, the load's velocity and a rate k in 1/s;
-            returns the drive with which the force follows the wanted one as F' = k (F_d - F). None
-            where there is none.
     """
 
     state: ca.SX
@@ -63,8 +44,6 @@ class AttachedStage:
     ports: Mapping[str, slice] = field(default_factory=dict)
     shaft: tuple[ca.SX, ca.SX] | None = None
     carries_rotors: bool = False
-    spring: Spring | None = None
-    drive_for: Callable[[ca.SX, ca.SX, ca.SX], ca.SX] | None = None
 
 
 class Stage(ABC):
@@ -80,10 +59,7 @@ class Stage(ABC):
     4. Another stage can drive it exactly if there is a `shaft`; its drive is then a force.
     5. At rest, the drive can balance any force on the load: s' = 0 has a solution (s, drive).
     6. Names of states and ports are unique in a chain. At most one stage carries the rotors.
-    7. `is_spring` says whether it is springs alone, so that it has a `Spring` when attached.
     """
-
-    is_spring: ClassVar[bool] = False
 
     @abstractmethod
     def attach(self, links: Links) -> AttachedStage:

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from drake_dae.dae.beyond.contact_gains import ContactGains, contact_gains
-from drake_dae.dae.beyond.spring_loop import contact_gains_behind
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.tracking.constraint_damping import damping_gains
 from drake_dae.errors import ScenarioError
@@ -18,17 +17,18 @@ from drake_dae.scenario.advice.sensed import (
     predicted,
     sensed_contact,
 )
-from drake_dae.scenario.advice.springs import NOISE, loop_note, rounded, velocity_noise, with_loop
-from drake_dae.scenario.advice.touch import Touching, reaction_time
+from drake_dae.scenario.advice.touch import Touching, reaction_time, rounded
 from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.observed import law_robot
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.scenario import Scenario
 
 _SOFTER = 5.0
 """The ratio of the poles of positions to those of the distance, of a robot without contact."""
+
+NOISE = 1e-3
+"""The standard deviation of velocity noise in rad/s, without encoders."""
 
 _FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
@@ -59,8 +59,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     It computes gains, integrals of forces and of points, constraint damping, an observer of
     disturbance and friction, and measured force, each if it is left out; and for a task the gains
     without contact, soft along the distance. With encoders and rigid joints the gains are those of
-    `advised_gains` for the noise of the encoders; otherwise those of `contact_gains`, or for a
-    cascade of `contact_gains_behind`. A scenario with `gains`, or with ideal contact, is unchanged.
+    `advised_gains` for the noise of the encoders; otherwise those of `contact_gains`. A scenario
+    with `gains`, or with ideal contact, is unchanged.
 
     Args:
         scenario: The scenario, with all of its outputs.
@@ -76,16 +76,12 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     """
     material = scenario.plant.material
     _check_bounds(scenario)
-    if scenario.is_cascade:
-        scenario = with_loop(scenario)
-        model, structure = law_robot(scenario, model, structure)
     if material is None or not scenario.is_advised:
         return Completed(scenario)
     if model.stages:
         text = (
-            "for Drake's own contact no gains are computed if the robot has motors or valves, or "
-            "springs with the tracking law. Give gains, integral and observer, as in the scenario "
-            "wall_flexible_contact. For springs you can leave out `law` instead"
+            "no gains are computed if the robot has springs, motors or valves. Give gains, "
+            "integral and observer, as in the scenario wall_flexible_contact"
         )
         raise ScenarioError(("gains", text))
     sampling = scenario.sampling
@@ -99,12 +95,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     late = 0 if sampling is None else sampling.late_samples
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
     stiffness = material.stiffness_on(model, _FORCE)
-    fast, noise = None, velocity_noise(scenario, period)
-    known_by, outlook = f"velocities within {noise:.2g} rad/s", ""
-    loop = scenario.spring_loop
-    if loop is not None:
-        contact = contact_gains_behind(loop, stiffness, mobility, period, late, noise)
-    elif scenario.encoders is None:
+    fast = None
+    known_by, outlook = f"velocities within {NOISE:.2g} rad/s", ""
+    if scenario.encoders is None:
         contact = contact_gains(stiffness, mobility, period, late, NOISE)
     else:
         sensed = sensed_contact(scenario, model, structure, (period, late), stiffness)
@@ -179,7 +172,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"{-rounded(contact.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
         f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an observer of "
         f"{observer.rate:g} 1/s that identifies the friction of: {identified}{estimated}"
-        f"{loop_note(scenario)}{outlook}"
+        f"{outlook}"
         f"{touch_note}"
     )
     return Completed(chosen, (note,))
@@ -191,7 +184,7 @@ def _check_bounds(scenario: Scenario) -> None:
     Raises:
         ScenarioError: One is not, or is not positive.
     """
-    is_used = scenario.is_advised and scenario.encoders is not None and not scenario.is_cascade
+    is_used = scenario.is_advised and scenario.encoders is not None
     for name in ("largest_roughness", "largest_errors"):
         if getattr(scenario, name) is not None and not is_used:
             text = (

@@ -9,7 +9,6 @@ from scipy.linalg import expm
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references import Reference
-from drake_dae.scenario.advice.springs import rounded
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.task.fade import fade
@@ -48,6 +47,11 @@ def reaction_time(sampling: Sampling | None, step: float) -> float:
     if sampling.measurements is not None:
         lost += sampling.measurements.longest
     return sampling.period * (1 + sampling.late_samples + lost)
+
+
+def rounded(value: float) -> float:
+    """Returns a recommended number, rounded to three digits for a scenario file."""
+    return float(f"{value:.3g}")
 
 
 @dataclass(frozen=True)

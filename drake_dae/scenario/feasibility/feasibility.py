@@ -11,26 +11,22 @@ from drake_dae.analysis.analyze import along, analyze, examine
 from drake_dae.analysis.limits import limits_along
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.reference import common_period
-from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
 from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
-from drake_dae.robots.link_side import link_side
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.limits import robot_limits
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
-from drake_dae.scenario.feasibility.springs import spring_laws
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.loop import build_loop, exogenous_references
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
-from drake_dae.scenario.observed import law_robot
-from drake_dae.scenario.parts.parts import Poles, Tracking
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.robot_file.links import RobotLinks
 from drake_dae.scenario.scenario import Scenario
@@ -96,7 +92,7 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
     """The feasibility of a completed scenario with its model."""
     examined = None
     try:
-        if scenario.task is None and not scenario.is_cascade:
+        if scenario.task is None:
             examined = examine_scenario(model)
         if examined is None or examined.structure is None or examined.problems:
             structure = scenario_structure(model)
@@ -107,22 +103,6 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
     gains = _without_gains(scenario, model, structure)
     if scenario.task is not None:
         return Feasibility(analyze(model.dae), scenario.duration, gains=gains)
-    laws = None
-    if scenario.is_cascade:
-        # The requirements of the links, as if they were rigid.
-        links, structure = law_robot(scenario, model, structure)
-        laws = spring_laws(scenario, model, links, structure)
-        model = links
-        scenario = replace(
-            scenario,
-            law=Tracking(),
-            gains=Poles(all=[-4.0]),
-            integral=[],
-            plant_parameters={},  # Their names may be those of springs.
-        )
-    elif scenario.actuation and scenario.actuation[0].is_spring and scenario.sampling is not None:
-        links = link_side(model)
-        laws = spring_laws(scenario, model, links, find_structure(links.dae))
     # The law's model, without differences of the plant.
     ideal = replace(
         scenario,
@@ -162,7 +142,6 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
         *(((), (), (), ()) if motion is None else _ranges(motion, model)),
         is_resolved=is_resolved,
         behind=() if motion is None else _in_the_way(motion, model, scene_graph),
-        laws=laws,
         sticking=(
             ""
             if motion is None

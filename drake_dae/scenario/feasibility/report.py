@@ -12,7 +12,6 @@ from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.geometry.clearances import LinkBehind
 from drake_dae.robots.geometry.shapes import Collision
-from drake_dae.scenario.feasibility.springs import SpringLaws
 
 WRONG_SIDE = (
     ": turn its normal around if its free side is the other one, or choose another posture or place"
@@ -82,7 +81,6 @@ class Feasibility:
             known.
         behind: Links that move behind a contact surface, and links that collide; see `links_behind`
             and `collisions`.
-        laws: The requirements of two laws for springs; None without springs or samples.
         sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
         gains: Why no gains can be computed where they are left out, else empty.
         slowing: How much slower the references keep all limits; None where they keep them.
@@ -96,7 +94,6 @@ class Feasibility:
     joints: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
     behind: tuple[LinkBehind | Collision, ...] = ()
-    laws: SpringLaws | None = None
     sticking: str = ""
     gains: str = ""
     slowing: LimitsAlong | None = None
@@ -148,7 +145,6 @@ class Feasibility:
                 for key in ("controls", "joint_forces", "constraint_forces", "joints")
             },
             "behind": [asdict(link) for link in self.behind],
-            "spring_laws": None if self.laws is None else self.laws.to_dict(),
             "sticking": self.sticking,
             "slowing": None if self.slowing is None else asdict(self.slowing),
             "problems": list(self.problems),
@@ -171,8 +167,6 @@ class Feasibility:
                     "known. A shorter duration takes them closer together."
                 )
             parts.append([text])
-        if self.laws is not None:
-            parts.append(self.laws.lines)
         if self.sticking:
             parts.append([self.sticking])
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])

@@ -95,7 +95,6 @@ Load = Annotated[
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 FrictionCone = Annotated[friction.FrictionCone, Form(_WRITTEN)]
-Law = Annotated[parts.Tracking | parts.SpringCascadeForm, Choice()]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
     plants.IdealConstraints | plants.MultibodyPlant | plants.CompliantContact | plants.OwnPlant,

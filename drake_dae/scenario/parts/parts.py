@@ -6,7 +6,6 @@ from typing import ClassVar
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import positive
-from drake_dae.dae.beyond.spring_loop import DAMPING, SpringLoop
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.scenario.forms.values import Numbers
@@ -68,66 +67,6 @@ class MeasuredForce:
     def begin(self, sensor: ForceSensor, context: Context) -> None:
         """Sets the sensor's errors in its context."""
         sensor.set_errors(context, self.bias, self.noise_deviation, self.drift)
-
-
-@dataclass(frozen=True)
-class Tracking:
-    """The tracking law (28) of the whole robot; with springs it differentiates four times.
-
-    Attributes:
-        contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
-            of forces change within periods of the contact: its deflection is then fed ahead. It
-            needs rigid joints, and references, no task.
-    """
-
-    contact_stiffness: float | None = None
-    is_cascade: ClassVar = False
-
-    def loop(self) -> SpringLoop | None:
-        """None, since there is no loop around springs."""
-        return None
-
-
-@dataclass(frozen=True)
-class SpringCascadeForm:
-    """The tracking law for the links without springs, and an inner loop around the springs.
-
-    It is a `SpringCascade`. It needs `sampling`, and in `actuation` FlexibleJoints, perhaps
-    followed by DcMotors. `gains`, `integral` and `observer` are those of the law for the links; if
-    `gains` are left out in compliant contact, default values of all are computed.
-
-    Attributes:
-        rate: The rate of the inner loop in rad/s, the same for all joints; computed if left out.
-        damping: The damping ratio of the inner loop.
-        motor_rate: The rate in 1/s at which friction and other disturbances of the motors are
-            observed and compensated; the rate of the loop if left out, 0 for none.
-        current_rate: The rate in 1/s of currents behind the springs, if there are any; computed if
-            left out.
-    """
-
-    rate: float | None = None
-    damping: float = DAMPING
-    motor_rate: float | None = None
-    current_rate: float | None = None
-    is_cascade: ClassVar = True
-
-    def __post_init__(self) -> None:
-        rates = [self.rate, self.motor_rate, self.current_rate]
-        rate, *others = [1.0 if number is None else number for number in rates]
-        SpringLoop(rate, self.damping, *others)
-
-    def filled(self, numbers: SpringLoop) -> "SpringCascadeForm":
-        """A copy with these numbers in place of numbers that are left out."""
-        rate = numbers.rate if self.rate is None else self.rate
-        motor_rate = rate if self.motor_rate is None else self.motor_rate
-        current_rate = numbers.current_rate if self.current_rate is None else self.current_rate
-        return SpringCascadeForm(rate, self.damping, motor_rate, current_rate)
-
-    def loop(self) -> SpringLoop | None:
-        """The inner loop; None if one of its numbers is left out."""
-        if self.rate is None or self.motor_rate is None or self.current_rate is None:
-            return None
-        return SpringLoop(self.rate, self.damping, self.motor_rate, self.current_rate)
 
 
 @dataclass(frozen=True)

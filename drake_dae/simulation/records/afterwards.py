@@ -81,10 +81,8 @@ def _control_along(
     loop: RecordedLoop, context: Context, times: FloatArray, inputs: dict[str, FloatArray]
 ) -> FloatArray:
     """The control of a continuous law, as a function of the other signals."""
-    plant, controller, law = loop.plant, loop.controller, loop.controller.law
-    gains = plant.laws_along(plant.GetMyContextFromRoot(context), times)
-    if gains is None:
-        gains = _parameters_along(loop, controller, context, times)
+    plant, law = loop.plant, loop.controller.law
+    gains = _parameters_along(loop, loop.controller, context, times)
     if law.measured_force and "measured_force" not in inputs:
         # Without a sensor; a law that only integrates the force does not need it here.
         inputs["measured_force"] = (
@@ -92,8 +90,7 @@ def _control_along(
             if law.control_takes_force
             else np.zeros((times.size, plant.dae.num_constraints))
         )
-    inputs["parameters"] = gains
-    return function_along(law.function, inputs)
+    return function_along(law.function, {**inputs, "parameters": gains})
 
 
 def _parameters_along(
@@ -112,25 +109,19 @@ def _along(generator: ReferenceGenerator, times: FloatArray, context: Context) -
 
 
 def _refuse_fixed_ports(loop: RecordedLoop, context: Context) -> None:
-    plant, controller = loop.plant, loop.controller
+    controller = loop.controller
     at_controller = controller.GetMyContextFromRoot(context)
     sources = {"estimated_state": loop.state_source}
     if loop.generator is not None:
         sources["reference"] = loop.generator.GetOutputPort("reference")
     for name, source in sources.items():
         port = controller.GetInputPort(name)
-        if not port.HasValue(at_controller):
-            continue  # The law has its references, and is used at `feedback`.
         try:
             value = source.Eval(source.get_system().GetMyContextFromRoot(context))
         except DrakeDaeError:
             continue  # At the failure of a run.
         if not np.array_equal(value, port.Eval(at_controller), equal_nan=True):
             raise _fixed(name, controller)
-    if plant.HasInputPort("feedback"):
-        at_plant, port = plant.GetMyContextFromRoot(context), plant.GetInputPort("control")
-        if plant.GetInputPort("feedback").HasValue(at_plant) and port.HasValue(at_plant):
-            raise _fixed("control", plant)
 
 
 def _fixed(port: str, block: System) -> WiringError:

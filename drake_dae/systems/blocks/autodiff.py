@@ -10,18 +10,15 @@ from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector_,
     Context,
     ContinuousState,
     LeafSystem,
     LeafSystem_,
-    PortDataType,
 )
 
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.feedback import Immutable, nothing
 from drake_dae.systems.blocks.formulas import Formula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 
@@ -34,7 +31,6 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         formulas: Name of an output port -> its formula; "derivative" -> that of the time
             derivative.
         places: The indices of parameters that come from an input port `exogenous`.
-        references: The value of the input port `reference` without a wire; None if it needs one.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -44,7 +40,6 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         original: LeafSystem,
         formulas: Mapping[str, Formula],
         places: Sequence[int] = (),
-        references: Formula | None = None,
     ) -> None:
         super().__init__()
         self.set_name(original.get_name())
@@ -56,7 +51,7 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             state = context.get_continuous_state_vector().CopyToVector()
             self.DeclareContinuousState(BasicVector_[AutoDiffXd](state))
             self._rate = formulas["derivative"]
-        self._places, self._references = list(places), references
+        self._places = list(places)
         tickets = {
             "time": {self.time_ticket()},
             "state": {self.xc_ticket()},
@@ -65,25 +60,11 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
         for i in range(original.num_input_ports()):
             port = original.get_input_port(i)
             name = port.get_name()
-            if port.get_data_type() == PortDataType.kAbstractValued:
-                self.DeclareAbstractInputPort(name, nothing())
-            else:
-                self.DeclareVectorInputPort(name, port.size())
+            self.DeclareVectorInputPort(name, port.size())
             tickets[name] = {self.input_port_ticket(port.get_index())}
-        of_reference = set(tickets.get("reference", ()))
-        if references is not None:
-            tickets["reference"] |= tickets["time"]
-        if "feedback" in tickets:
-            tickets["control"] |= tickets["feedback"] | tickets["time"] | tickets["state"]
         for i in range(original.num_output_ports()):
             port = original.get_output_port(i)
             name = port.get_name()
-            if port.get_data_type() == PortDataType.kAbstractValued:
-                self._law = formulas["control"]
-                self.DeclareAbstractOutputPort(
-                    name, nothing, weakly(self._calc_feedback), tickets["parameters"] | of_reference
-                )
-                continue
             if name not in formulas:
                 raise ModelError(
                     f"{original.get_name()} does not convert to AutoDiffXd: its output port "
@@ -113,47 +94,12 @@ class AutoDiffSystem(LeafSystem_[AutoDiffXd]):
             if self._places and self.GetInputPort("exogenous").HasValue(context):
                 values[self._places] = self.GetInputPort("exogenous").Eval(context)
             return values
-        port, time = self.GetInputPort(name), context.get_time()
-        if name == "reference" and self._references is not None and not port.HasValue(context):
-            return _chained(self._references, time, [np.array([time])])
-        if name == "control" and self.HasInputPort("feedback") and not port.HasValue(context):
-            feedback = self.GetInputPort("feedback").Eval(context)
-            return feedback.control(time, self._source("state", context))
-        return port.Eval(context)
+        return self.GetInputPort(name).Eval(context)
 
     def _evaluate(self, formula: Formula, context: Context) -> Any:
         """The value with its gradient, an array of AutoDiffXd."""
         arguments = [self._source(name, context) for name in formula.sources]
         return _chained(formula, context.get_time(), arguments)
-
-    def _calc_feedback(self, context: Context, value: AbstractValue) -> None:
-        port, constants = self.GetInputPort("reference"), {}
-        if port.HasValue(context):
-            constants["reference"] = port.Eval(context)
-        constants["parameters"] = self._source("parameters", context)
-        value.set_value(_Feedback(self._law, self._references, constants))
-
-
-class _Feedback(Immutable):
-    """A law as the value of a port, as `Feedback`.
-
-    Args:
-        law: The law.
-        references: Its references as a function of time.
-        constants: Its parameters; and its references, if they are fixed.
-    """
-
-    def __init__(
-        self, law: Formula, references: Formula | None, constants: Mapping[str, Any]
-    ) -> None:
-        self._law, self._references, self._constants = law, references, constants
-
-    def control(self, time: AutoDiffXd, state: Any) -> Any:
-        """u at a time and a state, an array of AutoDiffXd."""
-        inputs = {"estimated_state": state, **self._constants}
-        if "reference" not in inputs and self._references is not None:
-            inputs["reference"] = _chained(self._references, time, [np.array([time])])
-        return _chained(self._law, time, [inputs[name] for name in self._law.sources])
 
 
 def _chained(formula: Formula, time: AutoDiffXd, arguments: Sequence[Any]) -> Any:

@@ -82,11 +82,6 @@ class DifferentiableSystem(LeafSystem):
     def _formulas(self) -> dict[str, Formula]:
         raise NotImplementedError
 
-    @property
-    def references_by_time(self) -> Formula | None:
-        """The value of an input port `reference` without a wire; None if it needs one."""
-        return None
-
     def check_context(self, context: Context) -> None:
         """Refuses the context of another system.
 
@@ -290,4 +285,4 @@ def _shown(port: InputPort | OutputPort) -> str:
 def _converted(original: DifferentiableSystem) -> AutoDiffSystem:
     """A block on AutoDiffXd."""
     places = original.exogenous_places if isinstance(original, ParameterizedSystem) else []
-    return AutoDiffSystem(original, original.formulas, places, original.references_by_time)
+    return AutoDiffSystem(original, original.formulas, places)

@@ -132,17 +132,15 @@ class Guard:
 class DrakeStepped:
     """The part of a block that is not traced: Drake steps it at t_k = k period.
 
-    The first entries of the block's HELD are the values of some output ports of that system,
-    stacked. They change only at t_k, like by an unrestricted update; its step depends on them, on
-    one of its input ports at t_k, and on t_k. Other entries have updates as usual.
+    The block's HELD are the values of some of its output ports, stacked. They change only at t_k,
+    like by an unrestricted update; its step depends on them, on one of its input ports at t_k, and
+    on t_k.
 
     Attributes:
-        system: The system that Drake steps: the block, or a diagram in it.
+        system: The system that Drake steps.
         period: The period, in s.
         ports: The names of these output ports.
         into: The name of that input port.
-        reads: The source of that input port: the name of an input port of the block, or of an
-            output of one of its computations.
         held: The context of the block -> HELD, shape (size,).
         put: (context of the system, HELD) -> None; sets the state before a step.
         read: (context of the system, array) -> None; writes the values of these output ports,
@@ -154,7 +152,6 @@ class DrakeStepped:
     period: float
     ports: tuple[str, ...]
     into: str
-    reads: str
     held: Callable[[Context], FloatArray]
     put: Callable[[Context, FloatArray], None]
     read: Callable[[Context, FloatArray], None]

@@ -71,7 +71,6 @@ class RunProgress:
         mark: The time after the last `PACE_STEPS` steps, in s.
         parameters: The numeric parameters of the block, each with the time in s after which it had
             them.
-        laws: Likewise those of the law that is fed back to it, if any.
         entry: The cache entry of this value, since looking it up takes longer.
     """
 
@@ -83,13 +82,10 @@ class RunProgress:
     steps: int = 0
     mark: float = 0.0
     parameters: list[tuple[float, FloatArray]] = field(default_factory=list)
-    laws: list[tuple[float, FloatArray]] = field(default_factory=list)
     entry: CacheEntry | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "RunProgress":
-        return replace(
-            self, state=self.state.copy(), parameters=list(self.parameters), laws=list(self.laws)
-        )
+        return replace(self, state=self.state.copy(), parameters=list(self.parameters))
 
 
 class StepWatch:
@@ -143,27 +139,6 @@ class StepWatch:
         """The numeric parameters of the block at accepted times, in s, one row for each."""
         return _along(self._progress(context).parameters or [(0.0, _parameters(context))], times)
 
-    def note_law(self, context: Context, parameters: FloatArray, begins: bool = False) -> None:
-        """Stores the parameters of the law from the last accepted state on.
-
-        Args:
-            context: The context.
-            parameters: The parameters; the array must not be changed.
-            begins: Whether a simulation begins; without one nothing is stored.
-        """
-        progress = self._progress(context)
-        if begins:
-            before = float(np.nextafter(context.get_time(), -inf))
-            progress.laws = [entry for entry in progress.laws if entry[0] < before]
-            _add(progress.laws, before, parameters)
-        elif progress.laws:
-            _add(progress.laws, progress.time, parameters)
-
-    def laws_along(self, context: Context, times: FloatArray) -> FloatArray | None:
-        """The parameters of the law at accepted times, in s, one row for each; None if unknown."""
-        laws = self._progress(context).laws
-        return _along(laws, times) if laws else None
-
     def _progress(self, context: Context) -> RunProgress:
         # The object is not replaced, and is changed in place.
         progress: RunProgress = self._system.get_cache_entry(self._index).Eval(context)
@@ -178,10 +153,7 @@ class StepWatch:
             _add(parameters, before, _parameters(context))
         entry = self._system.get_cache_entry(self._index)
         self._entry = ref(entry)
-        laws = progress.laws
-        begun = RunProgress(
-            time, start=time, mark=time, parameters=parameters, laws=laws, entry=entry
-        )
+        begun = RunProgress(time, start=time, mark=time, parameters=parameters, entry=entry)
         vars(progress).update(vars(begun))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()

@@ -59,15 +59,11 @@ class Controller(System):
        reference, forces, integrals and parameters. Otherwise it is logged. `derived` are further
        signals of a record, computed from the others. `compared` are outputs and their references
        now, for the check of divergence.
-    6. Theory. `predicted_error` is the predicted tracking error of a record, and `error_bound` a
-       bound of what the controller adds to it by design; None if it adds nothing.
+    6. Theory. `predicted_error` is the predicted tracking error of a record.
     7. Starts. With `takes_over` its references start at the current outputs; otherwise they come
        from a generator, and a run starts at their start. A run starts on the manifold of
        `start_structure`.
-    8. Observers. A controller whose law has another state and control than the plant names its
-       output ports with these in `observed`, and has the input port `acting_control` for what acts
-       on the plant. None if they are those of the plant.
-    9. Phases. `changes` are the times at which phases of a run began, with reasons, and
+    8. Phases. `changes` are the times at which phases of a run began, with reasons, and
        `phase_names` the names of the phases and of the rest after them; both are empty without
        phases.
     """
@@ -82,11 +78,6 @@ class Controller(System):
     takes_over: bool = False
     exogenous_layout: DerivativeLayout = DerivativeLayout(())
     exogenous_places: list[int] = NOWHERE
-
-    @property
-    def observed(self) -> tuple[str, str] | None:
-        """The output ports with state and control of the law; None if they are the plant's."""
-        return None
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
@@ -169,18 +160,6 @@ class Controller(System):
             parameters: Those of the law's model at its start.
         """
         raise NotImplementedError
-
-    def error_bound(
-        self, reference: Callable[[float], FloatArray], times: FloatArray, state: FloatArray
-    ) -> FloatArray | None:
-        """A bound of the error beside the predicted one, for each output, shape (p,); None if none.
-
-        Args:
-            reference: The function t -> R(t).
-            times: The times of a record, in s, shape (k,).
-            state: The state of the plant at the first of them, shape (n,).
-        """
-        return None
 
     def changes(self, context: Context) -> tuple[PhaseChange, ...]:
         """The start of each phase of a run, with the reason."""

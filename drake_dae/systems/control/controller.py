@@ -1,12 +1,9 @@
 """The tracking law as a LeafSystem."""
 
 from collections.abc import Mapping, Sequence
-from functools import cache
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -23,14 +20,12 @@ from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.feedback import Feedback, nothing
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.control.non_minimum_phase import warn_of_zero_dynamics
-from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.control.traced_law import traced_law
 from drake_dae.trace.functions import TracedFunction
 
@@ -54,9 +49,6 @@ class TrackingController(ParameterizedSystem, Controller):
             `hold` is not 0, or while it is at its limit and its error would increase it
             (anti-windup).
 
-        feedback: The law with its references and parameters as a value, for the port `feedback` of
-            a `DaePlant`; with feedback=True.
-
     A law with integrals also has an input port `hold`, shape (k,): an error is not integrated while
     its entry is not 0, for example while a drive is at its limit or a contact is lost. Without a
     wire it is 0.
@@ -73,29 +65,18 @@ class TrackingController(ParameterizedSystem, Controller):
             integrated force must come from a sensor.
         sample_period: The sample period of integrals in s, as for discrete plants; they then do
             not convert. 0 for continuous integrals.
-        references: R if the port `reference` has no wire; None if it needs one.
-        feedback: Whether there is an output port `feedback`, for a law that takes only the state
-            and `references`. The other ports are then for logging.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
 
     Raises:
-        ModelError: The law cannot be fed back, or a limit or period is not valid.
+        ModelError: A limit or period is not valid.
         SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
         NonFiniteError: A value is not finite on the way, likewise.
     """
 
     __slots__ = SHARED_DICTIONARY
     follows, shown = True, ("tracking_error",)
-
-    def __new__(cls, *arguments: Any, **named: Any) -> Self:
-        """Uses a class with a time derivative if the integrals are continuous."""
-        law = arguments[0] if arguments else named.get("law")
-        integral = getattr(law, "integral", None)  # __init__ refuses anything else than a law.
-        if integral is None or not integral.outputs or named.get("sample_period"):
-            return super().__new__(cls)
-        return super().__new__(_integrating(cls))  # type: ignore[arg-type]
 
     def __init__(
         self,
@@ -104,8 +85,6 @@ class TrackingController(ParameterizedSystem, Controller):
         integral_limits: ArrayLike = np.inf,
         *,
         sample_period: float = 0.0,
-        references: ReferenceGenerator | None = None,
-        feedback: bool = False,
     ) -> None:
         dae = law.system
         signals = {
@@ -113,7 +92,7 @@ class TrackingController(ParameterizedSystem, Controller):
             "reference": law.reference_signals,
             "measured_force": dae.constraint_input_signals,
         }
-        super().__init__(dae, law.all_parameters(), signals, sees_steps=not feedback)
+        super().__init__(dae, law.all_parameters(), signals)
         warn_of_zero_dynamics(law, outputs)
         self.law = law
         self.set_name("tracking_controller")
@@ -121,20 +100,12 @@ class TrackingController(ParameterizedSystem, Controller):
         if law.measured_force:
             sizes["measured_force"] = dae.num_constraints
         self._evaluators = [self.DeclareVectorInputPort(*item).Eval for item in sizes.items()]
-        self._references = references
-        if references is not None:
-            self._reference_at = references.by_time
-            self._reference_port = self.GetInputPort("reference")
-            self._evaluators[1] = weakly(self.reference_now)
         self._declare_exogenous(law.exogenous_degrees)
         sources = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
+        self._integrates = bool(law.integral.outputs and not sample_period)
         if law.integral.outputs:
             sources = self._add_integrals(integral_limits, sample_period)
         self._is_plain = len(self._evaluators) == 2 and self._exogenous is None
-        if references is not None:
-            sources.add(self.time_ticket())
-        if feedback:
-            self._declare_feedback()
         self.DeclareVectorOutputPort(
             "control", dae.num_controls, weakly(self._calc_control), sources
         )
@@ -196,6 +167,10 @@ class TrackingController(ParameterizedSystem, Controller):
         summed = self._integrals(context) + self.sample_period * self._integral_rate(context)
         state.get_mutable_discrete_state().set_value(0, summed)
         return EventStatus.Succeeded()
+
+    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
+        if self._integrates:  # Drake also calls this without a continuous state.
+            derivatives.get_mutable_vector().SetFromVector(self._integral_rate(context))
 
     def _integral_rate(self, context: Context) -> FloatArray:
         inputs = [evaluate(context) for evaluate in self._rate_evaluators]
@@ -264,38 +239,6 @@ class TrackingController(ParameterizedSystem, Controller):
         inputs = [evaluate(context) for evaluate in self._evaluators]
         return self._checked(function, context, *inputs)
 
-    def _declare_feedback(self) -> None:
-        if self._references is None or not self._is_plain:
-            raise ModelError(
-                f"{self.dae.name}: a law that is fed back needs references, and takes no measured "
-                "force, integral or exogenous signals"
-            )
-        port = self.input_port_ticket(self._reference_port.get_index())
-        self.DeclareAbstractOutputPort(
-            "feedback", nothing, weakly(self._calc_feedback), {self.all_parameters_ticket(), port}
-        )
-
-    def _calc_feedback(self, context: Context, value: AbstractValue) -> None:
-        parameters = np.array(context.get_numeric_parameter(0).value())
-        reference = self._reference_at
-        if self._reference_port.HasValue(context):
-            fixed = self._reference_port.Eval(context)
-
-            def reference(time: float) -> FloatArray:
-                return fixed
-
-        value.set_value(Feedback(self.law.function, reference, parameters, self._signals))
-
-    def reference_now(self, context: Context) -> FloatArray | None:
-        if self._references is None or self._reference_port.HasValue(context):
-            return super().reference_now(context)
-        return self._reference_at(context.get_time())
-
-    @property
-    def references_by_time(self) -> Formula | None:
-        """R if the input port `reference` has no wire; None if it needs one."""
-        return None if self._references is None else self._references.formulas["reference"]
-
     def _integrals(self, context: Context) -> FloatArray:
         if self.sample_period:
             return context.get_discrete_state(0).CopyToVector()
@@ -305,9 +248,7 @@ class TrackingController(ParameterizedSystem, Controller):
         limits, period = np.zeros(0), 0.0
         if self.law.integral.outputs:
             limits, period = self._limits, self.sample_period
-        return traced_law(
-            self, self.law, self._references, limits, period, self.exogenous_places, self._signals
-        )
+        return traced_law(self, self.law, limits, period, self.exogenous_places, self._signals)
 
     def _formulas(self) -> dict[str, Formula]:
         function = self.law.function
@@ -331,16 +272,3 @@ class TrackingController(ParameterizedSystem, Controller):
                 TracedFunction("integral", {"state": sigma}, {"value": sigma})
             )
         return formulas
-
-
-@cache
-def _integrating(kind: type[TrackingController]) -> type[TrackingController]:
-    """A class of controllers with a time derivative.
-
-    Drake would otherwise call it also without a state, which takes 10 % of a short step.
-    """
-
-    def rate(self: TrackingController, context: Context, derivatives: ContinuousState) -> None:
-        derivatives.get_mutable_vector().SetFromVector(self._integral_rate(context))
-
-    return type(kind.__name__, (kind,), {"__slots__": (), "DoCalcTimeDerivatives": rate})

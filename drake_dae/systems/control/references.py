@@ -104,25 +104,6 @@ class ReferenceGenerator(DifferentiableSystem):
         function = self.function if context is None else self._in(context)
         return signal_along(function, self.get_output_port().size(), moments)
 
-    @property
-    def is_by_time(self) -> bool:
-        """Whether R follows from the time alone."""
-        return self.follows_time and not self.reference_parameters
-
-    @property
-    def by_time(self) -> Callable[[float], FloatArray]:
-        """R(t) as a function of the time alone.
-
-        Raises:
-            ModelError: It has parameters, whose values are in a context.
-        """
-        if self.reference_parameters:
-            raise ModelError(
-                "references with parameters need a wire from their ReferenceGenerator, whose "
-                "context has the values: leave out references="
-            )
-        return self.function
-
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of its references in a context.
 

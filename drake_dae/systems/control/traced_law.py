@@ -20,13 +20,11 @@ from drake_dae.systems.blocks.traced import (
     Update,
     zero,
 )
-from drake_dae.systems.control.references import ReferenceGenerator
 
 
 def traced_law(
     block: System,
     law: TrackingLaw,
-    references: ReferenceGenerator | None,
     limits: FloatArray,
     sample_period: float,
     moving: Sequence[int],
@@ -37,7 +35,6 @@ def traced_law(
     Args:
         block: The controller.
         law: Its law.
-        references: R if the port `reference` has no wire; None if it needs one.
         limits: The largest |integral| of each error, shape (k,).
         sample_period: The sample period of integrals, in s; 0 for continuous integrals.
         moving: The indices of parameters that come through its port "exogenous".
@@ -50,8 +47,6 @@ def traced_law(
     computations: tuple[Computation, ...]
     updates: tuple[Update, ...] = ()
     unwired = {}
-    if references is not None:
-        (unwired["reference"],) = references.traced().computations
     if not law.integral.outputs:
         computations = (Computation.of(law.function, sources, shown),)
     else:

@@ -109,7 +109,7 @@ class ObserverFunctions(Observed):
         if known and degree:
             raise ModelError(
                 f"{law.system.name}: parameters are estimated for rigid joints; behind springs "
-                "and motors only coefficients of friction are, unless the law is a cascade"
+                "and motors only coefficients of friction are"
             )
         values = law.system.parameter_values
         start = (

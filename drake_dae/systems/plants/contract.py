@@ -17,7 +17,6 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.block import check_context
-from drake_dae.trace.functions import TracedFunction
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System
@@ -65,10 +64,7 @@ class Plant(System):
        guess, and returns it. Both refuse wrong shapes.
     10. Projection. `projects` says whether the state is projected onto N* after each step; a record
         then has the state before the projection.
-    11. Feedback. A plant that can compute its control itself has an input port `feedback`, which
-        takes a law as a value; see `DaePlant`. `laws_along` are the parameters of that law at the
-        times of a run, or None.
-    12. Contact. `is_ideal` says whether the constraints hold exactly.
+    11. Contact. `is_ideal` says whether the constraints hold exactly.
     13. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
         surfaces and constraint forces.
     14. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
@@ -170,14 +166,6 @@ class Plant(System):
         state = self.structure.manifold.settle(guess, self.current_parameters(context))
         self.set_state(context, state)
         return state
-
-    def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
-        """The parameters of the law at `feedback`, one row for each time; None without one."""
-        return None
-
-    def motion_under(self, law: TracedFunction) -> TracedFunction:
-        """Law and plant as one function, for a plant that takes a law as a value."""
-        raise ModelError(f"{self.dae.name}: no law can be fed back to a {type(self).__name__}")
 
     @property
     def port_signals(self) -> dict[str, tuple[Signal, ...]]:

@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name, vector
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.shared_forces import manifold_of_left_out
 from drake_dae.dae.structure.singular import dependent_constraints
@@ -29,13 +29,11 @@ from drake_dae.systems.blocks.failures import (
     off_start,
     singular_configuration,
 )
-from drake_dae.systems.blocks.feedback import Feedback
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.systems.blocks.traced import Block
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.law_input import LawInput
 from drake_dae.systems.plants.traced_plant import traced_plant
 from drake_dae.trace.functions import TracedFunction
 
@@ -59,9 +57,6 @@ class DaePlant(ParameterizedSystem, Plant):
         control: u, shape (p,).
         exogenous: The signals w with their derivatives, if the system has any; see
             `ParameterizedSystem`.
-        feedback: A law from the port `feedback` of a `TrackingController`; with feedback=True. If
-            `control` has no wire, u is the law's control at x. This equals wires for `state` and
-            `control`, in half the time, since the integrator calls only one block.
 
     Output ports:
         state: x, shape (n,).
@@ -91,7 +86,6 @@ class DaePlant(ParameterizedSystem, Plant):
         structure: The structure of the system, by `find_constraint_structure` or
             `find_structure`; the former if None.
         project: False leaves the drift off N* uncorrected, to study it.
-        feedback: Whether there is an input port `feedback`; not with exogenous signals.
 
     Attributes:
         structure: The structure.
@@ -101,8 +95,7 @@ class DaePlant(ParameterizedSystem, Plant):
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
-        ModelError: It is not a system, the structure is that of another one, or a law cannot be fed
-            back.
+        ModelError: It is not a system, or the structure is that of another one.
         InconsistentStateError: A simulation starts from a state that is off N*.
         SingularityError: A(x) is singular during a run; the exception has time and state. In a
             Painleve paradox it is a PainleveError with the outcome.
@@ -118,7 +111,6 @@ class DaePlant(ParameterizedSystem, Plant):
         *,
         structure: ConstraintStructure | None = None,
         project: bool = True,
-        feedback: bool = False,
     ) -> None:
         structure = constraint_structure_of(type(self).__name__, system, structure)
         signals = {"state": system.state_signals, "control": system.control_signals}
@@ -147,7 +139,7 @@ class DaePlant(ParameterizedSystem, Plant):
         self._left_out = manifold_of_left_out(system)
         degrees = system.exogenous.degrees(rate, force, output, residual)
         self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
-        self._declare_feedback(feedback)
+        self._control_ticket = self.input_port_ticket(self._control_port.get_index())
         self.DeclareVectorOutputPort(
             "state", system.num_states, weakly(self._copy_state), state_tickets(self)
         )
@@ -165,24 +157,7 @@ class DaePlant(ParameterizedSystem, Plant):
     def _tickets(self, function: TracedFunction) -> set[DependencyTicket]:
         """The dependencies of the values of a function."""
         takes_control = "control" in function.input_names
-        return self._by_state | (self._control_tickets if takes_control else set())
-
-    def _declare_feedback(self, is_fed_back: bool) -> None:
-        """Declares the input port `feedback`, and the dependencies of u besides time and state."""
-        self._control_tickets = {self.input_port_ticket(self._control_port.get_index())}
-        self._law: LawInput | None = None
-        if not is_fed_back:
-            return
-        if not self._is_controlled or self._exogenous is not None:
-            missing = "has exogenous signals" if self._is_controlled else "has no control"
-            raise ModelError(f"{self.dae.name} {missing}: no law can be fed back to it")
-        values, compiled = weakly(self._values), self.dae.compiled
-        self._law = LawInput(self, self._control_port, values, self._steps, self.dynamics, compiled)
-        self._control_tickets.add(self.input_port_ticket(self._law.port.get_index()))
-
-    def motion_under(self, law: TracedFunction) -> TracedFunction:
-        """Law and plant as one function; see `feedback.motion_under`."""
-        return super().motion_under(law) if self._law is None else self._law.motion_under(law)
+        return self._by_state | ({self._control_ticket} if takes_control else set())
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
@@ -199,15 +174,7 @@ class DaePlant(ParameterizedSystem, Plant):
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
         # Called most by an integrator, so without further calls for valid values.
-        if self._law is not None:
-            motion = self._law.motion(context)
-            if motion is not None:
-                state = context.get_continuous_state_vector().value()
-                rate = motion(context.get_time(), state)
-                if rate is not None:
-                    derivatives.SetFromVector(rate)
-                    return
-        elif self._is_controlled and self._exogenous is None:
+        if self._is_controlled and self._exogenous is None:
             control = self._control_port.Eval(context)
             state = context.get_continuous_state_vector().value()
             parameters = context.get_numeric_parameter(0).value()
@@ -220,33 +187,8 @@ class DaePlant(ParameterizedSystem, Plant):
     def _evaluate(self, function: TracedFunction, context: Context) -> FloatArray:
         x = context.get_continuous_state_vector().value()  # The context's own numbers, no copy.
         if "control" in function.input_names:
-            control = self._control(context)
-            if control is None:
-                return function.nowhere()[0]
-            return self._checked(function, context, x, control)[0]
+            return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
-
-    def _control(self, context: Context) -> FloatArray | None:
-        """u; None if the law at `feedback` has no value at a trial state."""
-        feedback = self._feedback(context)
-        if feedback is None:
-            wired: FloatArray = self._control_port.Eval(context)
-            return wired
-        time, state = context.get_time(), self.state(context)
-        control = feedback.control(time, state)
-        if control is None:
-            self._steps.tolerate(context, feedback.error(time, state))
-            return None
-        return control.copy()
-
-    def _feedback(self, context: Context) -> Feedback | None:
-        """The law at `feedback`; None if the control has a wire or a fixed value."""
-        return None if self._law is None else self._law.feedback(context)
-
-    def laws_along(self, context: Context, times: ArrayLike) -> FloatArray | None:
-        """The parameters of the law at `feedback`, as `parameters_along`; None without one."""
-        self.check_context(context)
-        return self._steps.laws_along(context, vector("times", times, None))
 
     def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
         """The values of a port of `functions` at given times, one row each; nan without a value.
@@ -319,9 +261,6 @@ class DaePlant(ParameterizedSystem, Plant):
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
-        feedback = self._feedback(context)
-        if feedback is not None:
-            self._steps.note_law(context, feedback.parameters, begins=True)
         return EventStatus.DidNothing()
 
     def check_start(self, state: FloatArray, parameters: FloatArray) -> None:

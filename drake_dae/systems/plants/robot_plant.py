@@ -45,7 +45,6 @@ class RobotPlant(DaePlant):
         model: The robot.
         structure: The structure of `model.dae`; found if None.
         project: False leaves the drift off N* uncorrected, to study it.
-        feedback: Whether there is an input port `feedback`, as for `DaePlant`.
 
     Attributes:
         model: The robot.
@@ -60,9 +59,8 @@ class RobotPlant(DaePlant):
         *,
         structure: ConstraintStructure | None = None,
         project: bool = True,
-        feedback: bool = False,
     ) -> None:
-        super().__init__(model.dae, structure=structure, project=project, feedback=feedback)
+        super().__init__(model.dae, structure=structure, project=project)
         self.model: RobotModel = model
         values, force = weakly(self._values), weakly(self._evaluate, self._force)
         by_force = self._tickets(self._force)

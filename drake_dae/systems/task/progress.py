@@ -3,12 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import inf
+from typing import Any, Self
 
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.layout import DerivativeLayout, Indices
-from drake_dae.systems.blocks.feedback import Immutable
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.fade import fade
@@ -113,7 +113,7 @@ class ReferenceSegment:
 
 
 @dataclass(frozen=True, eq=False)
-class TaskProgress(Immutable):
+class TaskProgress:
     """The progress of a task in a context.
 
     Attributes:
@@ -127,6 +127,9 @@ class TaskProgress(Immutable):
     step: float = -inf
     felt: float = -inf
     is_felt: bool = False
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self  # It never changes, so that contexts may share it.
 
     @property
     def changes(self) -> tuple[PhaseChange, ...]:

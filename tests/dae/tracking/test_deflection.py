@@ -41,11 +41,11 @@ def test_the_contact_follows_a_force_that_rises_within_a_period():
     The law is linear in 1 / k, and half of k leaves the opposite of that: the geometry changes by
     1e-3 of it.
     """
-    _, errors = force_errors(f"law=!Tracking {{contact_stiffness: {STIFFNESS}}}")
+    _, errors = force_errors(f"contact_stiffness={STIFFNESS}")
     assert np.abs(errors).max() < 1e-3
     _, without = force_errors()
     assert np.abs(without).max() > 5.0
-    _, half = force_errors(f"law=!Tracking {{contact_stiffness: {STIFFNESS / 2.0}}}")
+    _, half = force_errors(f"contact_stiffness={STIFFNESS / 2.0}")
     assert_allclose(half, -without, atol=6e-3)
 
 
@@ -59,4 +59,4 @@ def test_the_contact_follows_a_force_that_rises_within_a_period():
 )
 def test_where_a_deflection_is_not_known_it_is_refused(name, stiffness, message):
     with pytest.raises(ScenarioError, match=message):
-        build_scenario(load_scenario(name, [f"law=!Tracking {{contact_stiffness: {stiffness}}}"]))
+        build_scenario(load_scenario(name, [f"contact_stiffness={stiffness}"]))

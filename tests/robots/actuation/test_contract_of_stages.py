@@ -83,7 +83,7 @@ def test_it_can_be_attached_again(stage):
 def test_only_a_shaft_can_be_driven_by_a_stage(stage):
     behind = [stage, MEMBERS["motors"]]
     if stage.attach(links()).shaft is None:
-        with pytest.raises(ModelError, match=f"DcMotors cannot drive {type(stage).__name__}"):
+        with pytest.raises(ModelError, match=f"DcMotors.*{type(stage).__name__}"):
             chain(behind, links())
     else:
         assert len(chain(behind, links()).stages) == 2
@@ -92,7 +92,7 @@ def test_only_a_shaft_can_be_driven_by_a_stage(stage):
 def test_rotors_turn_once(stage):
     own = stage.attach(links())
     if own.carries_rotors:
-        with pytest.raises(ModelError, match="once"):
+        with pytest.raises(ModelError, match=type(stage).__name__):
             chain([stage, stage], links())
 
 

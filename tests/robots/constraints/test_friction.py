@@ -106,7 +106,7 @@ def test_numbers_of_friction_that_make_no_sense_are_refused():
         PointOnSurface("tool", wall, friction=0.3, stiction_tolerance=0.0)
     plant = RobotPlant(frictional())
     context = plant.CreateDefaultContext()
-    with pytest.raises(ModelError, match="must not be negative"):
+    with pytest.raises(ModelError, match=r"wall\.friction"):
         plant.set_parameter(context, "wall.friction", -0.3)
 
 

@@ -165,7 +165,7 @@ def test_a_start_that_slips_is_refused_and_mended():
     slipping = rolling_state(3.0, -2.0, 0.5, 1.0, 0.3)
     slipping[5:7] += [0.2, 0.3]
     block.set_state(context, slipping)
-    with pytest.raises(InconsistentStateError, match=r"left\.side_speed = "):
+    with pytest.raises(InconsistentStateError, match=r"left\.side_speed"):
         simulate(block, context, 0.1, fixed_step())
     mended = block.set_consistent_state(context, slipping)
     heading, rates = mended[2], mended[5:]
@@ -354,12 +354,12 @@ def test_a_pushed_ball_tracks_with_its_normal_force():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Blade("a", (0, 0, 0)), "axis must not be zero"),
-        (lambda: RollingWheel("a", 0.0), "'wheel.radius' must be positive"),
-        (lambda: RollingBall("a", Plane((0, 0, 0), (0, 0, 1)), -1.0), "'ball.radius' must be pos"),
+        (lambda: Blade("a", (0, 0, 0)), "axis"),
+        (lambda: RollingWheel("a", 0.0), r"'wheel\.radius'"),
+        (lambda: RollingBall("a", Plane((0, 0, 0), (0, 0, 1)), -1.0), r"'ball\.radius'"),
         (
             lambda: RollingBall("a", Ellipsoid((0, 0, 0), (1, 2, 3)), 0.1),
-            "cannot roll on Ellipsoid.*use Plane, Sphere, Cylinder or Torus",
+            "Ellipsoid",
         ),
     ],
 )

@@ -159,7 +159,7 @@ def test_a_law_of_sixty_joints_tracks_as_predicted():
     joints = [f"j{i}" for i in range(size) if i != 1]
     model = RobotModel.from_multibody(plant, [wall], [JointPositions(joints)], nominal_positions=q)
     law = TrackingLaw(model.dae, poles(-4.0))
-    robot = RobotPlant(model, structure=law.structure, feedback=True)
+    robot = RobotPlant(model, structure=law.structure)
     references = {name: float(q[int(name[1:])]) + 0.01 for name in joints}
     loop = make_closed_loop(robot, law, {**references, "wall.force": 5.0})
     context = loop.diagram.CreateDefaultContext()

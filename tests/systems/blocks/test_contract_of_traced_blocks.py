@@ -25,12 +25,10 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     SinusoidReference,
-    SpringLoop,
     StateEstimator,
     TrackingController,
     TrackingLaw,
     UnilateralRobotPlant,
-    link_side,
     poles,
     with_disturbance,
 )
@@ -38,8 +36,6 @@ from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.systems.blocks.switch import LawSwitch
 from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
-from drake_dae.systems.cascade.spring_view import SpringView
-from drake_dae.systems.cascade.torque_loop import TorqueLoop
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Packets, Sampling
 from drake_dae.systems.plants.unilateral.modes import ROUND_OFF
@@ -121,14 +117,6 @@ def observer_behind_springs():
     return DisturbanceObserver(TrackingLaw(dae, poles(-4.0)), Observing(20.0), 0.01)
 
 
-def torque_loop(kind):
-    model = actuated("two_link", kind).model
-    links = link_side(model).dae
-    dae = with_disturbance(links, [signal.name for signal in links.state_signals[2:]])
-    loop = SpringLoop(60.0, motor_rate=40.0, current_rate=200.0)
-    return TorqueLoop(model, TrackingLaw(dae, poles(-4.0)), loop, 0.01, 0.5)
-
-
 BLOCKS = {
     "RobotPlant": lambda: robot(None),
     "RobotPlant with springs": lambda: robot("flexible"),
@@ -145,9 +133,6 @@ BLOCKS = {
     "CommandedReferences": commanded,
     "ReferenceGenerator with parameters": references_with_parameters,
     "TrackingController": lambda: TrackingController(law("two_link")),
-    "TrackingController that knows its references": lambda: TrackingController(
-        law("two_link"), references=references()
-    ),
     "TrackingController of a measured force": lambda: TrackingController(measured_law(())),
     "TrackingController with an integral": lambda: TrackingController(
         measured_law(("tool.z",)), integral_limits=0.3
@@ -183,9 +168,6 @@ BLOCKS = {
     "StateEstimator of a contact that sticks": lambda: estimator(
         0.5, least_speed=1e3, least_force=1e-3
     ),
-    "SpringView": lambda: SpringView(actuated("two_link", "flexible").model),
-    "TorqueLoop": lambda: torque_loop("flexible"),
-    "TorqueLoop before motors": lambda: torque_loop("flexible motor"),
     "UnilateralRobotPlant": lambda: opening(None),
     "UnilateralRobotPlant with springs": lambda: opening("flexible"),
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),

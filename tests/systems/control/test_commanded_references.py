@@ -11,7 +11,6 @@ from drake_dae import (
     CommandedReferences,
     ConstantReference,
     ExpressionReference,
-    ReferenceGenerator,
 )
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ReferenceSignalError
@@ -94,12 +93,6 @@ def test_references_with_parameters_are_not_commanded():
         CommandedReferences([given], [2, 0], SIGNALS)
 
 
-def test_what_follows_time_alone_has_no_parameters():
-    """A plant may be fed by the latter; the former need not be logged."""
-    given = ExpressionReference(lambda t, level: [level, 2.0 * level], {"level": 0.3})
-    block = ReferenceGenerator([given], [2, 0])
-    assert (block.follows_time, block.is_by_time) == (True, False)
-    block = ReferenceGenerator([moving()], [2, 0])
-    assert (block.follows_time, block.is_by_time) == (True, True)
+def test_commanded_references_do_not_follow_time():
     block = CommandedReferences([moving()], [2, 0], SIGNALS)
-    assert (block.follows_time, block.is_by_time) == (False, False)
+    assert not block.follows_time

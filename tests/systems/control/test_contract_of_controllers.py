@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from actuated import actuated, at_rest
 from arms import arm, error_controlled, fixed_step, law
 from members import RestingController
 from polishing import PERIOD, laws, soft_wall, task_loop
@@ -17,14 +16,11 @@ from drake_dae import (
     ReferenceGenerator,
     RobotPlant,
     Sampling,
-    SpringCascade,
-    SpringLoop,
     Task,
     TaskController,
     Tolerances,
     TrackingController,
     TrackingLaw,
-    link_side,
     poles,
     simulate,
     wire_loop,
@@ -47,18 +43,11 @@ def task():
     return TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=PERIOD)
 
 
-def cascade():
-    model = actuated("two_link", "flexible").model
-    own = TrackingLaw(link_side(model).dae, poles(-4.0))
-    return SpringCascade(own, model, SpringLoop(60.0, motor_rate=60.0), SAMPLE)
-
-
 MEMBERS = {
     "law": lambda: TrackingController(law("two_link")),
     "with integral": integrating,
     "task": task,
     "resting": lambda: RestingController(law("two_link")),
-    "cascade": cascade,
 }
 
 
@@ -68,9 +57,6 @@ def robot(controller):
         return soft_wall(), None
     q = arm("two_link").model.configuration([0.3], [1.2, -1.6])
     found, state = arm("two_link"), [*q, 0.0, 0.0]
-    if controller.observed is not None:
-        found = actuated("two_link", "flexible")
-        state = at_rest("two_link", "flexible", q, GOALS[1])[0]
     return RobotPlant(found.model, structure=found.structure), state
 
 
@@ -103,8 +89,6 @@ def controller(request):
 
 def test_rules_1_and_2_what_it_reads_and_gives(controller):
     dae, optional = robot(controller)[0].dae, {"reference", "measured_force", "exogenous", "hold"}
-    if controller.observed is not None:
-        optional |= {"acting_control"}
     assert controller.GetInputPort("estimated_state").size() == dae.num_states
     names = {controller.get_input_port(i).get_name() for i in range(controller.num_input_ports())}
     assert names - {"estimated_state"} <= optional
@@ -175,8 +159,7 @@ def test_a_sensor_that_nothing_reads_is_refused(controller):
 @pytest.mark.slow
 def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
     """At rest at its goals a law has no error: round-off, and that of steps of 1 ms."""
-    settings = {} if controller.observed is None else {"sampling": Sampling(SAMPLE)}
-    loop, context = wired(controller, **settings)
+    loop, context = wired(controller)
     config = error_controlled(1e-8) if controller.takes_over else fixed_step()
     simulate(loop.diagram, context, 0.05, config)
     record = loop.record(context)
@@ -212,17 +195,7 @@ def test_rule_7_starts(controller):
     assert manifold.is_consistent(manifold.project(manifold.system.nominal_state))
 
 
-def test_rule_8_what_is_observed(controller):
-    """State and control of the law, on ports of the controller."""
-    if controller.observed is None:
-        assert not controller.HasInputPort("acting_control")
-        return
-    sizes = [controller.GetOutputPort(name).size() for name in controller.observed]
-    assert sizes == [controller.law.system.num_states, controller.law.system.num_controls]
-    assert controller.GetInputPort("acting_control").size() == sizes[1]
-
-
-def test_rule_9_phases():
+def test_rule_8_phases():
     """A task tells when it began; a law has no phases."""
     loop = task_loop([Approach(), Press(20.0)])
     assert loop.changes(loop.diagram.CreateDefaultContext()) == ()

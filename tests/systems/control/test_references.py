@@ -5,7 +5,6 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
-from arms import law
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient
 from pydrake.common import RandomDistribution
 from pydrake.math import BsplineBasis
@@ -19,10 +18,9 @@ from drake_dae import (
     ReferenceGenerator,
     SinusoidReference,
     SystemReference,
-    TrackingController,
     TrajectoryReference,
 )
-from drake_dae.errors import ModelError, NonFiniteError, ReferenceSignalError
+from drake_dae.errors import NonFiniteError, ReferenceSignalError
 
 
 def table(signal, degree, time):
@@ -318,11 +316,3 @@ def test_wrong_parameters_are_refused():
     one, two = (ExpressionReference(lambda t, a: a * t, {"a": a}) for a in (1.0, 2.0))
     with pytest.raises(ReferenceSignalError, match="two references have a parameter 'a'"):
         ReferenceGenerator([one, two], [0, 0])
-
-
-def test_what_takes_no_parameters_says_so():
-    moving = ExpressionReference(lambda t, rise: 0.3 + rise * t, {"rise": 0.1})
-    tracking = law("two_link")
-    generator = ReferenceGenerator([moving, ConstantReference(20.0)], tracking.degrees)
-    with pytest.raises(ModelError, match="need a wire from their ReferenceGenerator"):
-        TrackingController(tracking, references=generator, feedback=True)

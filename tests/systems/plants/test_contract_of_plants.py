@@ -57,9 +57,6 @@ def contact():
 MEMBERS = {
     "dae": lambda: DaePlant(arm("two_link").model.dae, structure=arm("two_link").structure),
     "robot": lambda: RobotPlant(arm("two_link").model, structure=arm("two_link").structure),
-    "fed back": lambda: RobotPlant(
-        arm("two_link").model, structure=arm("two_link").structure, feedback=True
-    ),
     "unilateral": lambda: UnilateralRobotPlant(
         arm("two_link").model, {"wall": 0.0}, structure=arm("two_link").structure
     ),
@@ -215,14 +212,6 @@ def test_rules_11_and_13_projection_and_contact(plant):
         assert np.max(np.abs(record["constraint_residual"])) < 1e-9
     else:  # A contact that gives way is pressed in.
         assert np.max(np.abs(record["constraint_residual"])) > 1e-6
-
-
-def test_rule_12_feedback(plant):
-    context = plant.CreateDefaultContext()
-    assert plant.laws_along(context, [0.0]) is None
-    function = arm_law().function
-    if plant.HasInputPort("feedback"):
-        assert plant.motion_under(function).input_names[-1] == "plant"
 
 
 @cache

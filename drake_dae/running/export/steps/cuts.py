@@ -62,26 +62,20 @@ def measured_ports(diagram: Diagram, plant: Plant) -> dict[Port, str]:
 
 
 def control_port(wires: Wires, plant: Plant) -> Port:
-    """The port that feeds the plant's control, directly or as the plant's feedback."""
+    """The port that feeds the plant's control."""
     system: Any = plant
-    for name in (CONTROL, "feedback"):
-        if not plant.HasInputPort(name):
-            continue
-        index = int(plant.GetInputPort(name).get_index())
-        while isinstance(system, Diagram) and (system, index) not in wires.sources:
-            locators = system.GetInputPortLocators(InputPortIndex(index))
-            if not locators:
-                break
-            system, index = locators[0][0], int(locators[0][1])
-        source = wires.sources.get((system, index))
-        if source is not None and name == CONTROL:
-            return source
-        if source is not None:
-            return leaf_port(source[0].GetOutputPort(CONTROL))
-        system = plant
-    raise ModelError(
-        f"nothing leads to the control of '{plant.get_name()}', so that there is no law"
-    )
+    index = int(plant.GetInputPort(CONTROL).get_index())
+    while isinstance(system, Diagram) and (system, index) not in wires.sources:
+        locators = system.GetInputPortLocators(InputPortIndex(index))
+        if not locators:
+            break
+        system, index = locators[0][0], int(locators[0][1])
+    source = wires.sources.get((system, index))
+    if source is None:
+        raise ModelError(
+            f"nothing leads to the control of '{plant.get_name()}', so that there is no law"
+        )
+    return source
 
 
 def upstream(

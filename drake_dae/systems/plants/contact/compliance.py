@@ -19,7 +19,7 @@ from drake_dae.systems.plants.contact.contact_laws import (
 )
 from drake_dae.systems.plants.contact.contact_material import PointMaterial
 from drake_dae.systems.plants.contact.point_contact import ball_normals, point_contacts, touching
-from drake_dae.systems.plants.contact.stepped_stages import stage_rates, stages_after
+from drake_dae.systems.plants.contact.stage_steps import stage_rates, stages_after
 from drake_dae.systems.plants.robot_ports import stage_ports
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction

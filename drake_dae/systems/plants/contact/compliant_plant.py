@@ -37,7 +37,7 @@ from drake_dae.systems.plants.contact.compliance import CompliantEquations
 from drake_dae.systems.plants.contact.contact_checks import changed_parameters
 from drake_dae.systems.plants.contact.contact_forces import contact_force_signals
 from drake_dae.systems.plants.contact.contact_material import FRICTION, PointMaterial
-from drake_dae.systems.plants.contact.stepped_stages import check_step
+from drake_dae.systems.plants.contact.stage_steps import check_step
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.functions import TracedFunction
 
@@ -57,7 +57,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
 
     A = M + h D with the damping D of the joints, and the impulses gamma of `contact_step`: Drake's
     discrete MultibodyPlant with its default, the "lagged" approximation. Stages of actuation step
-    as `SteppedStages`. With `time_step` = 0 it is continuous,
+    as `stages_after`. With `time_step` = 0 it is continuous,
 
         M v' + H = tau + J^T F,
 

@@ -31,6 +31,11 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
             "that the law does not know are disturbance forces (plant_disturbances). Use "
             "`plant: !CompliantContact`, which has the same equations of contact, or a rollout"
         )
+    if model.stages:
+        raise ModelError(
+            f"{model.name} has springs, motors or valves at its joints, which Drake's contact does "
+            "not step: take a CompliantPlant (`plant: !CompliantContact`)"
+        )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
     check_without_bristles(model)

@@ -50,7 +50,6 @@ from drake_dae.systems.plants.contact.disturbance_forces import (
     AppliedDisturbances,
     DisturbanceForce,
 )
-from drake_dae.systems.plants.contact.stepped_stages import SteppedStages, check_step
 from drake_dae.systems.plants.contact.traced_contact import traced_contact
 from drake_dae.systems.plants.contract import Plant
 
@@ -93,13 +92,13 @@ class ContactPlant(Diagram, Plant):
         query_object: Drake's, of the scene with the contact geometry.
 
     Args:
-        model: The robot: each constraint a `PointOnSurface` at rest, on a surface with `solids`, or
-            on any smooth one in hydroelastic contact.
+        model: The robot, with rigid joints: each constraint a `PointOnSurface` at rest, on a
+            surface with `solids`, or on any smooth one in hydroelastic contact.
         add_robot: Adds the robot to a plant, as it was added to the plant of the model.
         material: The contact material.
         structure: The structure of the model's system.
         parameters: Parameter name -> the plant's value if it differs from the model: positions and
-            friction of surfaces, masses of bodies, and numbers of stages.
+            friction of surfaces, and masses of bodies.
         disturbances: Forces on the robot that its law does not know.
 
     Attributes:
@@ -109,8 +108,7 @@ class ContactPlant(Diagram, Plant):
         remarks: As for `Plant`: the deviations of meshes from their surfaces.
 
     Raises:
-        ModelError: The robot's contacts cannot be represented, or the step is too long for its
-            stages.
+        ModelError: The robot has stages of actuation, or contacts that cannot be represented.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -132,62 +130,38 @@ class ContactPlant(Diagram, Plant):
         self.dae, self.structure = model.dae, structure
         self.time_step, self._friction = material.time_step, material.friction
         self._values = changed_parameters(model, parameters or {})
-        if model.stages:
-            check_step(model, material.time_step, self._values)
         logging.getLogger("drake").addFilter(_is_relevant)
-        inner = DiagramBuilder()
+        builder = DiagramBuilder()
         config = MultibodyPlantConfig(
             time_step=material.time_step,
             contact_model=material.contact_model,
             stiction_tolerance=material.stiction_tolerance,
         )
-        plant, scene_graph = AddMultibodyPlant(config, inner)
+        plant, scene_graph = AddMultibodyPlant(config, builder)
         self.multibody = plant
         add_robot(plant, scene_graph)
-        if any(stage.carries_rotors for stage in model.stages):
-            for index in plant.GetJointActuatorIndices():
-                plant.get_mutable_joint_actuator(index).set_default_rotor_inertia(0.0)
         pairs = self._add_contacts(plant, scene_graph, material)
         plant.Finalize()
         check_same(plant, model)
         self._masses = other_masses(model, plant, self._values)
         if disturbances:
             frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
-            applied = inner.AddSystem(AppliedDisturbances(plant, disturbances, frames))
-            inner.Connect(applied.get_output_port(), plant.get_applied_spatial_force_input_port())
+            applied = builder.AddSystem(AppliedDisturbances(plant, disturbances, frames))
+            builder.Connect(applied.get_output_port(), plant.get_applied_spatial_force_input_port())
         forces = ContactForces(model, structure, pairs, self._values)
-        self._forces = inner.AddSystem(forces)
+        self._forces = builder.AddSystem(forces)
         self.contact_force_signals = forces.contact_force_signals
         results = plant.get_contact_results_output_port()
-        inner.Connect(results, forces.GetInputPort("contact_results"))
-        inner.ExportInput(plant.get_actuation_input_port(), "joint_torque")
-        inner.ExportInput(forces.GetInputPort("state"), "state")
-        inner.ExportOutput(plant.get_state_output_port(), "link_state")
-        for name in _OF_FORCES:
-            inner.ExportOutput(forces.GetOutputPort(name), name)
-        inner.ExportOutput(results, "contact_results")
-        inner.ExportOutput(scene_graph.get_query_output_port(), "query_object")
-        # A diagram of its own, which a rollout lets Drake step without the stages.
-        builder, scene = DiagramBuilder(), inner.Build()
-        scene.set_name("scene")
-        self._scene = builder.AddSystem(scene)
-        links = state = scene.GetOutputPort("link_state")
-        self._stages = None
-        if model.stages:
-            stages = builder.AddSystem(SteppedStages(model, self.time_step, self._values))
-            self._stages, state = stages, stages.GetOutputPort("state")
-            builder.Connect(links, stages.GetInputPort("link_state"))
-            torque = stages.GetOutputPort("joint_torque")
-            builder.Connect(torque, scene.GetInputPort("joint_torque"))
-            builder.ExportInput(stages.GetInputPort("control"), "control")
-            for name in ("joint_torque", *stages.stage_ports):
-                builder.ExportOutput(stages.GetOutputPort(name), name)
-        else:
-            builder.ExportInput(scene.GetInputPort("joint_torque"), "control")
-        builder.Connect(state, scene.GetInputPort("state"))
+        builder.Connect(results, forces.GetInputPort("contact_results"))
+        state = plant.get_state_output_port()
+        builder.Connect(state, forces.GetInputPort("state"))
+        builder.ExportInput(plant.get_actuation_input_port(), "control")
         builder.ExportOutput(state, "state")
-        for name in ("link_state", *_OF_FORCES, "contact_results", "query_object"):
-            builder.ExportOutput(scene.GetOutputPort(name), name)
+        builder.ExportOutput(state, "link_state")
+        for name in _OF_FORCES:
+            builder.ExportOutput(forces.GetOutputPort(name), name)
+        builder.ExportOutput(results, "contact_results")
+        builder.ExportOutput(scene_graph.get_query_output_port(), "query_object")
         builder.BuildInto(self)
         self.set_name(model.dae.name)
 
@@ -274,11 +248,7 @@ class ContactPlant(Diagram, Plant):
     def state(self, context: Context) -> FloatArray:
         """The state x in a context, shape (n,)."""
         multibody_context = self.GetSubsystemContext(self.multibody, context)
-        links = np.array(self.multibody.GetPositionsAndVelocities(multibody_context))
-        if self._stages is None:
-            return links
-        stages = self._stages.state(self.GetSubsystemContext(self._stages, context))
-        return np.concatenate([links, stages])
+        return np.array(self.multibody.GetPositionsAndVelocities(multibody_context))
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the state x in a context, shape (n,), in contact or not.
@@ -288,25 +258,18 @@ class ContactPlant(Diagram, Plant):
         Raises:
             ModelError: The shape is wrong.
         """
-        count = self.multibody.num_multibody_states()
-        links, stages = np.split(self.dae.state_vector(state), [count])
-        self._set_links(self.GetMutableSubsystemContext(self._scene, context), links)
-        if self._stages is not None:
-            self._stages.set_state(self.GetMutableSubsystemContext(self._stages, context), stages)
+        self._put(context, self.dae.state_vector(state))
 
-    def _set_links(self, context: Context, values: FloatArray) -> None:
-        """Sets (q, v), the first of some values, and changed masses in a context of the scene."""
-        links = values[: self.multibody.num_multibody_states()]
-        multibody_context = self._scene.GetMutableSubsystemContext(self.multibody, context)
-        self.multibody.SetPositionsAndVelocities(multibody_context, links)
+    def _put(self, context: Context, values: FloatArray) -> None:
+        """Sets x, the first of some values, and changed masses."""
+        multibody_context = self.GetMutableSubsystemContext(self.multibody, context)
+        self.multibody.SetPositionsAndVelocities(multibody_context, values[: self.dae.num_states])
         set_masses(multibody_context, self._masses)
 
     def traced(self) -> Block:
-        parts = self._scene, self._forces, self._stages
-        return traced_contact(self, *parts, self._held, self._set_links, self._values)
+        return traced_contact(self, self._forces, self._held, self._put, self._values)
 
     def _held(self, context: Context) -> FloatArray:
-        """(q, v), the contact forces, and the states of the stages."""
-        count = self.multibody.num_multibody_states()
-        links, stages = np.split(self.state(context), [count])
-        return np.concatenate([links, self.GetOutputPort("contact_force").Eval(context), stages])
+        """(q, v), and the contact forces."""
+        forces = self.GetOutputPort("contact_force").Eval(context)
+        return np.concatenate([self.state(context), forces])

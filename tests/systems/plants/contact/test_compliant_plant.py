@@ -442,7 +442,6 @@ def test_a_task_on_a_continuous_contact_is_sampled():
     "name",
     [
         "wall_point_contact",
-        pytest.param("wall_flexible_contact", marks=pytest.mark.thorough),
     ],
 )
 def test_a_run_of_a_shipped_scenario_is_that_of_drakes_plant(name):

@@ -1,4 +1,4 @@
-"""Stages of actuation beside Drake's discrete plant, against closed forms and the ideal plant."""
+"""Stages of actuation in steps as Drake's, against closed forms and the ideal plant."""
 
 from functools import cache
 from itertools import pairwise
@@ -15,13 +15,13 @@ from pydrake.systems.primitives import LogVectorOutput
 from runs import some
 
 from drake_dae import (
-    ContactMaterial,
-    ContactPlant,
+    CompliantPlant,
     DcMotors,
     ElectrohydraulicServos,
     FlexibleJoints,
     Plane,
     PointCoordinates,
+    PointMaterial,
     PointOnSurface,
     RobotModel,
     RobotPlant,
@@ -34,7 +34,7 @@ MASS, ROTOR, STIFFNESS = 2.0, 0.5, 4000.0
 RATE = np.sqrt(STIFFNESS * (1.0 / MASS + 1.0 / ROTOR))  # 100 rad/s.
 
 
-def add_slider(plant: MultibodyPlant, scene_graph: object = None) -> None:
+def add_slider(plant: MultibodyPlant) -> None:
     """A body of 2 kg that slides along y on one of 1 kg that slides along x, toward a wall."""
     frame = plant.world_frame()
     for name, axis, mass in (("x", [1, 0, 0], 1.0), ("y", [0, 1, 0], MASS)):
@@ -60,18 +60,13 @@ def slider(*stages) -> tuple[RobotModel, object]:
     return model, find_structure(model.dae)
 
 
-def contact_plant(step: float, *stages, **parameters) -> ContactPlant:
+def contact_plant(step: float, *stages, **parameters) -> CompliantPlant:
     model, structure = slider(*stages)
-    material = ContactMaterial(time_step=step, friction=0.0)
-
-    def add(plant, scene_graph):
-        add_slider(plant)
-        plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
-
-    return ContactPlant(model, add, material, structure=structure, parameters=parameters)
+    material = PointMaterial(time_step=step, friction=0.0)
+    return CompliantPlant(model, material, structure=structure, parameters=parameters)
 
 
-def run(plant: ContactPlant, start, control, duration: float):
+def run(plant: CompliantPlant, start, control, duration: float):
     """x at the steps under a constant control, from a state that touches without a force."""
     builder = DiagramBuilder()
     builder.AddSystem(plant)

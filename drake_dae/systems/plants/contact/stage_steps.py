@@ -1,0 +1,123 @@
+"""The steps of stages of actuation beside links that step as Drake's discrete MultibodyPlant."""
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.robots.model import RobotModel
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+
+_GROWTH = 1e-7
+"""The allowed excess of the spectral radius over 1: round-off of motions without a force."""
+
+_SHORTER = np.geomspace(1.0, 0.01, 300)[1:]
+"""The fractions of a too long step that are tried for the message."""
+
+
+def stages_after(model: RobotModel, time_step: float, control: ca.SX) -> ca.SX:
+    """s after a step of the stages as an expression of x and u, shape (k, 1).
+
+    The links get new velocities from the forces at t_n, and new positions from the new velocities.
+    The stages do the same, from E s' = drift(q, v, s) + drive u: positions of shafts follow from
+    their new velocities, and everything else from the values at t_n,
+
+        E (s_(n+1) - s_n) = h (drift(q_n, v_n, s_n) + drive u_n),    but p_(n+1) = p_n + h p'_(n+1).
+
+    For springs, links and shafts together this is the symplectic Euler method: an undamped
+    oscillation of frequency w keeps its amplitude for w h < 2, with the frequency w_h of sin(w_h h
+    / 2) = w h / 2 in place of w. An unstable step is refused: see `check_step`.
+
+    Args:
+        model: The robot.
+        time_step: h in s.
+        control: u, shape (p, 1).
+    """
+    dae, size = model.dae, _num_link_states(model)
+    rates = stage_rates(model, control)
+    after = ca.vertcat(dae.state[:size], dae.state[size:] + time_step * rates)
+    for position, velocity in _shafts(model).items():
+        after[position] = dae.state[position] + time_step * after[velocity]
+    return after[size:]
+
+
+def stage_rates(model: RobotModel, control: ca.SX) -> ca.SX:
+    """s' = E^-1 (drift(q, v, s) + drive u) as an expression of x and u, shape (k, 1)."""
+    dae, size = model.dae, _num_link_states(model)
+    driven = dae.f[size:] + ca.mtimes(dae.h[size:, :], control)
+    # Stages do not share a mass with the links.
+    return PositiveDefiniteFactorization(dae.mass_matrix[size:, size:]).solve(driven)
+
+
+def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> None:
+    """Refuses a step that is too long for the stages of a robot.
+
+    About rest at the nominal state, one step multiplies small deviations of (q, v, s) by a matrix,
+    whose eigenvalues must not be outside the unit circle. For springs without damping this means w
+    h <= 2; for the electric part of a motor R h / L <= 2, and less if it oscillates with the
+    inertia.
+
+    Args:
+        model: The robot, with any stage.
+        time_step: h in s.
+        parameters: Values of all parameters.
+
+    Raises:
+        ModelError: The step is too long; which one would do.
+    """
+    slope, is_position = _linear(model, parameters)
+
+    def growth(step: float) -> float:
+        moved = np.where(is_position[:, None], slope, 0.0)
+        matrix = np.linalg.solve(
+            np.eye(len(slope)) - step * moved, np.eye(len(slope)) + step * (slope - moved)
+        )
+        return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+    if growth(time_step) <= 1.0 + _GROWTH:
+        return
+    fastest = float(np.abs(np.linalg.eigvals(slope)).max())
+    what = (
+        f"a time_step of {time_step:g} s is too long for what drives the joints, which has motions "
+        f"of {fastest:.3g} rad/s: each step would let one grow by {growth(time_step) - 1.0:.2g}"
+    )
+    for part in _SHORTER:
+        shorter = float(f"{part * time_step:.1e}")
+        if growth(shorter) <= 1.0 + _GROWTH:
+            raise ModelError(
+                f"{what}. Take {shorter:g} s or less; the law may keep its period with `sampling`"
+            )
+    raise ModelError(f"{what}, and so is one of {shorter:g} s; damp it, or take an ideal plant")
+
+
+def _linear(model: RobotModel, parameters: FloatArray) -> tuple[FloatArray, Booleans]:
+    """C of x' = C x for links and stages without weight, and which entries are positions."""
+    dae, links = model.dae, model.links
+    assert model.joint_force is not None
+    nq, size = links.q.numel(), _num_link_states(model)
+    B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
+    velocity = ca.mtimes(links.velocity_map, links.v)
+    forces = ca.vertcat(velocity, ca.mtimes(B, model.joint_force), dae.f[size:])
+    outputs = {"mass": dae.mass_matrix, "slope": ca.jacobian(forces, dae.state)}
+    function = dae.trace("linear motion", outputs, often=False)
+    mass, slope = function(dae.nominal_state, parameters)
+    is_position = np.arange(dae.num_states) < nq
+    is_position[list(_shafts(model))] = True
+    return np.asarray(np.linalg.solve(mass, slope)), is_position
+
+
+def _num_link_states(model: RobotModel) -> int:
+    return int(model.links.q.numel() + model.links.v.numel())
+
+
+def _shafts(model: RobotModel) -> dict[int, int]:
+    """The index of each shaft's position in x -> that of its velocity."""
+    velocities: dict[int, int] = {}
+    for stage in model.stages:
+        if stage.shaft is not None:
+            columns = [
+                ca.DM(ca.jacobian(symbols, model.dae.state)).full().argmax(axis=1).tolist()
+                for symbols in stage.shaft
+            ]
+            velocities.update(zip(*columns, strict=True))
+    return velocities
