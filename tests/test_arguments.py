@@ -23,7 +23,7 @@ from arms import arm, fixed_step, law
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
-from polishing import laws, polisher, task_loop
+from polishing import laws, soft_wall, task_loop
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -56,7 +56,6 @@ from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.studies.runs import Outcome, RunResult
-from drake_dae.systems.plants.contact_events import ContactChange
 from drake_dae.systems.task.phases import Phase
 from drake_dae.trace.functions import TracedFunction
 
@@ -231,7 +230,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.WaypointsReference: lambda: dd.WaypointsReference([[0.0], [1.0]], [0.0, 1.0]),
     dd.TrackingLaw: lambda: law("two_link"),
     Constraint: lambda: arm("two_link").model.constraints[0],
-    ContactChange: lambda: ContactChange.IMPACT,
     Context: lambda: context_of(None),
     Frame: lambda: arm("two_link").plant.GetFrameByName("tool"),
     Frames: lambda: arm("two_link").model.links,
@@ -322,7 +320,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "outputs of TaskController.rest_state": lambda: [0.3, 0.02],
     "name of TaskController.set_parameter": lambda: "wall.position",
     "value of TaskController.set_parameter": lambda: [1.2, 0.0, 0.0],
-    "plant of wire_loop": lambda: dd.UnilateralRobotPlant(polisher(), {"wall": 0.0}),
+    "plant of wire_loop": lambda: soft_wall(),
     "controller of wire_loop": lambda: dd.TaskController(
         dd.Task([dd.Approach()]), laws()[0], laws()[1]
     ),
@@ -341,9 +339,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "name of DaePlant.set_parameter": lambda: "link1.mass",
     "name of RobotPlant.get_parameter": lambda: "link1.mass",
     "name of RobotPlant.set_parameter": lambda: "link1.mass",
-    "name of UnilateralRobotPlant.get_parameter": lambda: "link1.mass",
-    "name of UnilateralRobotPlant.set_parameter": lambda: "link1.mass",
-    "contacts of UnilateralRobotPlant": lambda: {"wall": 0.5},
     "name of StateRealization.get_parameter": lambda: "link1.mass",
     "name of StateRealization.set_parameter": lambda: "link1.mass",
     "name of TrackingController.get_parameter": lambda: "link1.mass",

@@ -57,7 +57,6 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import Limits
 
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
-_FLASH = Rgba(1.0, 0.75, 0.1, 0.6)
 _CONE = Rgba(0.95, 0.6, 0.15, 0.35)
 
 _FOREVER = 2**31 - 1

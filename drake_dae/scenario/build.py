@@ -38,14 +38,6 @@ def build_scenario(
     return loop, start_scenario(completed.scenario, loop)
 
 
-def complete_with_law(scenario: Scenario) -> Completed:
-    """Completes a scenario, also by gains, without building its loop.
-
-    Errors are as for `build_scenario`.
-    """
-    return _prepared(scenario, SceneGraph(), drawn=False).completed
-
-
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from importlib import import_module
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
@@ -17,7 +17,6 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
@@ -203,13 +202,3 @@ class OwnPlant(ScenarioPlant):
                     f"'{self.maker}' is no class that keeps the contract of drake_dae.Plant"
                 )
             return kind(robot.model, robot.structure)
-
-
-def plant_kind(data: Mapping[str, Any]) -> type[ScenarioPlant]:
-    """The member that plain data choose by their tag; by default `IdealConstraints`.
-
-    Args:
-        data: The value of the key `plant`.
-    """
-    kinds = {f"!{kind.__name__}": kind for kind in ScenarioPlant.__subclasses__()}
-    return kinds.get(data.get(TAG, ""), IdealConstraints)

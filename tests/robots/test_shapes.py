@@ -11,7 +11,6 @@ from drake_dae import (
     Cylinder,
     JointPositions,
     Plane,
-    Plate,
     PointOnSurface,
     RobotModel,
     Sphere,
@@ -20,7 +19,6 @@ from drake_dae import (
 from drake_dae.robots.geometry.clearances import (
     LinkBehind,
     links_behind,
-    points_inside,
     surface_distances,
 )
 from drake_dae.robots.geometry.shapes import LinkShapes, collisions, nearest_links
@@ -229,28 +227,6 @@ def test_a_contact_point_goes_as_fast_as_its_frame():
     assert (one.constraint, one.frame) == ("wall", "tip")
     assert one.speed == pytest.approx(max(wanted), rel=1e-9)
     assert one.time == times[np.argmax(wanted)]
-
-
-def test_a_contact_point_inside_a_plate_is_found_and_one_below_or_beside_it_is_not():
-    """The depth in a box is the least distance from its sides; a plane does not end."""
-    plate = Plate((0.8, 0.0, 0.5), (0.0, 0.0, 1.0), half_widths=(0.7, 0.3), thickness=0.6)
-    model, _ = chain(plate)
-    random = np.random.default_rng(4)
-    states, times = random.uniform(-1.5, 1.5, (60, 2 * JOINTS)), np.arange(60) / 10.0
-    own = np.tile(model.dae.parameter_values, (60, 1))
-    x, _, z = np.array([ends(state[:JOINTS])[-1] for state in states]).T
-    depths = np.minimum.reduce([0.7 - np.abs(x - 0.8), 0.5 - z, z + 0.1])
-    inside = np.flatnonzero(depths > 0.0)
-    assert 2 < inside.size < 30
-    assert (depths < 0.3).all()  # its middle plane is at y = 0
-    (found,) = points_inside(model, times, states, own)
-    assert (found.constraint, found.link) == ("wall", "tip")
-    assert found.depth == pytest.approx(depths.max(), abs=1e-12)
-    assert (found.time, found.since) == (times[np.argmax(depths)], times[inside[0]])
-    outside = depths < 0.0
-    assert points_inside(model, times[outside], states[outside], own[outside]) == ()
-    model, _ = chain(Plane(point=plate.point, normal=plate.normal))
-    assert points_inside(model, times, states, own) == ()
 
 
 @pytest.mark.slow

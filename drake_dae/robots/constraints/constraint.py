@@ -163,7 +163,7 @@ class Constraint(ABC):
     def sliding(self, kinematics: Kinematics) -> ca.SX | None:
         """The sliding velocity relative to the other object, m/s, shape (3, 1).
 
-        None without friction, or with friction of its own that impacts do not include.
+        None without friction.
         """
         return None
 

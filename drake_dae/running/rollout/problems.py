@@ -43,7 +43,6 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
     if program.compiled.changes and np.isnan(held).any():
         # The initialization of a block need not be an expression.
         begun = context.Clone()
-        begun.SetAccuracy(1e-9)
         program.compiled.diagram.ExecuteInitializationEvents(begun)
         held = np.where(np.isnan(held), program.compiled.start(begun)[1], held)
     held = program.compiled.initialized(context.get_time(), state, held, values)

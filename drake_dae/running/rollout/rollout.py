@@ -44,8 +44,8 @@ class Rollout:
     Attributes:
         steps: The number of its steps.
         failure: The reason of an early end, with time and state; None if it reached its end.
-        context: The diagram's context after the run, if it has blocks that change at times to be
-            located: contacts that open, and phases of a task. Otherwise None.
+        context: The diagram's context after the run, if it has blocks with changes at samples, as
+            phases of a task. Otherwise None.
     """
 
     steps: int

@@ -41,34 +41,29 @@ class Plant(System):
        `constraint_force`, `constraint_residual` and `controlled_output` have the entries of
        `dae.state_signals`, `dae.force_signals`, `structure.manifold.residual_signals` and
        `dae.output_signals`.
-    2. System. `dae` is the system, and `structure` its structure.
-    3. Robots. `model` is the robot of the system `dae`; then the output port `link_state` is (q, v)
-       of its links. It is None for other plants.
-    4. State and steps. `time_step` is the time between its steps in s, 0 for a continuous plant.
-       `state` returns x, shape (n,). A discrete plant uses at each step the control of that
-       instant.
-    5. Records. `further_signals` are the output ports in a record besides those of rule 1, with
-       names and units of their entries.
-    6. Computed afterwards. `functions` names the output ports that `along` computes from the log:
-       "state", "control", "parameters" and the ports of rule 5 that are not among `functions`. For
-       a plant without functions everything is logged at its steps.
-    7. Exogenous signals. Exogenous parameters come through an input port `exogenous`, stacked by
+    2. System. `dae` is the system, and `structure` its structure. `model` is its robot, if it is
+       one; then the output port `link_state` is (q, v) of its links.
+    3. State. `time_step` is the time between its steps in s, 0 for a continuous plant. `state`
+       returns x, shape (n,). A discrete plant uses at each step the control of that instant.
+       `projects` says whether the state is projected onto N* after each step; a record then has the
+       state before the projection.
+    4. Records. `further_signals` are the output ports in a record besides those of rule 1, with
+       names and units of their entries. `functions` names the output ports that `along` computes
+       afterwards from the log: "state", "control", "parameters" and the further ports that are not
+       among `functions`. For a plant without functions everything is logged at its steps.
+    5. Exogenous signals. Exogenous parameters come through an input port `exogenous`, stacked by
        `exogenous_layout`, in place of those at `exogenous_places`. Without a wire they keep their
        values. A plant without such a port has an empty layout and no places.
-    8. Parameters. `parameters` are those of a context in the order of `dae.parameters`,
+    6. Parameters. `parameters` are those of a context in the order of `dae.parameters`,
        `current_parameters` the same with the current exogenous ones, and `parameters_along` those
        at the times of a run. `set_parameter` changes one in a context; a plant with fixed numbers
        refuses. `further_parameters` are those that follow them in numeric parameter 0 and may be
        identified, each with its place there.
-    9. Starts. `set_state` sets x as given. `set_consistent_state` sets the state on N* next to a
+    7. Starts. `set_state` sets x as given. `set_consistent_state` sets the state on N* next to a
        guess, and returns it. Both refuse wrong shapes.
-    10. Projection. `projects` says whether the state is projected onto N* after each step; a record
-        then has the state before the projection.
-    11. Contact. `is_ideal` says whether the constraints hold exactly.
-    13. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
-        surfaces and constraint forces.
-    14. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
-        the law may not know; not negative.
+    8. Contact. `is_ideal` says whether the constraints hold exactly. `friction` are the
+       coefficients of friction of contacts, those of the plant, which the law may not know; not
+       negative. `add_own_view` adds the plant's own part of the Meshcat view.
     """
 
     __slots__ = ()

@@ -123,7 +123,9 @@ def test_plans_that_make_no_sense_are_refused(phases, message):
         (lambda: Approach(on_failure="approach"), "on_failure: 'approach' would go on as before"),
         (
             lambda: TaskController(
-                Task([Approach(guards=[Condition("control", above=1.0, name="elbow")])]), *laws()
+                Task([Approach(guards=[Condition("control", above=1.0, name="elbow")])]),
+                *laws(),
+                sample_period=1e-3,
             ),
             "no control 'elbow'",
         ),
