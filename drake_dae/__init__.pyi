@@ -129,7 +129,6 @@ from .systems.control.limits import ControlLimits as ControlLimits
 from .systems.control.phase_change import PhaseChange as PhaseChange
 from .systems.control.references import ReferenceGenerator as ReferenceGenerator
 from .systems.control.sampling import ControlHold as ControlHold
-from .systems.control.sampling import Packets as Packets
 from .systems.control.sampling import Sampling as Sampling
 from .systems.observing.estimator import StateEstimator as StateEstimator
 from .systems.observing.observer import DisturbanceObserver as DisturbanceObserver

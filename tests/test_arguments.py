@@ -322,7 +322,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "value of TaskController.set_parameter": lambda: [1.2, 0.0, 0.0],
     "plant of wire_loop": lambda: soft_wall(),
     "controller of wire_loop": lambda: dd.TaskController(
-        dd.Task([dd.Approach()]), laws()[0], laws()[1]
+        dd.Task([dd.Approach()]), laws()[0], laws()[1], sample_period=1e-3
     ),
     "integrators": lambda: {"joint1_motor": 1},
     "nominal_control": lambda: None,

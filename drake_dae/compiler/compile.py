@@ -5,8 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import casadi as ca
-import numpy as np
-from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort, PortDataType, System
+from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
@@ -82,32 +81,6 @@ def compile_part(
         {name: leaf_port(port) for name, port in outputs.items()},
     )
     return _compiled(wires, list(outputs), context, reacts=True)
-
-
-def compile_open(
-    diagram: Diagram, inputs: Sequence[InputPort], outputs: Mapping[str, OutputPort]
-) -> CompiledDiagram:
-    """Compiles a part of a diagram, with some input ports of its systems as parameters.
-
-    The connections to these ports are cut, all others stay. With the plant's control cut, for
-    example, the result is the plant with its exogenous signals. Raises as `compile_diagram` does.
-
-    Args:
-        diagram: The diagram.
-        inputs: The input ports to cut; `CompiledDiagram.fixed` says where their values are among
-            the parameters.
-        outputs: Name -> the output port, of a system in the diagram, that is computed.
-    """
-    wires, context = Wires.of(diagram), diagram.CreateDefaultContext()
-    cut = {(port.get_system(), int(port.get_index())) for port in inputs}
-    for port in inputs:
-        port.FixValue(port.get_system().GetMyMutableContextFromRoot(context), np.zeros(port.size()))
-    sources = {port: source for port, source in wires.sources.items() if port not in cut}
-    systems = tuple(each for each in wires.systems if not getattr(each, "ends_runs", False))
-    ports = {name: leaf_port(port) for name, port in outputs.items()}
-    return _compiled(
-        replace(wires, systems=systems, sources=sources, outputs=ports), list(outputs), context
-    )
 
 
 def with_twins(compiled: CompiledDiagram) -> CompiledDiagram:

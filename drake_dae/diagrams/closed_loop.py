@@ -12,10 +12,9 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.diagrams.drives import LinkWithNoise
 from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import seed_noise
-from drake_dae.diagrams.state_feedback import MeasuredState, PacketsWithNoise
+from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.simulation.records.afterwards import completed
 from drake_dae.simulation.records.record import Record, computed_record, recorded_values
@@ -49,8 +48,6 @@ class ClosedLoop:
         plant_exogenous: The generator of the exogenous signals for the plant, or None.
         encoders: The sensor of the state for the law, or None.
         observer: The observer of the disturbance or the state, or None.
-        link: The link to the drives, with jitter and losses, or None.
-        packets: The link from the sensors, with late and lost measurements, or None.
         memory: A cache for rollouts and starts.
     """
 
@@ -68,8 +65,6 @@ class ClosedLoop:
     plant_exogenous: ReferenceGenerator | None = None
     encoders: MeasuredState | None = None
     observer: Observer | None = None
-    link: LinkWithNoise | None = None
-    packets: PacketsWithNoise | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
@@ -94,12 +89,10 @@ class ClosedLoop:
         """The port of the state that the controller gets: estimated, measured, or the plant's."""
         if self.observer is not None and self.observer.HasOutputPort("estimated_state"):
             return self.observer.GetOutputPort("estimated_state")
-        if self.packets is not None:
-            return self.packets.state
         return self.plant.GetOutputPort("state") if self.encoders is None else self.encoders.output
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Sets the seed of the noise of the force sensor, and of losses and delays on the links.
+        """Sets the seed of the noise of the force sensor.
 
         Without it they are the same in every run of a loop.
 
@@ -108,9 +101,6 @@ class ClosedLoop:
             seed: The seed of the random numbers.
         """
         seed_noise(self.noise, context, seed)
-        for link in (self.link, self.packets):
-            if link is not None:
-                link.set_seed(context, seed)
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the state x of the plant, without a projection onto the constraints.

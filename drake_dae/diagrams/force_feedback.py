@@ -8,7 +8,6 @@ from pydrake.systems.primitives import RandomSource
 
 from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import add_noise
-from drake_dae.diagrams.state_feedback import PacketsWithNoise
 from drake_dae.errors import WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.sampling import Sampling
@@ -22,7 +21,6 @@ def add_force_feedback(
     controller: Controller,
     sensor: ForceSensor | None,
     sampling: Sampling | None,
-    packets: PacketsWithNoise | None = None,
     others: Sequence[Observer] = (),
 ) -> RandomSource | None:
     """Connects the constraint force to the controller, through the sensor if there is one.
@@ -33,7 +31,6 @@ def add_force_feedback(
         controller: The controller, whose law uses a measured force.
         sensor: The sensor; None for the exact force.
         sampling: The sampling of the control; None for continuous control.
-        packets: The way from the sensors to the law; None if all measurements arrive.
         others: Further blocks that use the measured force.
 
     Returns:
@@ -49,9 +46,6 @@ def add_force_feedback(
         force = sensor.GetOutputPort("measured_force")
         period = sensor.sample_period or sensor.time_constant
         noise = add_noise(builder, sensor, period, "force_noise")
-    if packets is not None:
-        builder.Connect(force, packets.block.GetInputPort("force"))
-        force = packets.block.GetOutputPort("measured_force")
     builder.Connect(force, controller.GetInputPort("measured_force"))
     if controller.HasOutputPort("tared_force"):
         force = controller.GetOutputPort("tared_force")

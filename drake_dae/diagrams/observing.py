@@ -70,7 +70,7 @@ def add_observer(
             "closed contact: make the law with measured_force=True (in a scenario: force_feedback: "
             "!MeasuredForce {sample_period: ...})"
         )
-    late = 0.0 if sampling is None else sampling.mean_delay + step
+    late = 0.0 if sampling is None else sampling.delay + step
     lag, delay = control_lag(plant, sampling), late + period / 2.0
     observer: Observer
     if observing.state_rate is None:
@@ -104,7 +104,7 @@ def control_lag(plant: Plant, sampling: Sampling | None) -> float:
     """
     step = plant.time_step
     period = step if sampling is None else sampling.period
-    rest = 0.0 if sampling is None else sampling.rest + sampling.jitter / 2.0
+    rest = 0.0 if sampling is None else sampling.rest
     return min((rest + step) / period, 1.0) if period else 0.0
 
 

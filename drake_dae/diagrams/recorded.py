@@ -7,9 +7,8 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSi
 
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.diagrams.drives import LinkWithNoise
 from drake_dae.diagrams.observing import Observer
-from drake_dae.diagrams.state_feedback import MeasuredState, PacketsWithNoise
+from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.simulation.sampled import SampleLog
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
@@ -80,8 +79,6 @@ def signals_of_parts(
     plant: Plant,
     controller: Controller,
     measured: MeasuredState | None,
-    packets: PacketsWithNoise | None,
-    link: LinkWithNoise | None,
     limits: ControlLimits | None,
     observer: Observer | None,
     sensor: ForceSensor | None,
@@ -89,17 +86,11 @@ def signals_of_parts(
     """The further signals of controller, parts and plant that a record contains."""
     dae, named = plant.dae, Named()
     estimates = observer is not None and observer.HasOutputPort("estimated_state")
-    arriving = None if measured is None else measured.output
-    if packets is not None:
-        arriving = packets.state
-        named["lost_measurements"] = (packets.missed, packets.block.signals)
-    if arriving is not None:
+    if measured is not None:
         name = "measured_state" if estimates else "estimated_state"
-        named[name] = (arriving, dae.state_signals)
+        named[name] = (measured.output, dae.state_signals)
     if observer is not None and estimates:
         named["estimated_state"] = (observer.GetOutputPort("estimated_state"), dae.state_signals)
-    if link is not None:
-        named["lost_controls"] = (link.block.GetOutputPort("lost_controls"), link.block.signals)
     if limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
     for block in (controller, observer):

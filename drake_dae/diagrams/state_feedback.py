@@ -1,4 +1,4 @@
-"""The wire from a plant's state to its law, through encoders, and in packets that may be lost."""
+"""The wire from a plant's state to its law, through encoders."""
 
 from dataclasses import dataclass
 
@@ -10,16 +10,11 @@ from drake_dae.diagrams.sources import add_noise, seed_noise
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.robots.links.links import velocities_are_rates
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
-from drake_dae.systems.sensing.packets import MeasurementLink
 
 ENCODER_NOISE = "encoder_noise"
 """The name of the source of the noise of encoders."""
-
-PACKET_NOISE = "packet_noise"
-"""The name of the source of random numbers of late and lost measurements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,56 +104,3 @@ def add_encoders(
     builder.AddSystem(sensor)
     builder.Connect(plant.GetOutputPort("state"), sensor.GetInputPort("state"))
     return MeasuredState(sensor, add_noise(builder, sensor, period, ENCODER_NOISE))
-
-
-@dataclass(frozen=True, eq=False)
-class PacketsWithNoise:
-    """The link from the sensors to a law.
-
-    Attributes:
-        block: The link.
-        noise: The source of its random numbers.
-    """
-
-    block: MeasurementLink
-    noise: RandomSource | None
-
-    @property
-    def state(self) -> OutputPort:
-        """The state that the law gets."""
-        return self.block.GetOutputPort("estimated_state")
-
-    @property
-    def missed(self) -> OutputPort:
-        """The number of samples since its measurement."""
-        return self.block.GetOutputPort("missed")
-
-    def set_seed(self, context: Context, seed: int) -> None:
-        """Sets the seed of the random numbers, below 2^32, in the context of the diagram."""
-        seed_noise(self.noise, context, packet_seed(seed))
-
-
-def packet_seed(seed: int) -> int:
-    """The seed of the packets for a user's seed below 2^32, so that its numbers are independent."""
-    return (seed + 3 * 2**30) % 2**32
-
-
-def add_packets(
-    builder: DiagramBuilder, state: OutputPort, forces: int, sampling: Sampling | None
-) -> PacketsWithNoise | None:
-    """Adds the link behind the sensors, if measurements may be late or lost.
-
-    Its input port `force` is left open: `add_force_feedback` connects it.
-
-    Args:
-        builder: The builder of the diagram.
-        state: The measured state.
-        forces: The number of forces that the law measures.
-        sampling: The sampling of the law.
-    """
-    if sampling is None or sampling.measurements is None:
-        return None
-    link = MeasurementLink(state.size(), forces, sampling.measurements, sampling.period)
-    block = builder.AddSystem(link)
-    builder.Connect(state, block.GetInputPort("state"))
-    return PacketsWithNoise(block, add_noise(builder, block, sampling.period, PACKET_NOISE))

@@ -69,10 +69,10 @@ class _Prepared:
     structure: Structure
 
 
-def _prepared(scenario: Scenario, scene_graph: SceneGraph, drawn: bool = True) -> _Prepared:
+def _prepared(scenario: Scenario, scene_graph: SceneGraph) -> _Prepared:
     if scenario.task is not None:
         check_task(scenario)
-    completed, model = completed_model(scenario, scene_graph, drawn=drawn)
+    completed, model = completed_model(scenario, scene_graph)
     try:
         structure = scenario_structure(model)
     except AssumptionError as error:

@@ -18,7 +18,7 @@ def latency_of(scenario: Scenario, model: RobotModel) -> float:
     step = 0.0 if material is None else material.time_step
     if model.stages:
         return 0.0
-    return step if sampling is None else sampling.mean_delay + (sampling.period + step) / 2.0
+    return step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
 
 
 def observed_structure(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:

@@ -10,12 +10,9 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.drives import LINK_NOISE, link_seed
 from drake_dae.diagrams.state_feedback import (
     ENCODER_NOISE,
-    PACKET_NOISE,
     encoder_seed,
-    packet_seed,
 )
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
@@ -135,9 +132,6 @@ def _seeds(scenario: Scenario) -> dict[str, int]:
         seeds["force_noise"] = scenario.force_feedback.seed
     if scenario.encoders is not None:
         seeds[ENCODER_NOISE] = encoder_seed(scenario.encoders.seed)
-    if scenario.sampling is not None:
-        seeds[LINK_NOISE] = link_seed(scenario.sampling.seed)
-        seeds[PACKET_NOISE] = packet_seed(scenario.sampling.seed)
     return seeds
 
 

@@ -82,9 +82,6 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
     loop.set_seed(context, scenario.force_feedback.seed)
     if loop.encoders is not None and scenario.encoders is not None:
         loop.encoders.set_seed(context, scenario.encoders.seed)
-    for link in (loop.link, loop.packets):
-        if link is not None and scenario.sampling is not None:
-            link.set_seed(context, scenario.sampling.seed)
 
 
 def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
@@ -171,30 +168,22 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
 
     Exogenous ones are measured: law and plant have the same.
     """
-    if "of law" not in loop.memory:  # They are the same in all runs.
-        dae, system = loop.plant.dae, loop.controller.law.system
-        moving = {p.name for p in dae.exogenous.moving}
-        sizes = {p.name: p.value.size for p in system.parameters}
-        known, assumed = np.full(parameters.size, np.nan), system.parameter_values
-        for p in dae.parameters:
-            if p.name not in moving and sizes.get(p.name) == p.value.size:
-                known[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
-        places = np.flatnonzero(~np.isnan(known))
-        loop.memory["of law"] = places, known[places]
-    places, known = loop.memory["of law"]
+    dae, system = loop.plant.dae, loop.controller.law.system
+    moving = {p.name for p in dae.exogenous.moving}
+    sizes, assumed = {p.name: p.value.size for p in system.parameters}, system.parameter_values
     of_law = parameters.copy()
-    of_law[places] = known
+    for p in dae.parameters:
+        if p.name not in moving and sizes.get(p.name) == p.value.size:
+            of_law[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
     return of_law
 
 
 def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
     """The gains of a scenario; those of the last run are reused if the design is the same."""
-    last, last_key, design = loop.memory.get("gains", (None, "", None))
-    if last is not gains:
-        if last_key != (key := repr(gains)):
-            law = loop.controller.law
-            design = law.design(gains.design())
-        loop.memory["gains"] = gains, key, design
+    key, design = loop.memory.get("gains", ("", None))
+    if key != repr(gains):
+        design = loop.controller.law.design(gains.design())
+        loop.memory["gains"] = repr(gains), design
     return cast(FeedbackGains, design)
 
 

@@ -97,7 +97,7 @@ def summary(
     is_compliant = "contact_force" in record
     kind = "in compliant contact" if is_compliant else "before each step's projection"
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
-    notes += [*_identified(record), *_lost(record)]
+    notes += _identified(record)
     notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
     ended = ""
     if run is not None:
@@ -233,18 +233,6 @@ def _estimated(record: Record) -> list[str]:
         names = ", ".join(unknown)
         found.append(f"not identified       {names}: this motion does not excite them")
     return found
-
-
-def _lost(record: Record) -> list[str]:
-    """The controls that did not arrive at the drives, and the measurements not at the law."""
-    lines, total = [], max(float(record.time[-1] - record.time[0]), 1e-300)
-    for name in ("lost_controls", "lost_measurements"):
-        if name in record.signals:
-            lost, title = record[name][:, 0], name.replace("_", " ")
-            share = float(np.diff(record.time) @ (lost[1:] > 0.0)) / total
-            most = f"at most {lost.max():g} in a row"
-            lines.append(f"{title:<20} in {share:.2%} of the time, {most}")
-    return lines
 
 
 def _number(value: float, size: float, digits: int) -> str:

@@ -99,9 +99,10 @@ def sweep(
     _check(base, chosen)
     simulated = for_rollout(scenario)[0] if rollout else scenario
     structures = [json.dumps(structure_of(each, simulated), sort_keys=True) for each in chosen]
-    count, lasting = len(set(structures)), None
+    num_structures, lasting = len(set(structures)), None
     if rollout:
-        lasting = sum(each.get("duration", scenario.duration) for each in chosen) / count
+        durations = (each.get("duration", scenario.duration) for each in chosen)
+        lasting = sum(d for d in durations if isinstance(d, (int, float))) / num_structures
     head = {"drake_dae": version("drake_dae"), "rollout": json.dumps(rollout)}
     head |= {key: json.dumps(part) for key, part in base.items()}
     head["variations"] = json.dumps(chosen)
@@ -112,51 +113,52 @@ def sweep(
         with open_journal(path, head) as journal:
             # Runs of one structure follow each other, so that a process keeps its loop.
             order = sorted(range(len(chosen)), key=structures.__getitem__)
-            missing = [run for run in order if not journal.is_done(run)]
-            results: dict[int, RunResult] = {}
-            if missing:
-                count = min(workers or num_cores(), len(missing))
-                running, ahead = _processes(count, time_limit, len(set(structures))), 4 * count
+            todo = {run: chosen[run] for run in order if not journal.is_done(run)}
+            if todo:
+                count = min(workers or num_cores(), len(todo))
+                running, ahead = _processes(count, time_limit, num_structures), 4 * count
                 if executor is not None:
                     running, ahead = _submitted_to(executor), AHEAD
-                with running as submit, _bar(len(chosen), len(missing), progress) as bar:
-                    todo = {run: chosen[run] for run in missing}
-                    for some in _ended(todo, settings, submit, ahead, journal):
-                        journal.add(some)
-                        results |= some
-                        bar.update(len(some))
-            results |= journal.results()
+                with running as submit, _bar(len(chosen), len(todo), progress) as bar:
+                    _run(todo, partial(submit, settings), ahead, journal, bar)
+            results = journal.results()
     return Study(tuple(chosen), tuple(results[run] for run in range(len(chosen))))
 
 
-def _ended(
-    runs: Mapping[int, Variation], settings: str, submit: Submit, ahead: int, journal: Journal
-) -> Iterator[dict[int, RunResult]]:
-    """Makes runs; yields the results of those that have ended, by their numbers."""
+def _run(
+    runs: Mapping[int, Variation],
+    submit: Callable[[Variation], "Future[RunResult]"],
+    ahead: int,
+    journal: Journal,
+    bar: Any,
+) -> None:
+    """Makes runs, and writes their results when they end."""
     ended: SimpleQueue[tuple[int, Future[RunResult]]] = SimpleQueue()
     waiting, running = list(runs.items())[::-1], 0
     while waiting or running:
         while waiting and running < ahead:
             run, variation = waiting.pop()
             if journal.is_done(run):  # By another process meanwhile.
+                bar.update()
                 continue
             put = partial(lambda run, future: ended.put((run, future)), run)
-            submit(settings, variation).add_done_callback(put)
+            submit(variation).add_done_callback(put)
             running += 1
         results = dict[int, RunResult]()
         while running and (not results or not ended.empty()):
             run, future = ended.get()
             results[run] = _result(future)
             running -= 1
-        yield results
+        journal.add(results)
+        bar.update(len(results))
 
 
 def _result(future: "Future[RunResult]") -> RunResult:
     """The result of a run that has ended, or been lost."""
     try:
         return future.result()
-    except TimeoutError as error:
-        return RunResult(Outcome.TIMED_OUT, f"no end within {error.args[-1]:g} s")
+    except TimeoutError:
+        return RunResult(Outcome.TIMED_OUT, "no end within its time limit")
     except BrokenExecutor as error:
         raise ModelError(f"the processes of the sweep have ended: {error}") from error
     except ProcessExpired as error:

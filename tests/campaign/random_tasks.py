@@ -42,7 +42,7 @@ constraints:
   friction: 0.0
 outputs:
 - {{frame: tool, axes: z}}
-sampling: {{period: 0.001, delay: 0.001{link}}}
+sampling: {{period: 0.001, delay: 0.001}}
 start: {{positions: {{joint1: 1.1653, joint2: -1.8326}}}}
 duration: 6
 plant: {plant}
@@ -61,8 +61,6 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     noise, bias = draw.choice((0.0, 0.1, 0.3)), draw.choice((0.0, 0.0, -1.0, 0.5, 1.0))
     drift = draw.choice((0.0, 0.0, 0.05, -0.05))
     sensor = f"{{sample_period: 0.001, noise_deviation: {noise}, bias: {bias}, drift: {drift}}}"
-    lost = f", loss: {draw.uniform(0.0, 0.01)}, burst: {draw.randrange(1, 5)}"
-    link = draw.choice(("", "", f"{lost}, most_lost: 20, seed: {draw.randrange(1000)}"))
     settings, moved = [], False
     stiffness, friction = 10 ** draw.uniform(4.0, 6.0), draw.uniform(0.0, 0.6)
     plant = f"!CompliantContact {{radius: 1e-5, stiffness: {stiffness}, friction: {friction}}}"
@@ -114,14 +112,9 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     first = draw.uniform(0.0, 3.0)
     ramp = f"start: [0], end: [1], start_time: {first}, end_time: {first + 0.1}"
     waits = any("ready" in phase for phase in phases)
-    if draw.random() < 0.3:
-        late, loss, burst = draw.uniform(0.0, 0.2), draw.uniform(0.0, 0.02), draw.randrange(1, 5)
-        packets = f"late: {late}, loss: {loss}, burst: {burst}, most_lost: 20"
-        link += f", measurements: {{{packets}}}"
     text = TEXT.format(
         plant=plant,
         sensor=sensor,
-        link=link,
         settings="\n".join(filter(None, settings)),
         tare=0.1 if bias else draw.choice((0.0, 0.1)),
         signals=f"{{ready: !PointToPoint {{{ramp}}}}}" if waits else "{}",

@@ -76,7 +76,7 @@ def test_how_small_is_nothing_can_be_set(small):
             **more,
         )
 
-    with pytest.warns(NegligibleWarning, match=r"derivative 1 of 'z0' is less than 1e-11 of the"):
+    with pytest.warns(NegligibleWarning, match=r"'z0'.*1e-11"):
         assert find_structure(system()).output_degrees == (2,)
     assert find_structure(system(negligible=1e-14)).output_degrees == (1,)
 
@@ -92,7 +92,7 @@ def test_a_zero_that_was_rounded_is_one_without_a_word(typed):
 @pytest.mark.parametrize("key", ["least_margin", "negligible"])
 @pytest.mark.parametrize("value", [0.0, -1e-6, 1e-20, 1.0, float("nan")])
 def test_thresholds_that_make_no_sense(key, value):
-    with pytest.raises(ModelError, match=f"{key} must be from 1e-15"):
+    with pytest.raises(ModelError, match=key):
         nearly_singular(0.1, **{key: value})
 
 

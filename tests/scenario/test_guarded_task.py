@@ -220,28 +220,6 @@ def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):
     assert not found[0].record["constraint_force"][found[0].record.time < touch].any()
 
 
-@pytest.mark.slow
-def test_a_task_goes_on_while_controls_are_late_and_lost(file):
-    """Every tenth control is lost, three in a row, and half of them are late: it is done."""
-    link = "period: 0.002, delay: 0.001, jitter: 0.0005, loss: 0.04, burst: 3, most_lost: 20"
-    change = [f"sampling={{{link}}}", "plant.time_step=0.0005", TOLERANT, "duration=2"]
-    found, changes = rolled(load_scenario(file, change))
-    assert found.failure is None
-    assert changes[-1].phase == "done"
-    lost = found.record["lost_controls"][:, 0]
-    assert lost.max() >= 3.0
-    assert 0.05 < np.mean(lost > 0.0) < 0.2
-
-
-def test_a_task_ends_where_the_robot_stops_by_itself(file):
-    """With the reason and the record up to there."""
-    link = "sampling={period: 0.002, delay: 0.001, loss: 0.01, burst: 20, most_lost: 20}"
-    found, changes = rolled(load_scenario(file, [link]))
-    assert "20 controls in a row were lost (sampling.most_lost)" in str(found.failure)
-    assert found.record.time[-1] <= found.failure.time
-    assert changes[-1].phase not in ("done", "held")
-
-
 HELD_PHASES = {
     "Press": "!Press {force: 10, over: 1.0, within: 3, if_lost: away, on_failure: fail}",
     "Dwell": "!Dwell {duration: 1.0, if_lost: away, on_failure: fail}",

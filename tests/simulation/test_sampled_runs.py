@@ -28,10 +28,7 @@ LOOPS = {
         "encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}",
     ),
     "noise": ("wall_point_contact", NOISE),
-    "a link that is late and loses": (
-        "wall_point_contact",
-        "sampling={period: 2.0e-3, delay: 3.0e-3, jitter: 1.0e-3, loss: 0.02, seed: 5}",
-    ),
+    "a control that is late": ("wall_point_contact", "sampling={period: 2.0e-3, delay: 3.0e-3}"),
     "drives with limits": ("wall_point_contact", "saturation=true"),
     "a start between two samples": ("wall_point_contact", "integrator.start_time=0.0104"),
 }

@@ -68,7 +68,6 @@ MOST_FILES, MOST_LINES = 12, 350
 # Longer files, each with the reason why it is one.
 LONG = {
     "drake_dae.dae.system.system": "one class: the fields of (1)-(3), and the same with others",
-    "drake_dae.systems.plants.dae_plant": "one class: ports, steps, projection",
 }
 
 # Distributions whose modules bear another name.

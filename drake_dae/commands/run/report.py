@@ -7,8 +7,8 @@ from typing import Any
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.diagrams.clearances import links_in_the_way, nearness
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.robots.links_behind import LinkBehind, links_behind
 from drake_dae.scenario.feasibility.limits import limits_of_run
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.job import JobOutcome, JobVerdict, judge_job
@@ -75,7 +75,10 @@ def report_run(
     fixed = loop.plant.time_step or not config.use_error_control
     accuracy = None if fixed else config.accuracy
     reasons = _reasons(scenario, loop, record)
-    near = nearness(loop, record, context)
+    behind: tuple[LinkBehind, ...] = ()
+    if model is not None:
+        own = loop.plant_parameters(record, context)
+        behind = links_behind(model, record.time, record["state"], own)
     changes = loop.changes(context)
     is_interrupted = statistics is not None and statistics.interrupted is not None
     job = judge_job(
@@ -85,7 +88,7 @@ def report_run(
         [
             *shortfalls(record, limits),
             *exceeded,
-            *map(str, links_in_the_way(loop, record, context)),
+            *map(str, behind),
         ],
         limits.pushing,
         changes,
@@ -95,7 +98,6 @@ def report_run(
     verdict = judge(record, predicted, accuracy)
     lines = [summary(record, predicted, limits, statistics, failure, accuracy, reasons)]
     lines += _contact_remarks(scenario, loop, record)
-    lines += map(str, (*near.distances, *near.speeds))
     lines += reference_remarks({**scenario.references, **scenario.exogenous, "task": scenario.task})
     lines += _task_remarks(scenario, changes, statistics)
     is_unexplained = verdict.tracking is TrackingResult.OFF and not reasons
@@ -103,7 +105,7 @@ def report_run(
         "missed": job.outcome is JobOutcome.BAD or is_unexplained,
         "job": job.to_dict(),
         "phases": [asdict(change) for change in changes],
-        **asdict(near),
+        "behind": [asdict(link) for link in behind],
         **as_data(verdict, reasons),
         "interrupted": is_interrupted,
         **{
@@ -154,12 +156,6 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
-        "controls are late or lost on their way (sampling)": not (
-            scenario.sampling is None or scenario.sampling.is_exact
-        ),
-        "measurements are late or lost on their way (sampling.measurements)": (
-            scenario.sampling is not None and scenario.sampling.measurements is not None
-        ),
     }
     return [reason for reason, holds in reasons.items() if holds]
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from math import isfinite
 
 import casadi as ca
+import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
@@ -12,8 +13,12 @@ from drake_dae.dae.manifold.residual import Residual
 from drake_dae.dae.manifold.search import CONSISTENT, ConsistentStateSearch
 from drake_dae.dae.manifold.settling import Settling
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import ModelError
+from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import norm
+from drake_dae.trace.round_off import positive
+
+PROBE = 1e-4
+"""The distance at which poles show, in states over their scale."""
 
 FLOOR = 1e-12
 """A distance from N* that is round-off even if all states are zero."""
@@ -59,7 +64,8 @@ class Manifold(Residual):
         x, p = self._state(state), self.system.parameter_vector(parameters)
         reach = float(self._first_steps.evaluate(x, p)[0][1])
         if isfinite(reach) and reach > 0.0:
-            return reach <= CONSISTENT * norm(x / self.scale) + FLOOR
+            is_near = reach <= CONSISTENT * norm(x / self.scale) + FLOOR
+            return is_near and not self._is_at_pole(x, p)
         # Dependent gradients, a residual of zero, or one that no state changes.
         return self.relative_size(x, p) <= CONSISTENT
 
@@ -82,7 +88,33 @@ class Manifold(Residual):
             ModelError: The state has a wrong shape.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
-        return self.projected(start, p)
+        found = self.projected(start, p)
+        if self._is_at_pole(found, p):
+            left = self.residual_function(found, p)[0]
+            worst = int(np.argmax(np.abs(left)))
+            raise InconsistentStateError(
+                f"{self.system.name}: {self.residual_signals[worst].name} = {left[worst]:.3g} is "
+                "left at a pole of the constraint, as where a rotation is half a turn off: start "
+                "nearer to the constraint",
+                left,
+            )
+        return found
+
+    def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
+        """Whether the residual is large though Newton's step is short.
+
+        Near a pole the step is the distance to it. The residual then falls along the step, while it
+        grows from a consistent state, whose own is round-off.
+        """
+        step = self._first_steps.evaluate(x, p)[2]
+        length = norm(step / self.scale)
+        if not (isfinite(length) and length > 0.0):
+            return False
+        here, there = (
+            self.residual_function(state, p)[0] for state in (x, x + PROBE / length * step)
+        )
+        lengths = positive(np.linalg.norm(self.gradients(x, p) * self.scale, axis=1))
+        return bool(norm(there / lengths) < norm(here / lengths))
 
     def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
@@ -122,7 +154,7 @@ class Manifold(Residual):
             return start
         near = self.first_steps(start, p)
         if near is not None and 0.0 < self._first_steps.outputs[0][1] <= FLOOR:
-            return near.copy()  # It was there up to round-off, which no level would move.
+            return self.project(start, p)  # It was there up to round-off, which no level moves.
         settled = self._settling.settled(start, p)
         return self.project(start if settled is None else settled, p)
 

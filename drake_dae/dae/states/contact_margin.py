@@ -13,17 +13,9 @@ from drake_dae.dae.states.region import ConsistentRegion
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.system.contacts import critical_factor
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import ModelError
-from drake_dae.trace.functions import TracedFunction
 
 MEANINGLESS = 1e6
 """Critical coefficients above this are meaningless: they occur where sliding is only round-off."""
-
-FAST = 1e3
-"""A sliding speed in m/s at which friction is fully developed."""
-
-FLAT = 1e-9
-"""The ratio of singular values of sliding velocities below which they do not span a direction."""
 
 CLOSER = (0.9, 0.99)
 """The fractions of the lowest critical friction so far for which a paradoxical state is sought."""
@@ -109,66 +101,6 @@ class ContactMargins:
         """Returns the smallest margin along a motion of at least one state."""
         rows = zip(states, parameters, times.tolist(), strict=True)
         return min((self.at(*row) for row in rows), key=_first)
-
-    def in_worst_directions(
-        self, states: FloatArray, parameters: FloatArray, velocities: slice, times: FloatArray
-    ) -> ContactMargin:
-        """Returns the smallest margin along a motion if each contact slides in its worst direction.
-
-        Friction that opposes sliding in the direction s leaves A_ii = a_0 - mu a^T s of a contact,
-        which is least for s = a / |a|. The velocities of each state are replaced by others with
-        these directions; with several contacts each slides in the direction that is worst for it
-        alone, as far as the robot can move so.
-
-        Args:
-            states: Shape (N, n).
-            parameters: The values of all parameters, with positive coefficients of friction.
-            velocities: The velocities among the states.
-            times: Of the states, in s, shape (N,).
-
-        Raises:
-            ModelError: The sliding velocities of a contact are not known.
-        """
-        sliding = self._sliding(velocities)
-        worst = [self._with_worst_directions(x, parameters, velocities, sliding) for x in states]
-        return self.along(times, np.array(worst), np.tile(parameters, (len(worst), 1)))
-
-    def _with_worst_directions(
-        self, x: FloatArray, parameters: FloatArray, velocities: slice, sliding: TracedFunction
-    ) -> FloatArray:
-        """The state with the velocities of `in_worst_directions`."""
-        without, state = self._with_friction(parameters, 0.0), x.copy()
-        size = len(self._system.constraint_input_signals)
-        count = velocities.stop - velocities.start
-        A_0 = self._values(x, without)[0].reshape(size, size)
-        slopes = [slope.reshape(-1, count) for slope in sliding(x, without)]
-        directions = []
-        for i, slope in zip(self._contacts.rows, slopes, strict=True):
-            left, sizes, right = np.linalg.svd(slope, full_matrices=False)
-            rank = np.count_nonzero(sizes > FLAT * sizes.max(initial=0.0))
-            losses = np.zeros(rank)
-            for j in range(rank):  # Here the contact slides along column j of `left`.
-                state[velocities] = FAST / sizes[j] * right[j]
-                A = self._values(state, parameters)[0].reshape(size, size)
-                losses[j] = A_0[i, i] - A[i, i]
-            length = np.linalg.norm(losses)
-            directions.append(left[:, :rank] @ losses / (length if length > 0.0 else 1.0))
-        wanted = FAST * np.concatenate(directions)
-        state[velocities] = np.linalg.lstsq(np.vstack(slopes), wanted, rcond=FLAT)[0]
-        return state
-
-    def _sliding(self, velocities: slice) -> TracedFunction:
-        """x -> the derivatives of the sliding velocities of each contact by the velocities."""
-        rates, slopes = self._system.state[velocities], {}
-        inputs = [signal.name for signal in self._system.constraint_input_signals]
-        for contact in self._system.contacts:
-            if contact.force not in inputs:
-                continue
-            if contact.friction and contact.sliding is None:
-                raise ModelError(f"the sliding velocities of {contact.force} are not known")
-            still = ca.SX(1, 1) if contact.sliding is None else contact.sliding
-            slopes[contact.force] = ca.densify(ca.jacobian(still, rates))
-        return self._system.trace("slopes of sliding", slopes, often=False)
 
     def _downhill(
         self, box: ConsistentRegion, start: ContactMargin, parameters: FloatArray

@@ -4,11 +4,12 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.geometry import Box, Capsule, Convex, Cylinder, Ellipsoid, Mesh, SceneGraph, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -24,6 +25,18 @@ from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.joints import ElementaryJoints, constant_pose, elementary_joints
 from drake_dae.robots.links.tree import TreeLink, link_poses
+
+MOST_CORNERS = 200
+"""The largest number of points of a mesh."""
+
+
+class Outline(NamedTuple):
+    """Points of a link in one of its frames, m, shape (k, 3), and a radius around them in m."""
+
+    name: str
+    frame: Any
+    points: FloatArray = np.zeros((1, 3))
+    radius: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,3 +210,48 @@ def joint_names(plant: MultibodyPlant) -> dict[str, Joint]:
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     moving = [joint for joint in joints if joint.num_velocities() > 0]
     return dict(zip(unique_names(plant, moving), moving, strict=True))
+
+
+def outlines_of(
+    plant: MultibodyPlant, scene_graph: SceneGraph | None, bodies: list[RigidBody]
+) -> tuple[Outline, ...]:
+    """The outline of each collision geometry of bodies; of a body without any, its origin."""
+    found = []
+    inspector: Any = scene_graph and scene_graph.model_inspector()
+    for body in bodies:
+        frame, name, own = body.body_frame(), body.name(), []
+        for geometry in plant.GetCollisionGeometriesForBody(body) if inspector else ():
+            points, radius = _corners(inspector.GetShape(geometry))
+            placed = inspector.GetPoseInFrame(geometry).multiply(points.T).T
+            own += [Outline(name, frame, placed, radius)] if len(points) else []
+        found += own or [Outline(name, frame)]
+    return tuple(found)
+
+
+def _corners(shape: object) -> tuple[FloatArray, float]:
+    """Points of a shape, and its radius around these; no points for unbounded shapes."""
+    grid = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1).T
+    match shape:
+        case Sphere():
+            return np.zeros((1, 3)), shape.radius()
+        case Capsule():
+            return np.linspace(
+                [0.0, 0.0, -0.5], [0.0, 0.0, 0.5], 9
+            ) * shape.length(), shape.radius()
+        case Cylinder():
+            turns = np.pi * np.arange(16) / 8
+            ring = shape.radius() * np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])
+            ends = np.array([-0.5, 0.0, 0.5])[:, None, None] * [0.0, 0.0, shape.length()]
+            return (ring + ends).reshape(-1, 3), 0.0
+        case Box():
+            return grid * shape.size() / 2.0, 0.0
+        case Ellipsoid():
+            directions = grid[np.any(grid, axis=1)]
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            return directions * [shape.a(), shape.b(), shape.c()], 0.0
+        case Mesh() | Convex():
+            hull = shape.GetConvexHull()
+            count = hull.num_vertices()
+            chosen = np.unique(np.linspace(0, count - 1, MOST_CORNERS).astype(int))
+            return np.array([hull.vertex(int(i)) for i in chosen]), 0.0
+    return np.zeros((0, 3)), 0.0

@@ -8,6 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.robots.links.articulated import ArticulatedBodies
+from drake_dae.robots.links.frames import Outline
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 
 
@@ -105,6 +106,10 @@ class Links(Frames, Protocol):
     @property
     def landmark_names(self) -> tuple[str, ...]:
         """The names of the frames whose origins the landmarks are, k of them."""
+
+    @property
+    def outlines(self) -> tuple[Outline, ...]:
+        """Points of the collision geometry of each link, of one without any its origin."""
 
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
         """The frames in motion, in which constraints are expressed.

@@ -5,6 +5,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody
 
@@ -15,7 +16,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.links.articulated import ArticulatedBodies, is_one_by_one
 from drake_dae.robots.links.comparison import compare_with_plant
 from drake_dae.robots.links.force_elements import Springs, check_force_elements
-from drake_dae.robots.links.frames import PlantFrames, position_of, unique_names
+from drake_dae.robots.links.frames import PlantFrames, outlines_of, position_of, unique_names
 from drake_dae.robots.links.joints import (
     check_joint,
     clean,
@@ -52,6 +53,10 @@ class MultibodyExpressions:
     Drake's order. On construction M, N and every part of H are compared with the plant's own
     values at random states.
 
+    Args:
+        plant: The plant.
+        scene_graph: The scene graph with its geometry; without one links are their origins.
+
     Attributes:
         plant: The plant.
         q, v: Symbols, shapes (nq, 1) and (nv, 1), with nq = nv.
@@ -71,15 +76,17 @@ class MultibodyExpressions:
         gear_ratios: Motor turns per joint turn, shape (nu,).
         position_limits, velocity_limits: The lower and upper limits, shapes (nq,) and (nv,).
         default_positions: The plant's default configuration, shape (nq,).
+        outlines: Points of the collision geometry of each body.
 
     Raises:
         ModelError: The plant is not finalized, cannot move, or has a joint or force element that
             is not supported; or the comparison with the plant failed.
     """
 
-    def __init__(self, plant: MultibodyPlant) -> None:
+    def __init__(self, plant: MultibodyPlant, scene_graph: SceneGraph | None = None) -> None:
         _check_support(plant)
         self.plant = plant
+        self.outlines = outlines_of(plant, scene_graph, _bodies(plant))
         self._joints = _moving_joints(plant)
         self._read_signals()
         self._read_actuators()

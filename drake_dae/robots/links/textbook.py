@@ -13,6 +13,7 @@ from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae.system.expressions import as_expression
 from drake_dae.dae.system.signals import Parameter, Signal, is_symbol, signals
 from drake_dae.errors import ModelError
+from drake_dae.robots.links.frames import Outline
 from drake_dae.robots.links.kinematics import ORIGIN, Kinematics, Reaction
 
 
@@ -137,6 +138,11 @@ class LinkExpressions:
     def landmark_names(self) -> tuple[str, ...]:
         """The names of all frames, in the order of the landmarks."""
         return ("world", *self.frames)
+
+    @property
+    def outlines(self) -> tuple[Outline, ...]:
+        """The origins of all frames."""
+        return tuple(Outline(name, name) for name in self.landmark_names)
 
     def kinematics(self, acceleration: ca.SX | None = None) -> "TextbookKinematics":
         """The frames in motion with v' = `acceleration`, a symbol if None."""

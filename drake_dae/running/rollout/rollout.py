@@ -12,29 +12,38 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.running.rollout.asked import RolloutRequest, record_of
-from drake_dae.running.rollout.beside import run_beside
 from drake_dae.running.rollout.changes import run_with_changes
+from drake_dae.running.rollout.drake_stepped import run_stepped
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
+from drake_dae.running.rollout.lanes import library
 from drake_dae.running.rollout.lanes.batch import run_many
 from drake_dae.running.rollout.lanes.library import Lanes
-from drake_dae.running.rollout.problems import Problems, problems_of
-from drake_dae.running.rollout.program import MAKING, RolloutProgram
+from drake_dae.running.rollout.problems import Problems, checked_times, problems_of
+from drake_dae.running.rollout.program import MAKING, RolloutProgram, program_of
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
-from drake_dae.simulation.records.record import Record, RecordAfter
-from drake_dae.trace.compiled import Compiled
+from drake_dae.simulation.records.record import (
+    Record,
+    RecordAfter,
+    computed_record,
+    recorded_values,
+)
+from drake_dae.simulation.simulate import check_config
+from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
 SEVERAL = 8
 """The least number of runs that go side by side; fewer give the bits of single runs."""
 
-USUAL = 20_000
-"""More steps than a run of a study takes, unless it diverges."""
+STAGES_PER_SECOND = 500
+"""An estimate of the evaluations in a simulated second under error control."""
+
+FASTER = 0.05
+"""The time that runs side by side save per evaluation, over that of an interpreted one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +67,7 @@ class Rollout:
     @cached_property
     def record(self) -> Record:
         """The signals at the times of the rows, up to the end of the run."""
-        return record_of(self._program, self._times, self._rows, context=self.context)
+        return _record_of(self._program, self._times, self._rows, context=self.context)
 
     def ended(self, failure: SimulationError) -> Self:
         """Returns the run as one that ended with a failure; its record ends at the failure."""
@@ -140,22 +149,75 @@ def run_loop(
         look: Called from time to time with a function: time in s, or None -> the record after it.
             Returns whether to stop the run; its record then ends there.
     """
+    config = config or SimulatorConfig()
+    check_config(config)
     with MAKING:
-        request = RolloutRequest.of(loop, times, config, compiled, lasting, look)
-        problems = problems_of(request.program, starts, parameters, request.times, seeds)
-        kinds = _kinds(request.program, problems)
+        program = program_of(loop)
+        choice: Compiled = program.choice if compiled is None else compiled
+        check_choice("rollout", choice)
+        moments = checked_times(times)
+        problems = problems_of(program, starts, parameters, moments, seeds)
+        kinds = _kinds(program, problems)
+
+    def stop(rows: Callable[[], FloatArray], context: Context | None) -> bool:
+        if look is None:
+            return False
+        return look(lambda after: _record_of(program, moments, rows(), after, context))
+
+    settings = Settings.of(config, program.compiled.scale, stop)
+    seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
     rollouts: dict[int, Rollout] = {}
-    for program, indices in kinds:
+    for kind, indices in kinds:
         some = problems.chosen(indices)
         with MAKING:
-            code = request.machine_code(program, len(problems))
+            calls = seconds * _calls_per_second(kind, settings)
+            code = _machine_code(kind, choice, calls, is_all=lasting is None)
             lanes = None
             if code is not None and look is None and len(some) >= SEVERAL:
-                lanes = request.lanes(program, len(problems))
-        runs = _runs(program, some, request.settings, code, lanes)
-        for index, run in zip(indices.tolist(), runs, strict=True):
-            rollouts[index] = _rollout(request.program, problems, index, run)
+                lanes = _lanes(kind, choice, FASTER * calls, is_all=lasting is None)
+        for index, run in zip(
+            indices.tolist(), _runs(kind, some, settings, code, lanes), strict=True
+        ):
+            rollouts[index] = _rollout(program, problems, index, run)
     return [rollouts[index] for index in range(len(problems))]
+
+
+def _calls_per_second(program: RolloutProgram, settings: Settings) -> float:
+    """The number of evaluations in a simulated second."""
+    updates = sum(1.0 / rate.period for rate in program.compiled.rates)
+    if settings.tableau is None:
+        return STAGES_PER_SECOND + updates
+    return len(settings.tableau.b) / settings.longest + updates
+
+
+def _pays(program: RolloutProgram, choice: Compiled, calls: float) -> bool:
+    """Whether machine code pays that saves so many interpreted evaluations."""
+    tries = attempts("auto", program.num_operations)
+    return choice is True or any(each.make and calls >= each.calls for each in tries)
+
+
+def _machine_code(
+    program: RolloutProgram, choice: Compiled, calls: float, is_all: bool
+) -> machine.Library | None:
+    """Returns a diagram as machine code, or None if compiling takes longer than it saves.
+
+    Code that is already in the cache is used in any case, unless further runs will follow.
+    """
+    if choice is False:
+        return None
+    make = _pays(program, choice, calls)
+    if program.library is None and (make or is_all):
+        program.library = machine.load(program, choice, make)
+    return program.library
+
+
+def _lanes(program: RolloutProgram, choice: Compiled, calls: float, is_all: bool) -> Lanes | None:
+    """Returns as `_machine_code`, for runs side by side."""
+    can_run = program.kept("can run side by side", lambda: library.can_run(program))
+    make = _pays(program, choice, calls)
+    if not can_run or not (make or is_all):
+        return None
+    return program.kept(f"lanes {make}", lambda: library.load(program, choice, make))
 
 
 def _kinds(program: RolloutProgram, problems: Problems) -> list[tuple[RolloutProgram, np.ndarray]]:
@@ -185,7 +247,7 @@ def _runs(
     if program.compiled.changes:
         run = partial(run_with_changes, functions_of(program), run)
     if program.compiled.has_stepped:
-        run = partial(run_beside, functions_of(program), code, settings=settings)
+        run = partial(run_stepped, functions_of(program), code, settings=settings)
     if code is None or len(problems) == 1 or program.compiled.has_stepped:
         return [run(problems[index]) for index in range(len(problems))]
     # Machine code releases Python's lock: threads are enough for all cores.
@@ -198,3 +260,20 @@ def _rollout(program: RolloutProgram, problems: Problems, index: int, run: Run) 
     if run.ending not in (RunEnding.DONE, RunEnding.PAUSED, RunEnding.STOPPED):
         failure = failure_of(program, problems[index], run)
     return Rollout(run.steps, failure, program, problems.times, run.rows, run.context)
+
+
+def _record_of(
+    program: RolloutProgram,
+    times: FloatArray,
+    rows: FloatArray,
+    after: float | None = None,
+    context: Context | None = None,
+) -> Record:
+    """Returns the record of a run, or of its rows after a time in s."""
+    times = times[: len(rows)]
+    first = 0 if after is None else int(np.searchsorted(times, after, side="right"))
+    columns, stop, signals = by_columns(rows[first:]), 0, {}
+    for name, entries in program.signals.items():
+        start, stop = stop, stop + len(entries)
+        signals[name] = recorded_values(columns[start:stop].T, tuple(entries))
+    return program.complete(computed_record(times[first:], signals), context)

@@ -35,7 +35,7 @@ def touch_peak(felt: float, speed: float, stiffness: float, mobility: float, lat
 
 
 def reaction_time(sampling: Sampling | None, step: float) -> float:
-    """The longest time in s until a law reacts, with lost controls and measurements.
+    """The longest time in s until a law reacts.
 
     Args:
         sampling: The sampling of the law; None where it acts at each step of the plant.
@@ -43,10 +43,7 @@ def reaction_time(sampling: Sampling | None, step: float) -> float:
     """
     if sampling is None:
         return step
-    lost = sampling.burst if sampling.loss else 0
-    if sampling.measurements is not None:
-        lost += sampling.measurements.longest
-    return sampling.period * (1 + sampling.late_samples + lost)
+    return sampling.period * (1 + sampling.late_samples)
 
 
 def rounded(value: float) -> float:

@@ -14,6 +14,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Touch
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.links.links import Links
+from drake_dae.robots.links_behind import LinkDepths
 from drake_dae.robots.loop_state import LoopState
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
@@ -26,9 +27,6 @@ NEAR_LIMIT = 0.1
 
 _NEWTON_STEPS = 25
 """The largest number of Newton steps from a guess; a good guess takes six."""
-
-_BELOW = 0.02
-"""A body this far behind a surface, relative to the size of the robot, collides with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +46,7 @@ class Posture:
         forces: S of the force outputs, shape (s, m).
         mass: M(q), shape (nv, nv).
         actuation: The generalized force per unit of each control, shape (nv, nu).
-        clearances: The clearance of each body from each surface, in m.
+        depth: The largest depth of a link behind a surface, in m.
         normals: The unit normal of each surface at its contact, stacked.
         leans: The cosine between the outward axis of each tool and its surface's normal.
     """
@@ -63,7 +61,7 @@ class Posture:
     forces: FloatArray
     mass: FloatArray
     actuation: FloatArray
-    clearances: FloatArray
+    depth: float
     normals: FloatArray
     leans: FloatArray
 
@@ -143,8 +141,6 @@ class Postures:
         rows = ca.vertcat(ca.SX(0, 1), rows)
         slopes = ca.jacobian(rows, links.q)
         bodies = links.landmarks()
-        moving = [b for b in ca.horzsplit(bodies) if ca.depends_on(b, links.q)]
-        clearances = [touch.clearance(body) for touch, _ in touches for body in moving]
         motors = LoopState.of(bound, links).motors
         inputs = {"q": links.q, "parameters": ca.vertcat(*[p.symbol for p in parameters])}
         constraint_slopes = ca.jacobian(residual, links.q)
@@ -169,12 +165,13 @@ class Postures:
                 "forces": forces,
                 "mass": links.mass_matrix,
                 "actuation": ca.horzcat(ca.SX(ca.DM(links.actuation_matrix)), motors),
-                "clearances": ca.vertcat(ca.SX(0, 1), *clearances),
                 "normals": ca.vertcat(ca.SX(0, 1), *[touch.normal for touch, _ in touches]),
                 "leans": ca.vertcat(ca.SX(0, 1), *[ca.dot(t.normal, axis) for t, axis in touches]),
                 "bodies": bodies,
             },
         )
+        by_place = {str(place): touch for place, (touch, _) in enumerate(touches)}
+        self._depths = LinkDepths(links, by_place, inputs["parameters"])
         self._parameters = np.concatenate([_value_of(p, values) for p in parameters])
         self.low, self.high = links.position_limits
         self._turns = np.array([signal.unit == "rad" for signal in links.position_signals])
@@ -196,7 +193,9 @@ class Postures:
         """The posture of a configuration."""
         values = self._values(q)
         del values["bodies"]
-        return Posture(q=q, **values)
+        depths = self._depths.at(q, self._parameters).values()
+        depth = max((float(np.max(of_links)) for of_links in depths), default=0.0)
+        return Posture(q=q, depth=depth, **values)
 
     def solve(self, rows: Sequence[int], wanted: FloatArray, guess: FloatArray) -> FloatArray:
         """Solves for a configuration on the constraints in which some rows have given values.
@@ -261,10 +260,10 @@ class Postures:
     def quality(self, posture: Posture, rows: Sequence[int]) -> float:
         """The quality of a posture for a task: `independence` of the rows times `margin`.
 
-        A body behind a surface, or a tool that points away from its surface, reduces it to a tenth.
+        A link behind a surface, or a tool that points away from its surface, reduces it to a tenth.
         """
         quality = posture.independence(rows) * self.margin(posture.q)
-        if np.min(posture.clearances, initial=0.0) < -_BELOW * self.size:
+        if posture.depth > 0.0:
             quality *= 0.1
         if np.max(posture.leans, initial=-1.0) > 0.0:
             quality *= 0.1

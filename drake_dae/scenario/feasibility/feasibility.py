@@ -16,8 +16,7 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError, ScenarioError
-from drake_dae.robots.geometry.clearances import LinkBehind, links_behind
-from drake_dae.robots.geometry.shapes import Collision, LinkShapes, collisions
+from drake_dae.robots.links_behind import links_behind
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
@@ -85,10 +84,10 @@ def complete_and_examine(
     if scenario.task is not None:
         check_task(scenario)
     completed, model = completed_model(scenario, scene_graph, drawn=False, robot=robot)
-    return completed.scenario, _feasibility(completed.scenario, model, scene_graph)
+    return completed.scenario, _feasibility(completed.scenario, model)
 
 
-def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph) -> Feasibility:
+def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     """The feasibility of a completed scenario with its model."""
     examined = None
     try:
@@ -141,7 +140,11 @@ def _feasibility(scenario: Scenario, model: RobotModel, scene_graph: SceneGraph)
         scenario.duration,
         *(((), (), (), ()) if motion is None else _ranges(motion, model)),
         is_resolved=is_resolved,
-        behind=() if motion is None else _in_the_way(motion, model, scene_graph),
+        behind=(
+            ()
+            if motion is None
+            else links_behind(model, motion.times, motion.states, motion.parameters)
+        ),
         sticking=(
             ""
             if motion is None
@@ -198,17 +201,6 @@ def sample_times(
         values = np.insert(values, new + 1, new_values[new], axis=0)
         if not (new.size and is_resolved):
             return times, is_resolved
-
-
-def _in_the_way(
-    motion: PinnedMotion, model: RobotModel, scene_graph: SceneGraph
-) -> tuple[LinkBehind | Collision, ...]:
-    """The links that move behind a surface, and those that collide."""
-    shapes, along = LinkShapes(model, scene_graph), (motion.times, motion.states)
-    behind: tuple[LinkBehind | Collision, ...] = links_behind(
-        model, *along, motion.parameters, shapes
-    )
-    return behind + collisions(shapes, *along)
 
 
 def _ranges(motion: PinnedMotion, model: RobotModel) -> _Ranges:

@@ -10,16 +10,12 @@ from drake_dae.analysis.limits import LimitsAlong
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.dae.system.signals import Signal
-from drake_dae.robots.geometry.clearances import LinkBehind
-from drake_dae.robots.geometry.shapes import Collision
+from drake_dae.robots.links_behind import LinkBehind
 
 WRONG_SIDE = (
     ": turn its normal around if its free side is the other one, or choose another posture or place"
 )
 """The remedy for a link behind a surface."""
-
-IN_EACH_OTHER = ": begin in another configuration, by start.positions, or choose another path"
-"""The remedy for links that collide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +75,7 @@ class Feasibility:
         joints: Positions and velocities of the joints that have limits.
         is_resolved: Whether the times resolve the reference; otherwise values between them are not
             known.
-        behind: Links that move behind a contact surface, and links that collide; see `links_behind`
-            and `collisions`.
+        behind: Links that move behind a contact surface.
         sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
         gains: Why no gains can be computed where they are left out, else empty.
         slowing: How much slower the references keep all limits; None where they keep them.
@@ -93,18 +88,15 @@ class Feasibility:
     constraint_forces: tuple[SignalRange, ...] = ()
     joints: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
-    behind: tuple[LinkBehind | Collision, ...] = ()
+    behind: tuple[LinkBehind, ...] = ()
     sticking: str = ""
     gains: str = ""
     slowing: LimitsAlong | None = None
 
     @property
     def wrong_sides(self) -> tuple[str, ...]:
-        """The problems with links behind a surface, or in each other."""
-        return tuple(
-            f"{link}{IN_EACH_OTHER if isinstance(link, Collision) else WRONG_SIDE}"
-            for link in self.behind
-        )
+        """The problems with links behind a surface."""
+        return tuple(f"{link}{WRONG_SIDE}" for link in self.behind)
 
     @property
     def problems(self) -> tuple[str, ...]:

@@ -109,7 +109,7 @@ def new_scenario(
 
 
 def _depth(report: Feasibility) -> float:
-    """The sum of the depths of links behind surfaces and in each other, in m."""
+    """The sum of the depths of links behind surfaces, in m."""
     return sum(link.depth for link in report.behind)
 
 

@@ -100,8 +100,7 @@ Plant = Annotated[
     plants.IdealConstraints | plants.MultibodyPlant | plants.CompliantContact | plants.OwnPlant,
     Choice(),
 ]
-_PACKETS: dict[Any, Any] = {sampling.Packets: Annotated[sampling.Packets, Form()]}
-Sampling = Annotated[sampling.Sampling, Form(_PACKETS)]
+Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
 Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]

@@ -81,7 +81,7 @@ def robot_links(
                 f"world by robot.base, as base: {{weld: {name}}}, or name it in robot.free, which "
                 "gives it a joint in roll, pitch and yaw"
             )
-    links = MultibodyExpressions(plant)
+    links = MultibodyExpressions(plant, scene_graph)
     _check_mass(plant)
     try:
         plant_constraints(links)

@@ -8,7 +8,6 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import check_whole_number
 from drake_dae.errors import ModelError, NonFiniteError, WiringError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
@@ -22,83 +21,20 @@ MOST_ON_THE_WAY = 10_000
 
 @checked(ModelError)
 @dataclass(frozen=True)
-class Packets:
-    """Measurements on their way to a sampled law: one packet for each sample, with x and forces.
-
-    The law uses the newest packet that has arrived. So do the guards of a task: they see a touch
-    when its packet comes, and a value that is repeated counts as a sample. An observer knows which
-    packets are new: at a sample without one it goes on by its model, and learns nothing.
-
-    Attributes:
-        late: The probability that a packet comes after its sample, and before the next one; less
-            than 1.
-        loss: The probability at each sample that packets begin to be lost, less than 1.
-        burst: The number of packets in a row that are lost each time.
-        most_lost: The number of samples without a new measurement after which the law stops the
-            robot, which ends the run with an error. None for never.
-
-    Raises:
-        ModelError: A number is out of range.
-    """
-
-    late: float = 0.0
-    loss: float = 0.0
-    burst: int = 1
-    most_lost: int | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("late", "loss"):
-            if not 0.0 <= getattr(self, name) < 1.0:
-                raise ModelError(
-                    f"the {name} of measurements is a probability of 0 or more and less than 1, "
-                    f"got {getattr(self, name):g}"
-                )
-        check_whole_number("the burst of measurements", self.burst, 1)
-        if self.most_lost is not None:
-            check_whole_number("the most_lost of measurements", self.most_lost, 1)
-
-    @property
-    def longest(self) -> int:
-        """The largest number of samples in a row without a new packet, with one loss at a time."""
-        return (self.burst if self.loss else 0) + (1 if self.late else 0)
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
 class Sampling:
     """A law samples its inputs at t_k = k period; its control acts from t_k + delay on.
-
-    With `jitter` some controls act later, with `loss` some do not arrive; then the drives hold the
-    last control that arrived. The law does not know it: its integrals and its references go on. An
-    observer uses the control at the drives. Measurements have `Packets` of their own.
 
     Attributes:
         period: T in s, positive.
         delay: The time to compute and send, in s, 0 or more; it may exceed a period, with several
             computations in progress.
-        jitter: A further delay in s, less than a period: each control has it with probability 1/2.
-            No other distribution of delays up to this one has a larger variance.
-        loss: The probability p at each sample that controls begin to be lost, less than 1.
-        burst: The number n of controls in a row that are lost each time; in all a share of
-            n p / (n p + 1 - p).
-        most_lost: The number of lost controls in a row at which the robot stops by itself, which
-            ends the run with an error; 20 for a Franka arm. None for never.
-        seed: The seed of jitter and loss in a scenario; in Python see `ClosedLoop.set_seed`.
-        measurements: Late and lost measurements; None if all arrive at once.
 
     Raises:
-        ModelError: The period is not positive, the delay is negative or very many periods, or
-            another number is out of range.
+        ModelError: The period is not positive, or the delay negative or very many periods.
     """
 
     period: float
     delay: float = 0.0
-    jitter: float = 0.0
-    loss: float = 0.0
-    burst: int = 1
-    most_lost: int | None = None
-    seed: int = 0
-    measurements: Packets | None = None
 
     def __post_init__(self) -> None:
         if not (isfinite(self.period) and self.period > 0.0):
@@ -110,30 +46,6 @@ class Sampling:
                 f"a sampling's delay may be {MOST_ON_THE_WAY} periods at most, here "
                 f"{MOST_ON_THE_WAY * self.period:g} s, got {self.delay:g} s"
             )
-        if not 0.0 <= self.jitter < self.period:
-            raise ModelError(
-                f"a sampling's jitter must be 0 or more and less than its period of "
-                f"{self.period:g} s, got {self.jitter:g} s"
-            )
-        if not 0.0 <= self.loss < 1.0:
-            raise ModelError(
-                "a sampling's loss is a probability of 0 or more and less than 1, got "
-                f"{self.loss:g}"
-            )
-        check_whole_number("a sampling's burst", self.burst, 1)
-        if self.most_lost is not None:
-            check_whole_number("a sampling's most_lost", self.most_lost, 1)
-        check_whole_number("a sampling's seed", self.seed, 0)
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether each control arrives at the drives, with the same delay."""
-        return not (self.jitter or self.loss)
-
-    @property
-    def mean_delay(self) -> float:
-        """The mean delay of the controls that arrive, in s."""
-        return self.delay + self.jitter / 2.0
 
     @property
     def whole_periods(self) -> int:
@@ -149,7 +61,7 @@ class Sampling:
     @property
     def late_samples(self) -> int:
         """The largest number of samples until a sampled value acts."""
-        return ceil((self.delay + self.jitter) / self.period - _SAME)
+        return ceil(self.delay / self.period - _SAME)
 
 
 @checked(ModelError)

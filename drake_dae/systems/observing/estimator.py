@@ -52,8 +52,6 @@ class StateEstimator(ObservingSystem):
         control: The applied u, shape (p,).
         measured_force: The constraint force, shape (m,); if the law measures it.
         hold, reference: As of a `DisturbanceObserver`.
-        missed: Not 0 at a sample whose measurement has not arrived, shape (1,); 0 without a wire.
-            Then the model predicts, and nothing corrects.
 
     Output ports:
         estimated_state: The estimate of (q, v) at the present sample, shape (n,).
@@ -183,8 +181,7 @@ class StateEstimator(ObservingSystem):
     def _calc(self, context: Context, value: AbstractValue) -> None:
         (x,) = self._inputs(context, "measured_state")
         held = context.get_discrete_state(self._held).value()
-        optional = [self._optional(name, context) for name in ("hold", "missed")]
-        read = [*self._inputs(context, *self._read[:-2]), *optional]
+        read = [*self._inputs(context, *self._read[:-1]), self._held_up(context)]
         time = np.array([context.get_time()])
         (estimate, *_) = self._checked(self._functions.now, context, x, held, *read, time)
         value.set_value(estimate.copy())

@@ -23,12 +23,12 @@ class EstimatorFunctions(Observed):
     Attributes:
         estimate: The symbols of an estimate.
         size: The number of entries of an estimate.
-        now: (xm, held, u, v, hold, missed, time, parameters) -> the estimate of the present sample;
+        now: (xm, held, u, v, hold, time, parameters) -> the estimate of the present sample;
             held is the estimate of a sample before, with u, v and R of that sample. It has no
             argument u where the plant uses the previous control alone, and no v if the law measures
             no force.
         measures: Whether the constraint force is measured, or there is none.
-        reads: The names of the ports of its arguments u, v, hold and missed.
+        reads: The names of the ports of its arguments u, v and hold.
         exogenous: (x, estimate, v, R, parameters) -> the disturbance to compensate, mu, and their
             derivatives.
 
@@ -77,7 +77,7 @@ class EstimatorFunctions(Observed):
         elimination = law.structure.elimination
         self._model_force = elimination.alpha, elimination.beta
         named = {"control": lag < 1.0, "measured_force": self.measures}
-        named |= {"hold": True, "missed": True}
+        named |= {"hold": True}
         self.reads = tuple(name for name, is_read in named.items() if is_read)
         self.now = self._estimated()
         self.exogenous = self.compensated(law, delay, self.estimate.column, self.estimate)
@@ -87,9 +87,8 @@ class EstimatorFunctions(Observed):
         system, old, period = self._system, self.estimate, self._period
         measured, v, count = system.state, self._force, len(self.observation.rows)
         u = ca.SX.sym("control", system.num_controls)
-        time, limited, missed = ca.SX.sym("time"), ca.SX.sym("hold", 1), ca.SX.sym("missed", 1)
-        is_new = missed < 0.5
-        hold = ca.logic_or(limited, ca.logic_not(is_new))
+        time, limited = ca.SX.sym("time"), ca.SX.sym("hold", 1)
+        hold = ca.ne(limited, 0)
         last_u, last_v = (ca.SX.sym("before", symbol.numel()) for symbol in (u, v))
         acted = self._lag * last_u + (1.0 - self._lag) * u
         share = (1.0 + self._step / period) / 2.0  # A discrete plant's force is that of its step.
@@ -127,8 +126,7 @@ class EstimatorFunctions(Observed):
 
         # Correction by the measurements, along the free and the constrained directions.
         steps = [
-            is_new
-            * (by_position * (measured[:count] - ahead) + by_velocity * (measured[count:] - moved))
+            by_position * (measured[:count] - ahead) + by_velocity * (measured[count:] - moved)
             for by_position, by_velocity in self._gains()
         ]
         free, constrained = steps[:3], steps[3:]
@@ -144,7 +142,7 @@ class EstimatorFunctions(Observed):
         change = self.change(contact, mu, new_r, hold)
         new_r -= ca.mtimes(contact.friction, change)
         if self._breaks_away:
-            error = is_new * (measured[:count] - ahead)
+            error = measured[:count] - ahead
             forces = self._developed(ca.vertcat(q, new_v), none)
             freed = ca.mtimes(contact.free, forces)
             along = factors.solve(freed)
@@ -180,7 +178,7 @@ class EstimatorFunctions(Observed):
         is_corrected = ca.logic_and(old.sample >= 0, ca.ne(old.sample, sample))
         fresh = ca.vertcat(sample, ca.if_else(old.sample >= 0, corrected, start))
         estimate = ca.if_else(ca.eq(old.sample, sample), old.column, fresh)
-        symbols = {"control": u, "measured_force": v, "hold": limited, "missed": missed}
+        symbols = {"control": u, "measured_force": v, "hold": limited}
         inputs = {name: symbols[name] for name in self.reads} | {"time": time}
         return system.trace(
             "estimate of the state",

@@ -48,9 +48,6 @@ class DisturbanceObserver(ObservingSystem):
         measured_force: v, shape (m,).
         hold: Not 0 while a drive is at its limit, shape (1,); 0 without a wire. Then mu is not
             updated; r is, since it depends on the applied u.
-        missed: Not 0 at a sample whose measurement has not arrived, shape (1,); 0 without a wire.
-            Then the momentum goes on by the model with r, and r and mu stay; the next measurement
-            brings what has come together.
         reference: R of the controller; without a wire the current outputs and rates.
 
     Output ports:
@@ -158,8 +155,7 @@ class DisturbanceObserver(ObservingSystem):
             context.get_discrete_state(self._held).value(),
             u,
             force,
-            self._optional("hold", context),
-            self._optional("missed", context),
+            self._held_up(context),
             self._reference(context, x),
         )
         after = self._checked(self._functions.sample, context, x, *inputs)[0]
@@ -179,7 +175,7 @@ class DisturbanceObserver(ObservingSystem):
         functions, memory = self._functions, self._functions.memory
         read = ("estimated_state", HELD)
         needed = (*read, "measured_force", "reference", PARAMETERS)
-        sampled = (*read, "control", "measured_force", "hold", "missed", "reference", PARAMETERS)
+        sampled = (*read, "control", "measured_force", "hold", "reference", PARAMETERS)
         parts = {"disturbance": memory.disturbance, "friction": memory.friction}
         parts |= self._estimates
         shown = ca.Function("shown", [memory.column], list(parts.values()))

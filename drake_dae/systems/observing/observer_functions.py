@@ -77,7 +77,7 @@ class ObserverFunctions(Observed):
 
     Attributes:
         memory: The symbols of the discrete state.
-        sample: (x, held, u, v, hold, missed, R, parameters) -> the discrete state after a sample.
+        sample: (x, held, u, v, hold, R, parameters) -> the discrete state after a sample.
         exogenous: (x, held, v, R, parameters) -> the disturbance to compensate, mu, and their
             derivatives.
 
@@ -126,10 +126,10 @@ class ObserverFunctions(Observed):
         )
         column = self.filter.memory.column
         self.memory = memory = ObserverMemory.of(size, frictions, degree, controls, column, known)
-        self.sample = self._sampled(ca.SX.sym("hold", 1), ca.SX.sym("missed", 1))
+        self.sample = self._sampled(ca.SX.sym("hold", 1))
         self.exogenous = self.compensated(law, delay, memory.column, memory)
 
-    def _sampled(self, held_up: ca.SX, missed: ca.SX) -> TracedFunction:
+    def _sampled(self, held_up: ca.SX) -> TracedFunction:
         """The discrete state after a sample."""
         observation, memory = self.observation, self.memory
         x, v, size = self._system.state, self._force, len(observation.rows)
@@ -141,9 +141,7 @@ class ObserverFunctions(Observed):
         contact = self.contact(x, parameters)
         reference = ca.SX.sym("reference", self._reference_size)
         p, drift, inputs = momentum[:3]
-        hold = ca.logic_or(held_up, missed > 0.5)
-        predicted = (memory.drift + drift) / 2.0 + inputs + ca.mtimes(contact.friction, mu) + r
-        p = ca.if_else(missed > 0.5, memory.momentum + self._period * predicted, p)
+        hold = ca.ne(held_up, 0)
         d = (p - memory.momentum) / self._period - (memory.drift + drift) / 2.0 - inputs
         d -= ca.mtimes(contact.friction, mu)
 
@@ -196,7 +194,6 @@ class ObserverFunctions(Observed):
                 "control": u,
                 "constraint_input": v,
                 "hold": held_up,
-                "missed": missed,
                 "reference": reference,
             },
         )

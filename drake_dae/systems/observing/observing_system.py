@@ -84,7 +84,6 @@ class ObservingSystem(ParameterizedSystem):
             state: system.num_states,
             "control": system.num_controls,
             "hold": 1,
-            "missed": 1,
             "reference": law.layout.reference_size,
         }
         if self._measures:
@@ -141,9 +140,9 @@ class ObservingSystem(ParameterizedSystem):
         """The values of input ports."""
         return [self._ports[name].Eval(context) for name in names]
 
-    def _optional(self, name: str, context: Context) -> FloatArray:
-        """The input port `hold` or `missed`; 0 without a wire."""
-        port = self._ports[name]
+    def _held_up(self, context: Context) -> FloatArray:
+        """The input port `hold`; 0 without a wire."""
+        port = self._ports["hold"]
         return np.asarray(port.Eval(context)) if port.HasValue(context) else np.zeros(1)
 
     def _reference(self, context: Context, state: FloatArray) -> FloatArray:
@@ -154,9 +153,7 @@ class ObservingSystem(ParameterizedSystem):
         return self._checked(self.observation.moving, context, state)[0].copy()
 
     def _hold_output(self, context: Context) -> FloatArray:
-        return self._observed.hold.evaluate(self._force(context), self._optional("hold", context))[
-            0
-        ]
+        return self._observed.hold.evaluate(self._force(context), self._held_up(context))[0]
 
     def _block(
         self,
@@ -178,7 +175,6 @@ class ObservingSystem(ParameterizedSystem):
             (Update(sample, self.sample_period, is_unrestricted=True),),
             unwired={
                 "hold": zero("hold"),
-                "missed": zero("missed"),
                 "reference": Computation.of(*rates),
             },
             signals=self._signals,

@@ -49,7 +49,7 @@ def test_gain_and_covariance_are_where_riccatis_recursion_ends(ratio):
 
 
 def test_what_makes_no_filter_is_refused():
-    with pytest.raises(ModelError, match="at most 1000 1/s"):
+    with pytest.raises(ModelError, match="1000"):
         ChainFilter.of(2000.0, 10.0, 1e-3)
-    with pytest.raises(ModelError, match="disturbance_rate must be positive"):
+    with pytest.raises(ModelError, match="disturbance_rate"):
         ChainFilter.of(20.0, 0.0, 1e-3)

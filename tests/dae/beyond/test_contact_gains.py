@@ -110,7 +110,7 @@ def test_stiff_contact_that_samples_cannot_damp_gets_no_damping():
 
     Then the force is changed as slowly as with a damping of half the rate w, five times slower.
     """
-    with pytest.warns(AdviceWarning, match="unstable"):
+    with pytest.warns(AdviceWarning, match=r"5\.63?e\+07"):
         found = contact_gains((1.3e3) ** 2 / 0.03, 0.03, 1e-3)
     assert found.constraint_damping == 0.0
     assert found.force_gain == pytest.approx(0.2 * found.position_rate / 1.5)
@@ -142,8 +142,10 @@ def test_gains_are_advised_in_silence_only_where_neighbours_come_to_rest(swing, 
 
 
 def test_numbers_that_make_no_sense_are_refused():
-    for arguments in ((-1.0, 0.1, 1e-3), (1e5, 0.0, 1e-3), (1e5, 0.1, 0.0)):
-        with pytest.raises(ModelError, match="must be positive"):
-            contact_gains(*arguments)
+    wrong = {"stiffness": -1.0, "mobility": 0.0, "sample_time": 0.0}
+    for name, value in wrong.items():
+        numbers = {"stiffness": 1e5, "mobility": 0.1, "sample_time": 1e-3, name: value}
+        with pytest.raises(ModelError, match=name):
+            contact_gains(**numbers)
     with pytest.raises(ModelError, match="velocity_noise"):
         contact_gains(1e5, 0.1, 1e-3, velocity_noise=-1.0)

@@ -139,22 +139,22 @@ def test_error_of_a_sampled_run_is_reported_beforehand():
 def test_laws_with_a_state_of_their_own_are_refused():
     system = mass_on_a_spring(0.0)
     chosen = TrackingLaw(system, poles(-4.0), integral=[system.output_signals[0].name])
-    with pytest.raises(ModelError, match="a law with integrals"):
+    with pytest.raises(ModelError, match="integral"):
         sampled_poles(chosen, np.zeros(3), T)
     with pytest.raises(ModelError, match="delay"):
         sampled_poles(TrackingLaw(system, poles(-4.0)), np.zeros(3), T, -1.0)
     plain = TrackingLaw(system, poles(-4.0))
     for sizes in ((2, 1), (3, 2)):
         rows = np.zeros((sizes[0], 2)), np.zeros((3, sizes[1]))
-        with pytest.raises(ModelError, match=r"of shape \(3, .\), with a row for each of 3 times"):
+        with pytest.raises(ModelError, match=r"\(3, .\)"):
             sampling_error(plain, [0, 1, 2], *rows, T)
 
 
 def test_poles_are_those_about_a_rest_that_few_periods_reach():
     plain = TrackingLaw(mass_on_a_spring(0.0), poles(-4.0))
-    with pytest.raises(ModelError, match=r"poles are computed at an equilibrium.* changes by"):
+    with pytest.raises(ModelError, match=r"x0|x1"):
         sampled_poles(plain, [0.1, 0.0, 0.0], T)
-    with pytest.raises(ModelError, match="10000000 periods"):
+    with pytest.raises(ModelError, match="10000000"):
         sampled_poles(plain, np.zeros(3), 1e-6, 10.0)
 
 

@@ -101,16 +101,16 @@ def test_no_integrators_change_nothing():
 @pytest.mark.parametrize(
     ("integrators", "nominal", "message"),
     [
-        (["v", "speed"], None, "integrators names speed, but the controls are v, w"),
-        ({"v": 0}, None, "integrators must be whole numbers from 1, got {'v': 0}"),
-        ({"v": 1.5}, None, r"integrators\['v'\] must be a whole number, got 1\.5"),
-        ({"v": True}, None, r"integrators\['v'\] must be a whole number, got True"),
-        (["v"], {"speed": 1.0}, "nominal_control names speed, but the controls are v, w"),
-        (["v"], {"v": np.nan}, r"nominal_control\['v'\] must be a finite number, got nan"),
+        (["v", "speed"], None, r"integrators.*speed"),
+        ({"v": 0}, None, r"integrators.*{'v': 0}"),
+        ({"v": 1.5}, None, r"integrators\['v'\].*1\.5"),
+        ({"v": True}, None, r"integrators\['v'\].*True"),
+        (["v"], {"speed": 1.0}, r"nominal_control.*speed"),
+        (["v"], {"v": np.nan}, r"nominal_control\['v'\].*nan"),
     ],
 )
 def test_wrong_arguments_are_refused(integrators, nominal, message):
-    with pytest.raises(ModelError, match=f"(unicycle|extend): .*{message}"):
+    with pytest.raises(ModelError, match=message):
         extend(unicycle(), integrators, nominal)
 
 

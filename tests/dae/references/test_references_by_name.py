@@ -64,12 +64,12 @@ def test_what_stands_together_stays_one():
 @pytest.mark.parametrize(
     ("references", "message"),
     [
-        ({}, r"missing: a\.x, a\.y; .* for a\.x, a\.y$"),
-        ({"a.z": 1.0}, r"^reference 'a\.z': no output 'a\.z'; did you mean 'a\.[xy]'\?"),
-        ({"a": 1.0, "a.x": 2.0}, r"'a\.x' has two, by 'a' and 'a\.x'"),
-        ({"a": ConstantReference([1.0])}, r"^reference 'a': 1 value for 2 outputs: a\.x, a\.y"),
-        ({"a.xx": 1.0}, r"no output 'a\.xx'"),
-        ({"a": PointToPointReference([0, 0], [1, 1], 0, 1, 1)}, r"'a': .* needs 2: pass order=2"),
+        ({}, r"a\.x, a\.y"),
+        ({"a.z": 1.0}, r"'a\.z'"),
+        ({"a": 1.0, "a.x": 2.0}, r"'a' and 'a\.x'"),
+        ({"a": ConstantReference([1.0])}, r"'a': .*a\.x, a\.y"),
+        ({"a.xx": 1.0}, r"'a\.xx'"),
+        ({"a": PointToPointReference([0, 0], [1, 1], 0, 1, 1)}, r"'a': .*order=2"),
     ],
 )
 def test_refusals(references, message):

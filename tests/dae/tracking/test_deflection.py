@@ -52,9 +52,9 @@ def test_the_contact_follows_a_force_that_rises_within_a_period():
 @pytest.mark.parametrize(
     ("name", "stiffness", "message"),
     [
-        ("two_link_wall", 0, "contact_stiffness must be positive"),
-        ("two_link_flexible", 1e5, "rigid joints"),
-        ("wall_polish", 1e5, "contact_stiffness: is not for scenarios with `task`"),
+        ("two_link_wall", 0, "contact_stiffness"),
+        ("two_link_flexible", 1e5, "joints"),
+        ("wall_polish", 1e5, "contact_stiffness"),
     ],
 )
 def test_where_a_deflection_is_not_known_it_is_refused(name, stiffness, message):

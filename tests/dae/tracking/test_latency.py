@@ -83,14 +83,14 @@ def test_only_damping_counts():
 
 def test_the_error_by_sampling_is_predicted_without_a_latency_for_damping():
     law, times = TrackingLaw(joint(), poles(POLE), latency=LATENCY), np.arange(3.0)
-    with pytest.raises(ModelError, match=r"compensates damping with its latency of 0\.0015 s"):
+    with pytest.raises(ModelError, match=r"latency.*0\.0015"):
         sampling_error(law, times, np.zeros((3, 2)), np.zeros((3, 1)), PERIOD)
 
 
 def test_a_latency_is_a_time():
-    with pytest.raises(ModelError, match=r"the latency of a law must be 0 s or more, got -0\.001"):
+    with pytest.raises(ModelError, match=r"latency.*-0\.001"):
         TrackingLaw(joint(), poles(POLE), latency=-1e-3)
-    with pytest.raises(ModelError, match="latency must be a finite number, got '1 ms'"):
+    with pytest.raises(ModelError, match=r"latency.*'1 ms'"):
         TrackingLaw(joint(), poles(POLE), latency="1 ms")
 
 

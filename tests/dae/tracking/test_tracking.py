@@ -269,13 +269,13 @@ def test_a_singular_a_shows_in_the_pivot():
 
 def test_wrong_arguments_are_refused():
     law = TrackingLaw(PROBLEMS["cart"]().system, poles(-1.0))
-    with pytest.raises(ModelError, match="'state' has size 3, not 2"):
+    with pytest.raises(ModelError, match=r"'state'.*3.*2"):
         law.control([1, 2, 3], [0, 0, 0])
-    with pytest.raises(ModelError, match="'reference' has size 2, not 3"):
+    with pytest.raises(ModelError, match=r"'reference'.*2.*3"):
         law.control([1, 2], [0, 0])
     with pytest.raises(ModelError, match="parameters"):
         law.control([1, 2], [0, 0, 0], parameters=[1.0])
-    with pytest.raises(ModelError, match="'reference' has size 2, not 3"):
+    with pytest.raises(ModelError, match=r"'reference'.*2.*3"):
         law.error_coordinates([1, 2], [0, 0])
 
 
@@ -286,11 +286,11 @@ def test_gains_must_be_those_of_the_system():
         FeedbackGains(["p"], [2], [[1.0, 1.0]]),
         FeedbackGains(["q", "p"], [1, 1], np.eye(2)),
     ):
-        with pytest.raises(GainError, match=r"the system has q with \(2,\)"):
+        with pytest.raises(GainError, match=r"\bq\b.*\(2,\)"):
             TrackingLaw(system, gains)
     law = TrackingLaw(system, FeedbackGains(["q"], [2], [[2.0, 3.0]]))
     assert law.control([1.0, 1.0], [0.0, 0.0, 0.0]) == pytest.approx([-5.0])
-    with pytest.raises(GainError, match="unknown outputs: z0"):
+    with pytest.raises(GainError, match="z0"):
         TrackingLaw(system, poles({"z0": -1.0}))
 
 
@@ -353,9 +353,9 @@ def test_measured_force_takes_the_place_of_the_models():
 
 def test_what_is_no_system_or_no_design_is_refused():
     system = pendulum().system
-    with pytest.raises(ModelError, match=r"system must be a DaeSystem, got .*; pass its \.dae$"):
+    with pytest.raises(ModelError, match="system"):
         TrackingLaw(SimpleNamespace(dae=system), poles(-1.0))
-    with pytest.raises(ModelError, match="gains must be a function or a FeedbackGains, got None"):
+    with pytest.raises(ModelError, match=r"gains.*None"):
         TrackingLaw(system, None)
 
 
@@ -364,10 +364,10 @@ def test_measured_force_needs_an_output_that_is_a_force():
         TrackingLaw(pendulum().system, poles(-1.0), measured_force=True)
     arm = PROBLEMS["two_link_arm"]().system
     for gain, message in (
-        (-1.0, "positive semidefinite"),
-        ([[1.0, 2.0]], r"number or shape \(1, 1\)"),
+        (-1.0, "force_gain"),
+        ([[1.0, 2.0]], r"\(1, 1\)"),
     ):
         with pytest.raises(GainError, match=message):
             TrackingLaw(arm, poles(-1.0), measured_force=True, force_gain=gain)
-    with pytest.raises(GainError, match="force_gain needs measured_force"):
+    with pytest.raises(GainError, match=r"force_gain.*measured_force"):
         TrackingLaw(arm, poles(-1.0), force_gain=1.0)

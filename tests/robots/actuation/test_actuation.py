@@ -220,7 +220,7 @@ def test_damping_of_some_joints_is_refused():
         (FlexibleJoints(**SHAFT), "actuation"),
         (["springs"], r"actuation\[0\].*'springs'"),
         ([FlexibleJoints(**SHAFT), FlexibleJoints(**SHAFT)], "FlexibleJoints"),
-        ([FlexibleJoints(**{**SHAFT, "damping": [5.0, 0.0]})], "damping|Damp"),
+        ([FlexibleJoints(**{**SHAFT, "damping": [5.0, 0.0]})], "Damp"),
         (
             [ElectrohydraulicServos(1e6, 1e-6, lambda q: [[q[0], 0], [0, q[1]]])],
             "geometry",

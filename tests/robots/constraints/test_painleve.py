@@ -15,18 +15,16 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from arms import consistent_states, error_controlled, parse, touching
+from arms import error_controlled, touching
 from numpy.testing import assert_allclose
 from painleve import GRAVITY, HALF, MASS, critical, rod, sliding
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from runs import some
 
 from drake_dae import (
     ConstantReference,
-    RobotModel,
     RobotPlant,
     SinusoidReference,
     TrackingLaw,
@@ -39,8 +37,6 @@ from drake_dae import (
     start_values,
 )
 from drake_dae.dae.references import stack_references
-from drake_dae.dae.states.contact_margin import ContactMargins
-from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.contacts import (
     MOST,
     Contacts,
@@ -321,46 +317,3 @@ def test_feet_that_do_not_slide_have_no_paradox():
     found = analyze(scenario_model(scenario, SceneGraph()).dae, count=5).contact_margin
     assert found.critical_friction == {"front.friction": np.inf, "rear.friction": np.inf}
     assert found.reserve == pytest.approx(1.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("slide", [-2.0, 2.0, 0.0])
-@pytest.mark.parametrize("angle", [0.4, 1.2])
-def test_the_worst_direction_of_a_rod_is_found_whichever_way_it_slides(angle, slide):
-    model = rod(0.5)
-    structure = find_structure(model.dae)
-    margins = ContactMargins(model.dae, structure.elimination.constraint_matrix)
-    states = np.array([sliding(angle, slide=slide), sliding(1.57, slide=slide)])
-    times = np.array([0.2, 0.3])
-    worst = margins.in_worst_directions(states, model.dae.parameter_values, slice(3, 6), times)
-    assert worst.time == 0.2
-    # At 1,000 m/s a friction with v_s = 1e-3 m/s lacks 5e-13 of its full size.
-    assert worst.reserve == pytest.approx(margin_of(0.5, angle), rel=1e-11)
-    assert worst.critical_friction["floor.friction"] == pytest.approx(critical(angle), rel=1e-11)
-
-
-@pytest.mark.slow
-def test_the_worst_direction_in_a_plane_is_that_of_its_mobility():
-    plant, model = parse("seven_joint_arm"), frictional_arm()
-    structure = find_structure(model.dae)
-    margins = ContactMargins(model.dae, structure.elimination.constraint_matrix)
-    context = plant.CreateDefaultContext()
-    for state in consistent_states("seven_joint", 5):
-        plant.SetPositions(context, state[:7])
-        frames = plant.GetFrameByName("tool"), np.zeros(3), *[plant.world_frame()] * 2
-        jacobian = plant.CalcJacobianTranslationalVelocity(context, JacobianWrtVariable.kV, *frames)
-        mobility = jacobian @ np.linalg.solve(plant.CalcMassMatrix(context), jacobian.T)
-        expected = mobility[0, 0] / np.linalg.norm(mobility[0, 1:])
-        found = margins.in_worst_directions(
-            state[None], model.dae.parameter_values, slice(7, 14), np.zeros(1)
-        )
-        # As above; in addition the two ways to M^-1 differ by round-off.
-        assert found.critical_friction["wall.friction"] == pytest.approx(expected, rel=1e-9)
-        assert found.reserve == pytest.approx(1.0 - 0.3 / expected, abs=1e-9)
-
-
-def frictional_arm():
-    """The seven-joint arm with a friction of 0.3 on the wall of `touching`."""
-    arm = touching("seven_joint")
-    wall = replace(arm.constraints[0], friction=0.3)
-    outputs, positions = arm.outputs, arm.nominal_positions
-    return RobotModel.from_multibody(arm.links.plant, [wall], outputs, positions)

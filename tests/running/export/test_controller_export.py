@@ -28,8 +28,6 @@ RUNNING, HOLDING, STOPPED, WAITING = range(4)
 FAULTS = NONE, NUMBER, STALE, LATE, CLOCK, VALUE = range(6)
 
 SAMPLED = "sampling={period: 0.001}"
-LOST = "{loss: 0.02, burst: 3, late: 0.2, most_lost: 20}"
-PACKETS = f"sampling={{period: 0.001, measurements: {LOST}}}"
 EVERYTHING = (
     "sampling={period: 0.002, delay: 0.003}",
     "observer={rate: 20.0}",
@@ -64,7 +62,6 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
     ("name", "settings"),
     [
         ("two_link_wall", (SAMPLED,)),
-        ("two_link_wall", (PACKETS,)),
         pytest.param("two_link_wall", (SAMPLED, MANY_PIECES), marks=pytest.mark.slow),
         pytest.param("two_link_wall", EVERYTHING, marks=pytest.mark.slow),
         pytest.param(
@@ -96,20 +93,6 @@ def test_the_controller_does_what_it_does_in_drakes_simulator(name, settings, tm
         "missed deadlines: made up for 10 steps, then stopped",
     ]
     assert re.fullmatch(r"a step: .* us in the median, .* at the 99.9th percentile.*", lines[4])
-
-
-def test_a_controller_gets_the_packets_that_arrive(tmp_path):
-    """The link is part of the machine: what is played has each packet as often as the law had it.
-
-    A packet is not new where it is lost, and where it or the one before is late.
-    """
-    exported(tmp_path, "two_link_wall", PACKETS)
-    rows = np.genfromtxt(tmp_path / "two_link_wall_run.csv", delimiter=",", names=True)
-    repeated = np.diff(rows["joint1"]) == 0.0
-    assert 20 < repeated.sum() < 150  # A fifth of 300, and some.
-    assert (np.diff(rows["toolz"]) != 0.0).all()  # The reference does not go through the link.
-    source = (tmp_path / "two_link_wall_controller.c").read_text()
-    assert "lost_measurements" not in source
 
 
 @needs_compiler

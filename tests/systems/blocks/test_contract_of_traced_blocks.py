@@ -36,10 +36,8 @@ from drake_dae.compiler.wires import Wires
 from drake_dae.systems.blocks.switch import LawSwitch
 from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
 from drake_dae.systems.control.limits import ControlLimits
-from drake_dae.systems.control.sampling import ControlHold, Packets, Sampling
+from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
-from drake_dae.systems.sensing.link import ControlLink
-from drake_dae.systems.sensing.packets import MeasurementLink
 
 
 def measured_law(integral, gain=0.5):
@@ -143,12 +141,6 @@ BLOCKS = {
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
     "ControlHold of one control": lambda: ControlHold(1, Sampling(0.01)),
-    "ControlLink": lambda: ControlLink(2, 3, Sampling(0.01, loss=0.3, burst=2, most_lost=20)),
-    "MeasurementLink": lambda: MeasurementLink(
-        3, 2, Packets(late=0.2, loss=0.3, burst=2, most_lost=20), 0.01
-    ),
-    "MeasurementLink without forces": lambda: MeasurementLink(2, 0, Packets(loss=0.3), 0.01),
-    "ControlLink of one control": lambda: ControlLink(1, 2, Sampling(0.01, loss=0.3)),
     "DisturbanceObserver": lambda: observer(least_force=1e-3),
     "DisturbanceObserver of a contact that sticks": lambda: observer(
         least_speed=1e3, least_force=1e-3

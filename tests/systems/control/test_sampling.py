@@ -63,7 +63,7 @@ def at(record, name, times):
 
 @pytest.mark.parametrize(("period", "delay"), [(1e-3, 1e6), (1e-12, 1.0), (1.0, 1e300)])
 def test_a_delay_of_more_samples_than_are_kept_is_refused(period, delay):
-    with pytest.raises(ModelError, match="10000 periods"):
+    with pytest.raises(ModelError, match="10000"):
         Sampling(period, delay)
     assert Sampling(period, 9_999.5 * period).late_samples == 10_000
 
@@ -238,7 +238,7 @@ def test_sampled_force_loop_that_diverges_is_refused(gain, sensor, sampling):
         force_gain=gain,
     )
     wanted = [ConstantReference(0.3), ConstantReference(20.0)]
-    with pytest.raises(WiringError, match="diverges"):
+    with pytest.raises(WiringError, match="force_gain"):
         make_closed_loop(
             RobotPlant(found.model, structure=found.structure),
             tracking,
@@ -263,7 +263,7 @@ def test_a_law_that_reads_the_force_of_its_own_first_control_is_reported():
         simulate(loop.diagram, context, 0.3, error_controlled(1e-6))
         return loop.record(context)["constraint_force"][-1]
 
-    with pytest.raises(WiringError, match="first control"):
+    with pytest.raises(WiringError, match="sample_period"):
         pressed(None)
     assert pressed(ForceSensor(1, sample_period=0.01)) == pytest.approx(20.0, abs=0.5)
 
@@ -281,16 +281,18 @@ def test_hold_of_a_source_shows_it_late():
     assert_allclose(log.FindLog(simulator.get_context()).data()[:, -1], [1.0, 2.0])
 
 
-@pytest.mark.parametrize("numbers", [(0.0, 0.0), (-1.0, 0.0), (0.01, -1e-3)])
-def test_sampling_refuses_times_that_are_none(numbers):
-    with pytest.raises(ModelError, match="must be"):
+@pytest.mark.parametrize(
+    ("numbers", "name"), [((0.0, 0.0), "period"), ((-1.0, 0.0), "period"), ((0.01, -1e-3), "delay")]
+)
+def test_sampling_refuses_times_that_are_none(numbers, name):
+    with pytest.raises(ModelError, match=name):
         Sampling(*numbers)
 
 
 def test_limits_that_are_none_are_refused():
-    with pytest.raises(ModelError, match="positive"):
+    with pytest.raises(ModelError, match="0"):
         ControlLimits([1.0, 0.0])
-    with pytest.raises(WiringError, match="2 entries, there are 1"):
+    with pytest.raises(WiringError, match=r"2.*1"):
         pursue(ConstantReference(0.0), None, 1.0, control_limits=[1.0, 1.0])
 
 
@@ -300,7 +302,7 @@ def test_scenario_samples_and_limits():
         "seven_joint_wall", "sampling={period: 2.0e-3, delay: 1.0e-3}", "saturation=true"
     )
     assert found.sampling == Sampling(2e-3, 1e-3)
-    with pytest.raises(ScenarioError, match="sampling: a sampling's period"):
+    with pytest.raises(ScenarioError, match=r"sampling: .*period"):
         scenario("two_link_wall", "sampling={period: 0.0}")
 
 
@@ -330,7 +332,7 @@ def test_what_a_sampled_sensor_takes_is_read_a_sample_later(gain, late):
     wanted = [ConstantReference(0.3), ConstantReference(20.0)]
     settings = LoopSettings(sensor=ForceSensor(1, lag, period), sampling=sampling)
     plant = RobotPlant(found.model, structure=found.structure)
-    with pytest.raises(WiringError, match="force error") as told:
+    with pytest.raises(WiringError, match="force_gain") as told:
         make_closed_loop(plant, tracking, wanted, settings)
     number = float(re.search(r"force error by ([0-9.]*[0-9])", str(told.value))[1])
     assert number == pytest.approx(radius, rel=5e-3)

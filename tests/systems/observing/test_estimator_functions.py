@@ -41,7 +41,6 @@ def sample(
     mu=0.0,
     friction=0.0,
     slid=1e3,
-    missed=0.0,
 ):
     """The estimate after a sample: (q, v), r, mu; forces and controls are the last and the new.
 
@@ -54,7 +53,7 @@ def sample(
     system = law(friction).system
     given = [] if lag == 1.0 else [controls[1]]
     found = function(
-        np.concatenate([measured, v]), held, *given, [forces[1]], [0.0], [missed], [T],
+        np.concatenate([measured, v]), held, *given, [forces[1]], [0.0], [T],
         system.parameter_values,
     )[0]  # fmt: skip
     return found[1:5], found[5:7], found[7]
@@ -83,17 +82,6 @@ def test_prediction_is_the_motion_between_samples(step, lag):
     state, r, mu = sample(q, V, forces, controls, step, lag)
     assert_allclose(state, [*q, *v], atol=1e-12)
     assert_allclose(r, 0.0, atol=1e-9)
-    assert mu == 0.0
-
-
-def test_without_a_new_measurement_the_prediction_stays():
-    """Whatever the old measurement is, the estimate is that of the model; to round-off."""
-    q, v = predicted(V, 30.0, np.zeros(2), 0.0)
-    state, r, mu = sample(
-        q + 0.1, V, (30.0, 30.0), (np.zeros(2), np.zeros(2)), r=(0.0, 0.0), missed=3.0
-    )
-    assert_allclose(state, [*q, *v], atol=1e-12)
-    assert_allclose(r, 0.0, atol=1e-12)
     assert mu == 0.0
 
 

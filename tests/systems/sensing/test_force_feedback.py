@@ -336,19 +336,19 @@ def test_sensor_has_no_direct_feedthrough_from_force():
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: ForceSensor(1), ModelError, "without state it would\nclose|algebraic loop"),
-        (lambda: ForceSensor(1, -0.1), ModelError, "not negative"),
+        (lambda: ForceSensor(1), ModelError, "close"),
+        (lambda: ForceSensor(1, -0.1), ModelError, r"-0.1"),
         (
             lambda: TrackingLaw(
                 arm("two_link").model.dae, poles(-4.0), measured_force=True, force_gain=-0.5
             ),
             GainError,
-            "positive semidefinite",
+            "force_gain",
         ),
         (
             lambda: TrackingLaw(arm("two_link").model.dae, poles(-4.0), force_gain=1.0),
             GainError,
-            "needs measured_force=True",
+            "measured_force",
         ),
         (
             lambda: TrackingLaw(

@@ -220,8 +220,8 @@ def _check_steps(compiled: CompiledDiagram) -> None:
         ),
         (
             compiled.noise,
-            "draws random numbers, which are none of a controller's: leave it out (in a scenario "
-            "sampling.jitter and sampling.loss), or put it behind a sensor",
+            "draws random numbers, which are none of a controller's: leave it out, or put "
+            "it behind a sensor",
         ),
     ):
         if places:

@@ -172,8 +172,7 @@ static mask bounded(Stepping *p, mask alive, real *end) {
 }
 
 /* Accepts a step of a run, or shortens it; returns 0 if the run adds hardly any time. */
-static int decide(const Batch *b, Stepping *p, int lane, int accepted, double end,
-                            double factor) {
+static int decide(Stepping *p, int lane, int accepted, double end, double factor) {
   Run *run = &p->run[lane];
   double size = p->size[lane];
   if (!accepted) {
@@ -191,7 +190,7 @@ static int decide(const Batch *b, Stepping *p, int lane, int accepted, double en
     run->mark = end;
     if (end - run->before < 1e-8 * (end - run->start)) return 0;
   }
-  return run->steps < b->most;
+  return 1;
 }
 
 /* Writes the rows at the ends of steps; returns for which runs this succeeds. */
@@ -262,7 +261,7 @@ static void run_apart(const Batch *b) {
     p.known |= accepted;
     for (lane = 0; lane < LANES; lane++) {
       if (!good[lane]) continue;
-      if (!decide(b, &p, lane, accepted[lane] != 0, end[lane], factor[lane])) {
+      if (!decide(&p, lane, accepted[lane] != 0, end[lane], factor[lane])) {
         good[lane] = 0;
       }
     }

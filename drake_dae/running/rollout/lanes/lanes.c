@@ -21,7 +21,7 @@ enum { TRIALS = 30 };
 
 /* The arguments from Python. Arrays of runs have a row for each run; with a step of 0, one for all. */
 typedef struct {
-  long long num_runs, most; /* after `most` steps Python continues the run */
+  long long num_runs;
   double *states, *held;    /* at the start, and then at the end */
   const double *parameters, *noise;
   long long parameter_step, noise_step;

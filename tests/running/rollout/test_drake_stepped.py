@@ -9,7 +9,7 @@ from drake_dae import build_scenario, rollout, start_values
 from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.export.parts import parts_of
-from drake_dae.running.rollout import beside
+from drake_dae.running.rollout import drake_stepped
 from drake_dae.running.rollout.program import program_of
 from drake_dae.scenario.rolled import roll_scenario, rollout_times
 
@@ -131,7 +131,7 @@ def test_a_step_that_drake_cannot_make_ends_the_run_with_its_reason(monkeypatch)
                 raise RuntimeError("no convergence.")
             super().step(time, given, outputs)
 
-    monkeypatch.setattr(beside, "DrakeSteps", Failing)
+    monkeypatch.setattr(drake_stepped, "DrakeSteps", Failing)
     found = chosen("a law with observer and integrals")
     rolled = roll_scenario(found, *build_scenario(found))
     assert isinstance(rolled.failure, SimulationError)

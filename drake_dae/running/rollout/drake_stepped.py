@@ -17,7 +17,7 @@ from drake_dae.running.rollout.stepping.machine import Library
 from drake_dae.systems.blocks.failures import cannot_go_on
 
 
-def run_beside(
+def run_stepped(
     functions: DiagramFunctions, code: Library | None, problem: RunProblem, settings: Settings
 ) -> Run:
     """Runs a diagram in which Drake steps one block, and no block has a continuous state.

@@ -1,0 +1,106 @@
+"""The depth of a robot's links behind the surfaces that it touches."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.robots.constraints.constraint import Touch
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.model import RobotModel
+
+MOST_STATES, TOUCHING, BESIDE = 60, 1e-3, 0.02
+"""The examined states of a motion. A point is behind a surface from this depth in m, and this
+fraction of its distance from the contact, since tools lie along a surface."""
+
+NEARER = 1.1
+"""A real surface may end before the base: a point counts if its distance from the contact is below
+this many times that from the base, or the base is in front and the link not next to it."""
+
+
+@dataclass(frozen=True)
+class LinkBehind:
+    """A link that is behind the surface of a constraint: its depth in m, and when in s."""
+
+    constraint: str
+    link: str
+    depth: float
+    time: float
+
+    def __str__(self) -> str:
+        where = f"behind the surface of '{self.constraint}'"
+        return f"{self.link} is {where} by {self.depth:.3g} m at {self.time:.4g} s"
+
+
+class LinkDepths:
+    """How deep links are behind surfaces; what moves with a contact is left out.
+
+    Args:
+        links: The robot.
+        touches: Name of a constraint -> its contact.
+        parameters: The symbols of all parameters.
+    """
+
+    def __init__(self, links: Links, touches: Mapping[str, Touch], parameters: ca.SX) -> None:
+        def moved_by(R: ca.SX, p: ca.SX) -> set[int]:
+            """The places of the positions on which a pose depends."""
+            pose = ca.vertcat(ca.vec(R), p)
+            return set(np.flatnonzero(ca.which_depends(pose, links.q, 1, False)))
+
+        at, point = [links.q, parameters], ca.SX.sym("point", 3)
+        poses = [(links.rotation(o.frame), links.position(o.frame)) for o in links.outlines]
+        every = [(o, *pose, moved_by(*pose)) for o, pose in zip(links.outlines, poses, strict=True)]
+        base = [p for o, _, p, by in every if not by and o.name != "world"]
+        every = [each for each in every if each[3]]
+        self.names = [o.name for o, *_ in every]
+        self._points = [o.points.T for o, *_ in every]
+        self._sizes = [len(o.points) for o, *_ in every]
+        self._radii = np.repeat([o.radius for o, *_ in every], self._sizes)
+        self._poses = ca.Function("poses", at, [ca.horzcat(R, p) for _, R, p, _ in every])
+        self._surfaces = {}
+        for name, touch in touches.items():
+            contact = links.position(touch.frame, touch.point)
+            held = moved_by(links.rotation(touch.frame), contact)
+            counts = np.repeat([not held <= by for *_, by in every], self._sizes)
+            inner = np.repeat([len(by) > 1 for *_, by in every], self._sizes)
+            to_base = ca.mmin(ca.vertcat(ca.inf, *[ca.norm_2(point - p) for p in base]))
+            deepest = ca.mmax(ca.vertcat(-ca.inf, *[-touch.clearance(p) for p in base]))
+            out = [-touch.clearance(point), ca.norm_2(point - contact), to_base, deepest]
+            self._surfaces[name] = ca.Function("depth", [point, *at], out), counts, inner
+
+    def at(self, q: FloatArray, parameters: FloatArray) -> dict[str, FloatArray]:
+        """Name of each constraint -> the depth of each link in m; 0 where it is in front."""
+        poses = [pose.full() for pose in self._poses.call([q, parameters])]
+        if not poses:
+            return {}
+        pairs = zip(poses, self._points, strict=True)
+        world = np.hstack([pose[:, :3] @ points + pose[:, 3:] for pose, points in pairs])
+        depths, starts = {}, np.cumsum([0, *self._sizes[:-1]])
+        for name, (function, counts, inner) in self._surfaces.items():
+            values = (v.full().ravel() for v in function(world, q, parameters))
+            depth, to_contact, to_base, base = values
+            depth = depth + self._radii
+            near = (to_contact < NEARER * to_base) | (inner & (base < TOUCHING))
+            behind = counts & near & (depth > np.maximum(TOUCHING, BESIDE * to_contact))
+            depths[name] = np.maximum.reduceat(np.where(behind, depth, 0.0), starts)
+        return depths
+
+
+def links_behind(
+    model: RobotModel, times: FloatArray, states: FloatArray, parameters: FloatArray
+) -> tuple[LinkBehind, ...]:
+    """The deepest link behind each surface along a motion, one row of each argument per time."""
+    every = {c.name: c.touch(model.links) for c in model.constraints}
+    touches = {name: touch for name, touch in every.items() if touch is not None}
+    depths = LinkDepths(model.links, touches, model.dae.parameter_symbol)
+    nq, last, found = model.links.q.numel(), len(times) - 1, []
+    chosen = sorted({round(i) for i in np.linspace(0, last, MOST_STATES)} if last >= 0 else set())
+    tables = [depths.at(states[i, :nq], parameters[i]) for i in chosen]
+    for name in tables[0] if tables else ():
+        table = np.array([one[name] for one in tables])
+        row, link = np.unravel_index(np.argmax(table), table.shape)
+        if (depth := float(table[row, link])) > 0.0:
+            found.append(LinkBehind(name, depths.names[link], depth, float(times[chosen[row]])))
+    return tuple(found)
