@@ -287,10 +287,10 @@ class CompiledDiagram:
             block = self.blocks[system]
             if block.projection is None:
                 continue
-            arguments = self._expressions.parameters(block), self._expressions.source(block, HELD)
+            parameters = self._expressions.parameters(block)
             x = start = self._columns["state"][part]
             for _ in range(count):
-                change = block.projection.newton(x, start, *arguments)
+                change = block.projection.newton(x, start, parameters)
                 x = x + ca.DM(block.projection.scale) * change
             state[part], length = x, ca.fmax(length, ca.norm_2(change))
         return [state, length]

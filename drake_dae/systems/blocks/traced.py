@@ -87,16 +87,16 @@ class Projection:
     """The projection of a block's state onto a manifold at the start of each step.
 
     Attributes:
-        newton: (state, start, parameters, held) -> a Newton step in units of `scale`, with the
+        newton: (state, start, parameters) -> a Newton step in units of `scale`, with the
             gradients at the start.
         scale: The sizes of the states, shape (n,).
-        project: (state, parameters, held) -> the state on the manifold, if Newton's steps do not
+        project: (state, parameters) -> the state on the manifold, if Newton's steps do not
             converge; raises InconsistentStateError.
     """
 
     newton: ca.Function
     scale: FloatArray
-    project: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+    project: Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)

@@ -270,8 +270,7 @@ class TaskController(Diagram, Controller):
 
         The outputs are the positions, the forces and the distances of the contact; in contact the
         desired distances are zero, otherwise the desired forces. "distance" has the distances, then
-        their derivatives, "phase" is 1 for the current phase and 0 for all others,
-        "predicted_error" is that of `predicted_errors`.
+        their derivatives, and "phase" is 1 for the current phase and 0 for all others.
         """
         signals, columns = self.output_signals, self.columns
         every = function_along(self.outputs, {**values, "force": values["constraint_force"]})
