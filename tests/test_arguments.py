@@ -200,7 +200,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.CommandedReferences: lambda: dd.CommandedReferences(
         [dd.ConstantReference(0.5)], [2], [dd.Signal("a")]
     ),
-    dd.Tolerances: lambda: dd.Tolerances({"tool.z": 0.1}),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     dd.Observing: lambda: dd.Observing(10.0),
     dd.DisturbanceObserver: observer,

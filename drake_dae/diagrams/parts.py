@@ -9,13 +9,11 @@ from pydrake.systems.primitives import Adder, MatrixGain
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import ConstantReference, Reference
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.errors import ModelError, WiringError
+from drake_dae.errors import WiringError
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
 
 Block = TypeVar("Block", bound=System)
 
@@ -109,17 +107,8 @@ def check_parts(
                 "needs a ReferenceGenerator(references, controller.law.layout.reference_degrees)"
             )
         raise WiringError(f"{controller.get_name()} {needs}")
-    needs = "it needs the references of a generator, and there is none"
-    missing = {"tolerances": reference, "observer": contact_reference(controller, reference)}
-    refused = {name: needs for name, source in missing.items() if source is None}
-    refused |= controller.refused
-    problems = [
-        f"{name}: {reason}"
-        for name, reason in refused.items()
-        if (value := getattr(parts, name)) is not None and (name != "exogenous" or value)
-    ]
-    if problems:
-        raise WiringError("; ".join(problems))
+    if parts.observer is not None and contact_reference(controller, reference) is None:
+        raise WiringError("observer: it needs the references of a generator, and there is none")
     sensor = parts.sensor
     if sensor is None:
         return
@@ -133,35 +122,6 @@ def check_parts(
         )
     if not controller.HasInputPort("measured_force"):
         raise WiringError("the law takes no measured force; make it with measured_force=True")
-
-
-def add_watch(
-    builder: DiagramBuilder,
-    plant: Plant,
-    reference: ReferenceGenerator,
-    law: TrackingLaw,
-    tolerances: Tolerances,
-) -> None:
-    """Adds the block that ends a run whose errors exceed the tolerances.
-
-    Raises:
-        WiringError: There is no such output.
-    """
-    dae, layout = plant.dae, law.layout
-    signals, sizes = (
-        (dae.output_signals, dae.force_signals),
-        (layout.reference_size, dae.num_states),
-    )
-    # For a continuous plant, often enough for the time constant.
-    period = plant.time_step or tolerances.window / 20.0
-    try:
-        watch = ToleranceWatch(tolerances, *signals, layout.lowest, sizes, period)
-    except ModelError as error:
-        raise WiringError(str(error)) from None
-    builder.AddSystem(watch)
-    builder.Connect(reference.GetOutputPort("reference"), watch.GetInputPort("reference"))
-    for name in ("controlled_output", "constraint_force", "state"):
-        builder.Connect(plant.GetOutputPort(name), watch.GetInputPort(name))
 
 
 def add_hold(

@@ -16,7 +16,6 @@ from drake_dae.diagrams.parts import (
     add_block,
     add_hold,
     add_signals,
-    add_watch,
     check_parts,
     contact_reference,
 )
@@ -65,7 +64,7 @@ def make_closed_loop(
             a scene_graph: `FRAME_RATE` times a second, which shortens the integrator's steps. None
             for no live view; `make_animation` does not need it.
 
-    A loop without view, sampling, limits and tolerances converts to AutoDiffXd, for Drake's
+    A loop without view, sampling and limits converts to AutoDiffXd, for Drake's
     Linearize.
 
     Warns:
@@ -169,8 +168,6 @@ def wire_loop(
             add_block(builder, parts.sensor)
         ways = parts.sensor, parts.sampling, [] if observer is None else [observer]
         noise = add_force_feedback(builder, plant, controller, *ways)
-    if parts.tolerances is not None and reference is not None:
-        add_watch(builder, plant, reference, law, parts.tolerances)
 
     # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
     named = {

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.references import ConstantReference, Reference
 from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
@@ -92,12 +92,15 @@ def build_loop(
         observer=scenario.observer,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
-        tolerances=scenario.tolerances,
         signals={} if task is None or commanded else task.signals,
         commanded=commanded,
         start_time=scenario.integrator.start_time,
     )
     _check_parts(settings, plant)
+    with at("tolerances"):
+        outputs_named(scenario.tolerances, model.dae.output_signals)
+        for name, error in scenario.tolerances.items():
+            positive(name, error)
 
     # The connections.
     if task is not None:
@@ -176,9 +179,6 @@ def _check_parts(settings: LoopSettings, plant: Plant) -> None:
     if settings.encoders is not None:
         with at("encoders"):
             make_sensor(plant, settings.encoders, settings.period(plant.time_step))
-    if settings.tolerances is not None:
-        with at("tolerances"):
-            outputs_named(settings.tolerances.outputs, plant.dae.output_signals)
 
 
 @at("saturation")

@@ -38,7 +38,6 @@ from drake_dae.scenario.parts.families import (
     Sampling,
     Stage,
     Task,
-    Tolerances,
 )
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.simulation.simulate import check_config, check_duration
@@ -141,7 +140,8 @@ class Scenario:
         encoders: The measurement of positions and velocities for the law, with `sampling`; exact if
             left out.
         saturation: Whether controls are limited to the effort limits of the robot's file.
-        tolerances: The tolerated errors; a run that exceeds them ends with the reason.
+        tolerances: Output name -> the error in its unit that the verdict of a run tolerates. For
+            others it is 1 % of the range of the references in their unit.
         may_diverge: Whether a run continues when its errors or states diverge; otherwise it ends
             with the reason.
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
@@ -186,7 +186,7 @@ class Scenario:
     sampling: Sampling | None = None
     encoders: Encoders | None = None
     saturation: bool = False
-    tolerances: Tolerances | None = None
+    tolerances: dict[str, float] = field(default_factory=dict)
     may_diverge: bool = False
     references: dict[str, Reference] = field(default_factory=dict)
     task: Task | None = None

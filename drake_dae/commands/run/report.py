@@ -84,7 +84,7 @@ def report_run(
     job = judge_job(
         record,
         predicted,
-        {} if scenario.tolerances is None else scenario.tolerances.outputs,
+        scenario.tolerances,
         [
             *shortfalls(record, limits),
             *exceeded,

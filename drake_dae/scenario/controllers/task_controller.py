@@ -21,7 +21,6 @@ def check_task(scenario: Scenario) -> None:
         ScenarioError: A key does not fit a task, or start.positions are missing.
     """
     refused = {"references": "a task has the references of its phases; leave them out"}
-    refused |= TaskController.refused
     problems = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
     if (task := scenario.task) is not None:
         names = [name for name in task.make().signals if name not in task.signals]

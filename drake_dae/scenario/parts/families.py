@@ -22,7 +22,7 @@ from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
 from drake_dae.systems.control import sampling
 from drake_dae.systems.plants.contact import disturbance_forces
-from drake_dae.systems.sensing import encoders, tolerances
+from drake_dae.systems.sensing import encoders
 from drake_dae.systems.task import phases
 
 # Vectors and arrays are written as in `_WRITTEN`; numbers, text, booleans, Literals, dataclasses,
@@ -102,7 +102,6 @@ Plant = Annotated[
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
-Tolerances = Annotated[tolerances.Tolerances, Form()]
 Observer = Annotated[parts.Observer, Form()]
 LargestErrors = Annotated[parts.LargestErrors, Form()]
 _Conditions = Annotated[

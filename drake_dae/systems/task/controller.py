@@ -28,8 +28,6 @@ from drake_dae.systems.task.progress import ReferenceSegment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
 from drake_dae.systems.task.task import Task
 
-_REFUSED = {"tolerances": "the phases of a task have their own, and times to end in; leave it out"}
-
 
 @checked(ModelError)
 class TaskController(Diagram, Controller):
@@ -101,7 +99,7 @@ class TaskController(Diagram, Controller):
     """
 
     __slots__ = SHARED_DICTIONARY
-    takes_over, shown, refused = True, ("desired_output", "ending"), _REFUSED
+    takes_over, shown = True, ("desired_output", "ending")
 
     def __init__(
         self,
