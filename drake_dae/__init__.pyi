@@ -68,7 +68,6 @@ from .robots.constraints.loop_joints import PrismaticLoopJoint as PrismaticLoopJ
 from .robots.constraints.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
 from .robots.constraints.points import FixedDistance as FixedDistance
 from .robots.constraints.points import PointOnSurface as PointOnSurface
-from .robots.constraints.presliding import Presliding as Presliding
 from .robots.constraints.rolling import Blade as Blade
 from .robots.constraints.rolling import RollingBall as RollingBall
 from .robots.constraints.rolling import RollingWheel as RollingWheel
@@ -91,8 +90,7 @@ from .robots.outputs import PointCoordinates as PointCoordinates
 from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
 from .robots.outputs import TiltFromNormal as TiltFromNormal
 from .robots.surfaces.implicit import ImplicitSurface as ImplicitSurface
-from .robots.surfaces.maps import HeightMap as HeightMap
-from .robots.surfaces.maps import MeshSurface as MeshSurface
+from .robots.surfaces.measured import MeasuredSurface as MeasuredSurface
 from .robots.surfaces.surfaces import Cylinder as Cylinder
 from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
 from .robots.surfaces.surfaces import Plane as Plane

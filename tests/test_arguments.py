@@ -394,14 +394,9 @@ PLACES: dict[str, Callable[[], Any]] = {
     "path": lambda: find_scenario("two_link_wall"),
     "values of grid_variations": lambda: {"duration": [1.0, 2.0]},
     "values of listed_variations": lambda: {"duration": [1.0, 2.0]},
-    "size of HeightMap": lambda: (0.4, 0.3),
-    "size of MeshSurface": lambda: None,
+    "size of MeasuredSurface": lambda: (0.4, 0.3),
     "heights": lambda: [[0.0, 0.1], [0.0, 0.2]],
     "file": lambda: None,
-    "file of MeshSurface": lambda: (
-        FOLDER.parents[1] / "tests" / "robots" / "surfaces" / "ridge.obj"
-    ),
-    "middle": lambda: None,
     "ranges": lambda: {"duration": (1.0, 2.0)},
     "variations of Study": lambda: ({"duration": 1.0},),
     "figure": lambda: "steps",

@@ -55,13 +55,6 @@ def build_loop(
         ScenarioError: Something does not fit; the message names its key.
     """
     # The law, and its exogenous signals.
-    if model.stages and model.friction.signals:
-        text = (
-            f"'{model.friction.owner}' has presliding, and the law behind springs and motors "
-            "differentiates friction, which bristles at rest do not allow: leave presliding out, "
-            "or leave the actuation out"
-        )
-        raise ScenarioError(("presliding", text))
     task, sampling = scenario.task, scenario.sampling
     observed = observed_structure(scenario, model, structure)
     law = _law(scenario, observed, latency_of(scenario, model))

@@ -24,7 +24,6 @@ integrator:
 FRICTION = {
     "smooth": "friction: 0.0",
     "frictional": "friction: 0.3",
-    "bristles": "friction: 0.3, presliding: {distance: 0.01, static_ratio: 1.2}",
 }
 ACTUATION = {
     "rigid": "",

@@ -123,7 +123,6 @@ def _contact_remarks(scenario: Scenario, loop: ClosedLoop, record: Record) -> li
     material = scenario.plant.material
     return [
         *surface_remarks(loop.plant.model, record),
-        *loop.plant.remarks,
         *ball_remarks(None if material is None else material.radius),
     ]
 

@@ -16,9 +16,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.presliding import FrictionState
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.layer import Layer
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Vector
 
@@ -65,8 +63,6 @@ class Touch:
         clearance: A point in the world, shape (3, 1) -> its distance into the free side, in m.
         velocity: A point in the world, shape (3, 1) -> the velocity of the object there, in m/s.
         is_exact: Whether the distance is exact also off the object; else it is to first order.
-        bent: The sliding velocity and the normal, in the world -> the traction of its bristles in
-            the world, shape (3, 1), and their state; None without bristles.
     """
 
     frame: str
@@ -75,7 +71,6 @@ class Touch:
     clearance: Callable[[ca.SX], ca.SX]
     velocity: Callable[[ca.SX], ca.SX] = lambda point: ca.SX(3, 1)
     is_exact: bool = True
-    bent: Callable[[ca.SX, ca.SX], tuple[ca.SX, FrictionState]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +134,6 @@ class Constraint(ABC):
     15. `touch` describes the contact point, if there is a free side; `residual` is then the
         clearance of that point.
     16. `add_to` adds it to a MultibodyPlant, if Drake has such a constraint.
-    17. `friction_state` are the states of its friction and their rates; they do not depend on
-        constraint forces.
 
     Attributes:
         name: The prefix of the names of its forces, residuals and parameters.
@@ -191,10 +184,6 @@ class Constraint(ABC):
 
     def drag(self, kinematics: Kinematics) -> Reaction | None:
         """The forces on the robot independent of constraint forces; None if there are none."""
-        return None
-
-    def friction_state(self, kinematics: Kinematics) -> FrictionState | None:
-        """The states of its friction; None if it has none."""
         return None
 
     def moving(self, names: Container[str]) -> Self:
@@ -281,7 +270,7 @@ class Constraint(ABC):
 
     def layer(
         self, values: FloatArray, point: FloatArray, size: float, depth: float
-    ) -> Layer | None:
+    ) -> PosedShape | None:
         """A mesh below a piece of the surface, for hydroelastic contact; None without a surface.
 
         Args:

@@ -15,7 +15,7 @@ from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.system.expressions import as_expression
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.layer import Layer, facets_needed, layer_below, sides
+from drake_dae.robots.surfaces.layer import facets_needed, layer_below, sides
 from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
@@ -127,7 +127,7 @@ class Surface(ABC):
         """The solids below the surface, with its reference point at the origin; () for none."""
         return ()
 
-    def layer(self, center: ArrayLike, size: float, depth: float) -> Layer:
+    def layer(self, center: ArrayLike, size: float, depth: float) -> PosedShape:
         """A layer of a mesh below a piece, with the reference point of the surface at the origin.
 
         Args:
@@ -145,7 +145,7 @@ class Surface(ABC):
             sides(count, length, depth) for count, length in zip(facets, lengths, strict=True)
         )
         grid = self._piece(place, size, (along, across))
-        return layer_below(grid, self._linear(), depth, lengths)
+        return layer_below(grid, self._linear(), depth)
 
     def _lengths(self, size: float) -> Pair:
         """The lengths of the sides of a piece in m: `size`, if the surface is unbounded."""

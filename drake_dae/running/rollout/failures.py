@@ -81,8 +81,6 @@ def _reason(
         function.evaluate(*arguments)
         if function.is_valid:
             continue
-        if call.block.failure is not None:
-            return call.block.failure(time, arguments)
         if TIME in call.computation.sources:
             return NonFiniteError(
                 f"the reference is not finite at t = {time:g} s", time, function.outputs[0].copy()

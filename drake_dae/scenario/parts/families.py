@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from drake_dae.dae import references
 from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
 from drake_dae.robots import constraints as contact
-from drake_dae.robots.constraints import friction, presliding
-from drake_dae.robots.surfaces import implicit, maps, surface, surfaces
+from drake_dae.robots.constraints import friction
+from drake_dae.robots.surfaces import implicit, measured, surface, surfaces
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
@@ -31,7 +31,6 @@ from drake_dae.systems.task import phases
 _WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, surface.Pair: Pair}
 _LISTED: dict[Any, Any] = {**_WRITTEN, Sequence[str]: list[str]}
 
-_PRESLIDING: dict[Any, Any] = {presliding.Presliding: Annotated[presliding.Presliding, Form()]}
 Surface = Annotated[
     surfaces.Plane
     | surfaces.Sphere
@@ -39,8 +38,7 @@ Surface = Annotated[
     | surfaces.Ellipsoid
     | surfaces.Torus
     | implicit.ImplicitSurface
-    | maps.HeightMap
-    | maps.MeshSurface,
+    | measured.MeasuredSurface,
     Choice({**_WRITTEN, Callable[..., SX] | str: str}),
 ]
 Constraint = Annotated[
@@ -55,7 +53,7 @@ Constraint = Annotated[
     | contact.Blade
     | contact.RollingWheel
     | contact.RollingBall,
-    Choice({**_WRITTEN, **_PRESLIDING, surface.Surface: Surface}),
+    Choice({**_WRITTEN, surface.Surface: Surface}),
 ]
 Output = Annotated[
     outputs.PointCoordinates
@@ -89,9 +87,7 @@ Reference = Annotated[
     | Annotated[references.CsvReference, Form(tag="!Csv")],
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
-Load = Annotated[
-    known_forces.KnownForce | joint_friction.JointFriction, Choice({**_LISTED, **_PRESLIDING})
-]
+Load = Annotated[known_forces.KnownForce | joint_friction.JointFriction, Choice(_LISTED)]
 Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 FrictionCone = Annotated[friction.FrictionCone, Form(_WRITTEN)]

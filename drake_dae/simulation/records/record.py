@@ -16,7 +16,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.files import open_file
+from drake_dae.files import MOST_RECORDED, check_file, open_file
 from drake_dae.simulation.records.columns import Recorded as Recorded
 from drake_dae.simulation.records.columns import label, read_csv, write_csv
 from drake_dae.simulation.records.versions import versions
@@ -255,6 +255,7 @@ class Record:
         Raises:
             ModelError: The file holds something else.
         """
+        check_file(path, ModelError, MOST_RECORDED)
         try:
             with open_file(path) as rows:
                 is_part = rows.read(1) == b"{"

@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, EventStatus, State, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, SimulationError
+from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 
 TIME, STATE, HELD, PARAMETERS, NOISE = "$time", "$state", "$held", "$parameters", "$noise"
@@ -185,8 +185,6 @@ class Block:
             same model and numbers and are wired directly; None if there is none.
         signals: Name of an argument -> names and units of its entries, for messages.
         ports: Name of an output port -> names and units of its entries, as far as they are known.
-        failure: (time, arguments) -> the error of an update whose values are not valid; None for
-            the error of its function.
     """
 
     system: System
@@ -206,7 +204,6 @@ class Block:
     under: Callable[[], Computation | None] | None = None
     signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
     ports: Mapping[str, tuple[Signal, ...]] = field(default_factory=dict)
-    failure: Callable[[float, Sequence[FloatArray]], SimulationError] | None = None
 
     def with_reaction(self) -> "Block":
         """The same block; its updates make the changes of its guard."""

@@ -77,7 +77,6 @@ class Plant(System):
     exogenous_places: list[int] = NOWHERE
     projects: bool = False
     is_ideal: bool = True
-    remarks: tuple[str, ...] = ()
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:

@@ -16,7 +16,7 @@ from runs import some
 from drake_dae import PointOnSurface
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.implicit import ImplicitSurface
-from drake_dae.robots.surfaces.maps import HeightMap, MeshSurface
+from drake_dae.robots.surfaces.measured import MeasuredSurface
 from drake_dae.robots.surfaces.surface import Surface, tangents
 from drake_dae.robots.surfaces.surfaces import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from drake_dae.trace.functions import TracedFunction
@@ -41,12 +41,13 @@ SURFACES = {
     ),
     "saddle": Saddle((0.3, 0.1, -0.2), 0.6),
     "formula": ImplicitSurface("a*cos(3*x) + exp(y/l) - z", (0.5, 0.0, 0.1), {"a": 0.2, "l": 2.0}),
-    "height map": HeightMap((2.4, 2.0), WAVES, point=(0.1, 0.2, 0.3), normal=(0.1, -1.0, 0.3)),
-    "mesh": MeshSurface(
-        obj_of_grid(FOLDER / "bell.obj", SIDE, SIDE, BELL),
+    "height map": MeasuredSurface(
+        (2.4, 2.0), WAVES, point=(0.1, 0.2, 0.3), normal=(0.1, -1.0, 0.3)
+    ),
+    "mesh": MeasuredSurface(
+        file=obj_of_grid(FOLDER / "bell.obj", SIDE, SIDE, BELL),
         point=(0.1, 0.2, 0.3),
         normal=(0.0, 0.2, 1.0),
-        middle=(0.0, 0.0),
         size=(1.0, 1.0),
     ),
 }

@@ -10,10 +10,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.plants.contact.contact_checks import check_without_bristles
 from drake_dae.systems.plants.contact.contact_laws import (
     Compliance,
-    bristle_rates,
     contact_force,
     contact_step,
 )
@@ -61,8 +59,6 @@ class CompliantEquations:
         self._compliance = Compliance(numbers[0], numbers[1], material.stiction_tolerance)
         friction = None if material.friction is None else numbers[2]
         self._contacts = point_contacts(model, normals, numbers[3], friction)
-        if self._h:
-            check_without_bristles(model)
         control, force = ca.SX.sym("u", dae.num_controls), ca.SX.sym("F", 3 * len(self._contacts))
         advanced, slack = (self._step if self._h else self._rate)(control)
         outputs = self._outputs(structure, force if self._h else self._forces())
@@ -151,10 +147,6 @@ class CompliantEquations:
         change = PositiveDefiniteFactorization(mass).solve(forces)
         velocity = ca.mtimes(links.velocity_map, links.v)
         rate = ca.vertcat(velocity, change, stage_rates(model, control))
-        names = [signal.name for signal in model.dae.state_signals]
-        for contact in self._contacts:
-            if (bristles := bristle_rates(contact, links.v)) is not None:
-                rate[[names.index(signal.name) for signal in bristles.signals]] = bristles.rate
         return rate, self._within_limits(links.q)
 
     def _step(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -8,7 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray, numbers, show, unknown_name
+from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.robots.constraints.constraint import Constraint
@@ -38,7 +38,6 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
         )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
-    check_without_bristles(model)
     for constraint in model.constraints:
         values = own_values(constraint, model.dae, model.dae.parameter_values)
         solids = constraint.solids(values)
@@ -51,24 +50,10 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
             )
 
 
-def check_without_bristles(model: RobotModel) -> None:
-    """Refuses friction with bristles, whose states a plant in discrete steps does not have.
-
-    Raises:
-        ModelError: A contact or a joint has presliding.
-    """
-    if model.friction.signals:
-        raise ModelError(
-            f"'{model.friction.owner}' has presliding, and a contact plant with a time_step has no "
-            "bristles: its steps are too long for them. Use `plant: !CompliantContact {time_step: "
-            "0}` or `plant: !IdealConstraints`"
-        )
-
-
 def solids_of(
     constraint: Constraint, values: FloatArray, point: FloatArray, material: ContactMaterial
-) -> tuple[tuple[PosedShape, ...], str]:
-    """The solids of a constraint in the world, and a remark on their deviation from its surface.
+) -> tuple[PosedShape, ...]:
+    """The solids of a constraint in the world.
 
     Args:
         constraint: The contact.
@@ -82,7 +67,7 @@ def solids_of(
     solids = constraint.solids(values)
     exact = solids and all(isinstance(solid.form, HalfSpace | Sphere) for solid in solids)
     if material.contact_model == "point" or exact:
-        return solids, ""
+        return solids
     # Drake's own mesh of a long cylinder is too coarse: 2 N of ripple in a force of 20 N.
     try:
         layer = constraint.layer(values, point, material.piece, material.thickness)
@@ -90,7 +75,7 @@ def solids_of(
         raise ModelError(f"{constraint.name}: {error}") from None
     if layer is None:
         raise ModelError(f"'{constraint.name}' is no contact with a surface: use an ideal plant")
-    return (layer.solid,), f"{constraint.name} around {show(point)} m is {layer}"
+    return (layer,)
 
 
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:

@@ -105,7 +105,6 @@ class ContactPlant(Diagram, Plant):
         dae, model, structure, time_step: As for `Plant`.
         multibody: Drake's plant.
         contact_force_signals: Names and units of `contact_force`.
-        remarks: As for `Plant`: the deviations of meshes from their surfaces.
 
     Raises:
         ModelError: The robot has stages of actuation, or contacts that cannot be represented.
@@ -170,13 +169,11 @@ class ContactPlant(Diagram, Plant):
     ) -> list[tuple[list[GeometryId], list[GeometryId]]]:
         """Balls on the robot and solids in the world for each constraint, and nothing else."""
         pairs = []
-        remarks = []
         for constraint, (frame, center, point) in zip(
             self.model.constraints, self._balls(plant, material), strict=True
         ):
             values = own_values(constraint, self.dae, self._values)
-            solids, remark = solids_of(constraint, values, point, material)
-            remarks.append(remark)
+            solids = solids_of(constraint, values, point, material)
             friction, name = material.friction, constraint.friction_parameter
             if friction is None:
                 friction = self._values[self.dae.parameter_slice(name)].item() if name else 0.0
@@ -198,7 +195,6 @@ class ContactPlant(Diagram, Plant):
                 for number, solid in enumerate(solids)
             ]
             pairs.append(([ball], touched))
-        self.remarks = tuple(filter(None, remarks))
         # The robot's own shapes do not collide, and a ball collides only with its own surface.
         every = scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity)
         manager = scene_graph.collision_filter_manager()

@@ -1,13 +1,11 @@
 """Contacts of balls with surfaces as expressions, as Drake's point contact defines them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
 
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Constraint, Touch
-from drake_dae.robots.constraints.presliding import FrictionState
 from drake_dae.robots.model import RobotModel
 from drake_dae.trace.smoothness import length_of
 
@@ -27,7 +25,6 @@ class PointContact:
         velocity: The velocity of the surface at the point in m/s, in the world, shape (3, 1).
         friction: The coefficient of friction.
         viscous_friction: The coefficient of viscous friction in N s/m.
-        bent: As of `Touch`.
     """
 
     depth: ca.SX
@@ -36,7 +33,6 @@ class PointContact:
     velocity: ca.SX
     friction: ca.SX
     viscous_friction: ca.SX
-    bent: Callable[[ca.SX, ca.SX], tuple[ca.SX, FrictionState]] | None = None
 
     def along(self, velocity: ca.SX) -> ca.SX:
         """The part of a velocity along the surface, shape (3, 1)."""
@@ -108,7 +104,7 @@ def point_contacts(
         normal, depth = _overlap(touch, ball, radius)
         contact = ball - normal * (radius - depth / 2)
         moves, drags = ca.substitute([jacobian, velocity], [point], [contact])
-        contacts.append(PointContact(depth, normal, moves, drags, coefficient, viscous, touch.bent))
+        contacts.append(PointContact(depth, normal, moves, drags, coefficient, viscous))
     return contacts
 
 

@@ -1,19 +1,19 @@
 """Surfaces from formulas and from data: what they are, and how far they are off it."""
 
 import re
+import tracemalloc
 import warnings
+import zipfile
 
 import casadi as ca
 import numpy as np
 import pytest
-from matplotlib.image import imsave
 from meshes import obj_of_grid, stl_of
 
 from drake_dae import (
     Cylinder,
-    HeightMap,
     ImplicitSurface,
-    MeshSurface,
+    MeasuredSurface,
     PointOnSurface,
     Sphere,
 )
@@ -183,11 +183,11 @@ def test_a_height_map_of_a_wave_is_the_wave():
     Each derivative loses a factor of 1 / 0.025 m, the width of the bells, against one of b: four of
     them, as springs need, are right to 3e-3 of a b^4.
     """
-    surface = HeightMap((0.4, 0.3), WAVES)
-    assert surface.relief.largest < 1e-8
+    surface = MeasuredSurface((0.4, 0.3), WAVES)
+    assert surface.fit.largest < 1e-8
     x, y = np.linspace(-0.2, 0.2, 101), np.linspace(-0.15, 0.15, 41)
     np.testing.assert_allclose(
-        surface.relief.heights(x, y), A * np.sin(B * x) + 0 * y[:, None], rtol=0, atol=1e-7
+        surface.fit.heights(x, y), A * np.sin(B * x) + 0 * y[:, None], rtol=0, atol=1e-7
     )
     own = derivatives(surface, 4)
     exact = derivatives(ImplicitSurface(lambda p: p[2] - A * ca.sin(B * p[0])), 4)
@@ -203,15 +203,13 @@ def test_a_height_map_of_a_wave_is_the_wave():
 def test_the_error_of_smoothing_is_reported():
     """Measured again from the distances of the data's own points, and a tenth of it is noise."""
     noise = 1e-4 * np.random.default_rng(0).normal(size=WAVES.shape)
-    surface = HeightMap((0.4, 0.3), WAVES + noise, resolution=0.05)
-    off = surface.relief.heights(X, Y) - WAVES - noise
-    assert surface.relief.largest == pytest.approx(np.max(np.abs(off)), rel=1e-12)
-    assert surface.relief.rms == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
-    told = f"{1e3 * surface.relief.largest:.2g} mm and {1e3 * surface.relief.rms:.2g} mm"
-    assert told in surface.remark
-    assert 0.5e-4 < surface.relief.rms < 1.2e-4
+    surface = MeasuredSurface((0.4, 0.3), WAVES + noise, resolution=0.05)
+    off = surface.fit.heights(X, Y) - WAVES - noise
+    assert surface.fit.largest == pytest.approx(np.max(np.abs(off)), rel=1e-12)
+    assert f"{1e3 * surface.fit.largest:.2g} mm" in surface.remark
+    assert 0.5e-4 < np.sqrt(np.mean(off**2)) < 1.2e-4
     # It is nearer to the wave than the noise is.
-    assert np.sqrt(np.mean((surface.relief.heights(X, Y) - WAVES) ** 2)) < 0.7e-4
+    assert np.sqrt(np.mean((surface.fit.heights(X, Y) - WAVES) ** 2)) < 0.7e-4
     assert PointOnSurface("tool", surface, name="bench").remark == f"bench: {surface.remark}"
     assert PointOnSurface("tool", Sphere((0, 0, 0), 1.0)).remark == ""
 
@@ -220,11 +218,11 @@ def test_the_error_of_smoothing_is_reported():
 def test_beyond_its_edges_a_map_is_calm(rough):
     """Whatever the data: at most 1.5 times their range off the plane, as far out as one likes."""
     heights = 0.05 * rough + 0.0 * Y[:, None]
-    relief = HeightMap((0.4, 0.3), heights).relief
+    fit = MeasuredSurface((0.4, 0.3), heights).fit
     far = np.linspace(-1.0, 1.0, 401)
-    flat = relief.plane[0] + relief.plane[1] * far + relief.plane[2] * far[:, None]
-    assert np.max(np.abs(relief.heights(far, far) - flat)) < 1.6 * np.ptp(heights)
-    assert np.max(np.abs(relief.heights(far[:5], far[:5]) - flat[:5, :5])) < 1e-9
+    flat = fit.plane[0] + fit.plane[1] * far + fit.plane[2] * far[:, None]
+    assert np.max(np.abs(fit.heights(far, far) - flat)) < 1.6 * np.ptp(heights)
+    assert np.max(np.abs(fit.heights(far[:5], far[:5]) - flat[:5, :5])) < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -246,39 +244,55 @@ def test_a_fit_does_not_multiply_the_round_off_of_its_data(data, resolution):
     At the data, where a fit is a projection; 100 of them are the round-off of some 20 bells.
     """
     random, largest = np.random.default_rng(0), np.max(np.abs(data))
-    fitted = HeightMap((0.4, 0.3), data, resolution=resolution).relief
+    fitted = MeasuredSurface((0.4, 0.3), data, resolution=resolution).fit
     for _ in range(3):
         last_digit = np.finfo(float).eps * random.choice([-1.0, 0.0, 1.0], data.shape)
-        again = HeightMap((0.4, 0.3), data * (1.0 + last_digit), resolution=resolution).relief
+        again = MeasuredSurface((0.4, 0.3), data * (1.0 + last_digit), resolution=resolution).fit
         off = again.heights(X, Y) - fitted.heights(X, Y)
         assert np.max(np.abs(off)) < 100 * np.finfo(float).eps * largest
 
 
 def test_files_hold_what_the_table_does(tmp_path):
     tall = 0.05 + 0.02 * np.sin(10 * X) * np.cos(12 * Y)[:, None] + 0.1 * Y[:, None]
-    table = HeightMap((0.4, 0.3), tall)
+    table = MeasuredSurface((0.4, 0.3), tall)
     np.save(tmp_path / "a.npy", tall)
+    np.savez_compressed(tmp_path / "a.npz", any=tall)
     np.savetxt(tmp_path / "a.csv", tall, delimiter=",")
     np.savetxt(tmp_path / "b.csv", 1e3 * tall, delimiter="; ")
-    # Seen from above, the second coordinate upward; 8 bits of 0.1 m are 0.4 mm.
-    imsave(tmp_path / "a.png", (tall / 0.1)[::-1], cmap="gray", vmin=0.0, vmax=1.0)
-    wanted = table.relief.heights(X, Y)
-    for name, scale, slack in (("a.npy", 1, 1e-12), ("a.csv", 1, 1e-12), ("b.csv", 1e-3, 1e-12)):
-        own = HeightMap((0.4, 0.3), file=tmp_path / name, scale=float(scale))
-        np.testing.assert_allclose(own.relief.heights(X, Y), wanted, rtol=0, atol=slack)
-    image = HeightMap((0.4, 0.3), file=str(tmp_path / "a.png"), scale=0.1)
-    np.testing.assert_allclose(image.relief.heights(X, Y), wanted, rtol=0, atol=5e-4)
-    assert "HeightMap 'a.png'" in image.remark
+    wanted = table.fit.heights(X, Y)
+    for name, scale in (("a.npy", 1), ("a.npz", 1), ("a.csv", 1), ("b.csv", 1e-3)):
+        own = MeasuredSurface((0.4, 0.3), file=tmp_path / name, scale=float(scale))
+        np.testing.assert_allclose(own.fit.heights(X, Y), wanted, rtol=0, atol=1e-12)
+        assert name in own.remark
     # A fit is kept while the file stays.
-    assert HeightMap((0.4, 0.3), file=str(tmp_path / "a.png"), scale=0.1).relief is image.relief
+    again = MeasuredSurface((0.4, 0.3), file=tmp_path / "b.csv", scale=1e-3)
+    assert again.fit is own.fit
     np.save(tmp_path / "a.npy", 2.0 * tall[:-1])
-    changed = HeightMap((0.4, 0.3), file=tmp_path / "a.npy")
-    assert changed.relief.heights(X, Y)[0, 0] == pytest.approx(2.0 * wanted[0, 0], rel=1e-3)
+    changed = MeasuredSurface((0.4, 0.3), file=tmp_path / "a.npy")
+    assert changed.fit.heights(X, Y)[0, 0] == pytest.approx(2.0 * wanted[0, 0], rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["npz", "obj"])
+def test_what_an_archive_unpacks_to_is_bounded_before_it_is_read(kind, tmp_path):
+    """A megabyte that would be a gigabyte: refused without the memory for it."""
+    file = tmp_path / f"bomb.{kind}"
+    with (
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
+        archive.open("heights.npy", "w") as member,
+    ):
+        for _ in range(1024):
+            member.write(bytes(1 << 20))
+    assert file.stat().st_size < 2 << 20
+    tracemalloc.start()
+    with pytest.raises(ModelError, match="1,073,741,824"):
+        MeasuredSurface((0.4, 0.3), file=file)
+    assert tracemalloc.get_traced_memory()[1] < 10 << 20
+    tracemalloc.stop()
 
 
 def test_a_map_stands_where_its_point_and_normal_say():
     """On the wall x = 1: sideways along y, upward along z, and heights toward the robot."""
-    surface = HeightMap((0.4, 0.3), WAVES, point=(1.0, 0.1, 0.5), normal=(-1.0, 0.0, 0.0))
+    surface = MeasuredSurface((0.4, 0.3), WAVES, point=(1.0, 0.1, 0.5), normal=(-1.0, 0.0, 0.0))
     y, z = 0.07, -0.02
     height = A * np.sin(B * y)
     distance = derivatives(surface, 0)
@@ -307,16 +321,16 @@ def test_a_mesh_is_sampled_along_the_normal(kind, tmp_path):
         file = stl_of(tmp_path / "sheet.stl", vertices, triangles)
     off = A * (B * 0.005) ** 2 / 8
     x, y = np.linspace(-0.19, 0.19, 50), np.linspace(-0.14, 0.14, 30)
-    above = MeshSurface(file, scale=1e-3)
+    above = MeasuredSurface(file=file, scale=1e-3)
     np.testing.assert_allclose(
-        above.relief.heights(x, y), A * np.sin(B * x) + 0 * y[:, None], rtol=0, atol=3 * off
+        above.fit.heights(x, y), A * np.sin(B * x) + 0 * y[:, None], rtol=0, atol=3 * off
     )
-    assert above.relief.largest < 2 * off
+    assert above.fit.largest < 2 * off
     # From below the heights are the other way round, and so is one of the coordinates.
-    below = MeshSurface(file, scale=1e-3, normal=(0.0, 0.0, -1.0), resolution=0.02)
+    below = MeasuredSurface(file=file, scale=1e-3, normal=(0.0, 0.0, -1.0), resolution=0.02)
     _, second = tangents([0.0, 0.0, -1.0])
     np.testing.assert_allclose(
-        below.relief.heights(x, second[1] * y), -A * np.sin(B * x) + 0 * y[:, None], atol=3 * off
+        below.fit.heights(x, second[1] * y), -A * np.sin(B * x) + 0 * y[:, None], atol=3 * off
     )
 
 
@@ -331,55 +345,51 @@ def box(corner, size):
 def test_a_solid_has_the_side_that_is_seen(tmp_path):
     file = stl_of(tmp_path / "box.stl", *box([0.1, 0.2, 0.3], [0.4, 0.3, 0.2]))
     for normal, height in (((0, 0, 1), 0.5), ((0, 0, -1), -0.3), ((1, 0, 0), 0.5)):
-        surface = MeshSurface(file, normal=tuple(map(float, normal)))
-        relief = surface.relief
-        found = relief.heights(np.linspace(*relief.x, 5), np.linspace(*relief.y, 5))
+        surface = MeasuredSurface(file=file, normal=tuple(map(float, normal)))
+        found = surface.fit.heights(*(np.linspace(*side, 5) for side in surface.extent.T))
         np.testing.assert_allclose(found, height, atol=1e-9)
 
 
 def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
+    """A shelf over the half x > 0.5 of a table, and a rectangle that is wider than the table."""
     low, high = box([0, 0, 0], [1, 1, 0.1]), box([0.5, 0, 0.4], [0.5, 1, 0.1])
     both = np.vstack([low[0], high[0]]), np.vstack([low[1], high[1] + 8])
-    file = stl_of(tmp_path / "table.stl", *both)
-    with pytest.raises(ModelError, match=r"at \[0\.\d+ *, +0\.\d+ *\] m .*overlaps itself"):
-        MeshSurface(file)
-    left = MeshSurface(file, middle=(0.2, 0.5), size=(0.4, 0.8))
-    assert left.relief.heights(np.array([0.2]), np.array([0.5]))[0, 0] == pytest.approx(0.1)
-    with pytest.raises(ModelError, match=r"at \[1\.\d+ *, +0\.\d+ *\] m .*mesh is not below"):
-        MeshSurface(file, middle=(1.1, 0.5), size=(0.1, 0.8))
+    with pytest.raises(ModelError, match=r"at \[0\.[5-9]\d* *, +0\.\d+ *\] m"):
+        MeasuredSurface(file=stl_of(tmp_path / "shelf.stl", *both))
+    file = stl_of(tmp_path / "table.stl", *low)
+    part = MeasuredSurface((0.4, 0.8), file=file)
+    assert part.fit.heights(np.array([0.5]), np.array([0.5]))[0, 0] == pytest.approx(0.1)
+    with pytest.raises(ModelError, match=r"at \[[-1]\.*\d* *, +0\.\d+ *\] m"):
+        MeasuredSurface((3.0, 0.8), file=file)
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda f: HeightMap((0.4, 0.3)), "give either heights, row by row, or a file"),
-        (lambda f: HeightMap((0.4, 0.3), [[0, 1], [0, 1]], f / "a.npy"), "give either heights"),
-        (lambda f: HeightMap((0.4, 0.3), [[0, 1]]), "two rows of two heights are the least"),
-        (lambda f: HeightMap((0.4, 0.0), [[0, 1], [0, 1]]), "size must be positive, got 0.0"),
-        (lambda f: HeightMap((0.4, 0.3), [[0, 1], [0, 1]], scale=-1.0), "scale must be positive"),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "none.npy"), "no file '"),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "a\0.npy"), "no file '"),
-        (lambda f: HeightMap((0.4, 0.3), file=f), "is no .csv, .npy or .png"),
-        (
-            lambda f: HeightMap((0.4, 0.3), file=f / "hole.csv"),
-            "row 2, column 1: expected a number, got 'nan'",
+        (lambda f: MeasuredSurface((0.4, 0.3)), "heights"),
+        (lambda f: MeasuredSurface((0.4, 0.3), [[0, 1], [0, 1]], f / "a.npy"), "heights"),
+        (lambda f: MeasuredSurface(heights=[[0, 1], [0, 1]]), "size"),
+        (lambda f: MeasuredSurface((0.4, 0.3), [[0, 1]]), "(1, 2)"),
+        (lambda f: MeasuredSurface((0.4, 0.3), [[0, 1], [0, np.nan]]), "nan"),
+        (lambda f: MeasuredSurface((0.4, 0.0), [[0, 1], [0, 1]]), "size"),
+        (lambda f: MeasuredSurface((0.4, 0.3), [[0, 1], [0, 1]], scale=-1.0), "scale"),
+        (lambda f: MeasuredSurface((0.4, 0.3), [[0, 1e200], [0, 1]]), "1e+200"),
+        (lambda f: MeasuredSurface((0.4, 0.3), file=f / "none.npy"), "none.npy"),
+        (lambda f: MeasuredSurface((0.4, 0.3), file=f / "a\0.npy"), "null byte"),
+        (lambda f: MeasuredSurface((0.4, 0.3), file=f), "directory"),
+        (lambda f: MeasuredSurface((0.4, 0.3), file=f / "hole.csv"), "row 2, column 1"),
+        *(
+            (lambda f, kind=kind: MeasuredSurface((0.4, 0.3), file=f / f"words.{kind}"), kind)
+            for kind in ("csv", "npy", "npz", "png", "zip", "obj", "stl")
         ),
-        (
-            lambda f: HeightMap((0.4, 0.3), file=f / "uneven.csv"),
-            "row 1 has 2 heights, row 2 has 1",
-        ),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "words.csv"), "has no table of heights"),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "words.png"), "'words.png'"),
-        (lambda f: HeightMap((0.4, 0.3), file=f / "words.npy"), "'words.npy'"),
-        (lambda f: MeshSurface(f / "words.obj"), "no mesh in 'words.obj'"),
-        (lambda f: MeshSurface(f / "words.stl"), "no mesh in 'words.stl'"),
-        (lambda f: MeshSurface(f / "none.stl"), "no file '"),
+        (lambda f: MeasuredSurface(file=f / "none.stl"), "none.stl"),
+        (lambda f: MeasuredSurface(file=f / "wide.obj"), "wide.obj"),
     ],
 )
 def test_refusals(make, words, tmp_path):
     (tmp_path / "hole.csv").write_text("1, 2\nnan, 4\n")
-    (tmp_path / "uneven.csv").write_text("1, 2\n3\n")
-    for kind in ("csv", "png", "npy", "obj", "stl"):
+    (tmp_path / "wide.obj").write_text("v 0 0 0\nv 1e200 0 0\nv 0 1 0\nf 1 2 3\n")
+    for kind in ("csv", "png", "npy", "npz", "zip", "obj", "stl"):
         (tmp_path / f"words.{kind}").write_text("these are words\n")
     with pytest.raises(ModelError) as caught:
         make(tmp_path)
@@ -390,8 +400,8 @@ def test_refusals(make, words, tmp_path):
 def test_what_is_missing_to_read_a_mesh_is_reported(tmp_path, monkeypatch):
     file = stl_of(tmp_path / "box.stl", *box([0, 0, 0], [1, 1, 1]))
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
-    with pytest.raises(ModelError, match=r"pip install 'drake_dae\[meshes\]', or give the mesh as"):
-        MeshSurface(file)
+    with pytest.raises(ModelError, match=r"drake_dae\[meshes\]"):
+        MeasuredSurface(file=file)
 
 
 def test_functions_of_numpy_are_reported_in_one_line_and_once():
