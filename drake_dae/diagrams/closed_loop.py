@@ -103,6 +103,7 @@ class ClosedLoop:
         """
         seed_noise(self.noise, context, seed)
 
+    @checked(WiringError)
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the state x of the plant, without a projection onto the constraints.
 
@@ -147,6 +148,7 @@ class ClosedLoop:
         events = self.plant.events(self.plant.GetMyContextFromRoot(context))
         return replace(record, events=tuple(event for event in events if begin < event.time <= end))
 
+    @checked(WiringError)
     def with_errors(self, record: Record, context: Context | None = None) -> Record:
         """Adds the derived signals of the controller, such as `tracking_error`, to a record.
 
@@ -164,6 +166,7 @@ class ClosedLoop:
         added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
         return computed_record(record.time, {**record.signals, **added})
 
+    @checked(WiringError)
     def plant_parameters(self, record: Record, context: Context) -> FloatArray:
         """The parameters of the plant at the times of a record, one row each.
 
@@ -177,6 +180,7 @@ class ClosedLoop:
             values[:, plant.exogenous_places] = record["exogenous"]
         return values
 
+    @checked(WiringError)
     def predicted_error(self, record: Record) -> FloatArray:
         """The predicted error (30), (31) of a record, one column for each output."""
         parameters = self.controller.law.system.parameter_values

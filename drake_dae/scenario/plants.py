@@ -99,7 +99,6 @@ class ScenarioPlant(ABC):
         """
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly.
@@ -177,7 +176,6 @@ class Unilateral(ScenarioPlant):
             )
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class MultibodyPlant(ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
@@ -216,7 +214,6 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
             )
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class CompliantContact(PointMaterial, ScenarioPlant):
     """The plant is a `CompliantPlant`: Drake's point contact as equations of this library.
@@ -243,7 +240,6 @@ class CompliantContact(PointMaterial, ScenarioPlant):
             return CompliantPlant(robot.model, self, structure=robot.structure)
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class OwnPlant(ScenarioPlant):
     """The plant is your own class that follows the contract of `drake_dae.Plant`.

@@ -115,6 +115,7 @@ class Record:
         events = f", {len(self.events)} events" if self.events else ""
         return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s{events}"
 
+    @checked(ModelError)
     def after(self, time: float | None) -> Self:
         """The part of the record later than a time in s; the whole record for None."""
         if time is None:
@@ -188,6 +189,7 @@ class Record:
             },
         )
 
+    @checked(ModelError)
     def save(self, path: str | Path) -> None:
         """Writes the record as one `.npz` file."""
         arrays: dict[str, np.ndarray] = {"time": self.time}
@@ -199,6 +201,7 @@ class Record:
         arrays["about"] = np.array(json.dumps({"versions": versions(), **self.about}))
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
+    @checked(ModelError)
     def to_csv(self, path: str | Path) -> None:
         """Writes the record as text: a line of names with units, then one line for each time.
 

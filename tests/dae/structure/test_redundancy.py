@@ -76,14 +76,14 @@ def rate_of(system):
 
 
 def test_what_cannot_go_is_refused():
-    with pytest.raises(ModelError, match=r"no constraint 'leg4'; did you mean 'leg"):
+    with pytest.raises(ModelError, match=r"'leg4'.*'leg"):
         drop_constraints(plate(TABLE), ["leg4"])
     with pytest.raises(ModelError, match="'leg0', 'leg1'"):
         drop_constraints(plate(TABLE), ["leg0", "leg1"])
     # v_2 pushes z'' beside x''.
     with pytest.raises(ModelError, match="'y1'"):
         drop_constraints(redundant(lambda x: [x[0], x[0]]))
-    with pytest.raises(ModelError, match="'y1', which is not determined"):
+    with pytest.raises(ModelError, match="'y1'"):
         drop_constraints(
             system_of(
                 2,

@@ -153,7 +153,7 @@ def test_rules_5_and_6_what_is_computed_afterwards_is_what_the_ports_showed(plan
     given["control"] = np.tile(plant.GetInputPort("control").Eval(own), (record.time.size, 1))
     for port in plant.functions:
         np.testing.assert_allclose(plant.along(port, given), record[port], atol=FINE, err_msg=port)
-    with pytest.raises(ModelError, match="port"):
+    with pytest.raises(ModelError, match="nothing"):
         plant.along("nothing", given)
 
 
@@ -173,7 +173,7 @@ def test_rule_8_parameters(plant):
         plant.set_parameter(context, "nothing", 1.0)
     place = plant.dae.parameter_slice("link2.mass")
     if isinstance(plant, ContactPlant | SpringyPlant):  # A test knows its members.
-        with pytest.raises(ModelError, match="fixed"):
+        with pytest.raises(ModelError, match=type(plant).__name__):
             plant.set_parameter(context, "link2.mass", 6.0)
         np.testing.assert_array_equal(plant.parameters(context), before)
     else:
@@ -188,7 +188,7 @@ def test_rule_9_starts(plant):
     found = plant.set_consistent_state(context, nominal)
     np.testing.assert_array_equal(plant.state(context), found)
     assert plant.structure.manifold.is_consistent(found)
-    with pytest.raises(ModelError, match="shape"):
+    with pytest.raises(ModelError, match=r"\(\d+,\)"):
         plant.set_state(context, nominal[:-1])
 
 
@@ -293,12 +293,12 @@ def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monk
 @pytest.mark.parametrize(
     ("maker", "told"),
     [
-        ("members", "plant: maker: a module and a class in it are needed"),
+        ("members", "plant: maker"),
         (
             "no_such_module:Plant",
-            r"plant.maker: 'no_such_module:Plant' cannot be loaded: No module",
+            r"plant\.maker: .*'no_such_module:Plant'",
         ),
-        ("members:NoSuchPlant", "plant.maker: .* has no attribute 'NoSuchPlant'"),
+        ("members:NoSuchPlant", r"plant\.maker: .*'NoSuchPlant'"),
     ],
 )
 def test_a_plant_that_cannot_be_loaded_is_refused_with_its_key(maker, told):

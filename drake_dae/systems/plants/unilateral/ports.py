@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, ContinuousState
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system.signals import Signal
@@ -30,7 +29,6 @@ _FORCES = ("constraint_force", "hole_force")
 _OF_HOLES = (("hole_mode", "closed", ""), ("hole_gap", "gap", "m"), ("hole_force", "force", "N"))
 
 
-@checked(ModelError)
 class ModalPorts(ParameterizedSystem, Plant):
     """State, mode and ports of a `UnilateralRobotPlant`, with its attributes, in a fixed mode.
 
@@ -275,7 +273,6 @@ class ModalPorts(ParameterizedSystem, Plant):
             return self._checked(function, context, x, self._control_port.Eval(context))[0]
         return self._checked(function, context, x)[0]
 
-    @checked(ModelError)
     def explained(
         self,
         error: SimulationError,
