@@ -102,6 +102,7 @@ class ClosedLoop:
         """
         seed_noise(self.noise, context, seed)
 
+    @checked(WiringError)
     def set_state(self, context: Context, state: ArrayLike) -> None:
         """Sets the state x of the plant, without a projection onto the constraints.
 
@@ -142,6 +143,7 @@ class ClosedLoop:
             logged = completed(logged, self, context)
         return self.with_errors(logged, context).while_finite()
 
+    @checked(WiringError)
     def with_errors(self, record: Record, context: Context | None = None) -> Record:
         """Adds the derived signals of the controller, such as `tracking_error`, to a record.
 
@@ -159,6 +161,7 @@ class ClosedLoop:
         added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
         return computed_record(record.time, {**record.signals, **added})
 
+    @checked(WiringError)
     def plant_parameters(self, record: Record, context: Context) -> FloatArray:
         """The parameters of the plant at the times of a record, one row each.
 
@@ -172,6 +175,7 @@ class ClosedLoop:
             values[:, plant.exogenous_places] = record["exogenous"]
         return values
 
+    @checked(WiringError)
     def predicted_error(self, record: Record) -> FloatArray:
         """The predicted error (30), (31) of a record, one column for each output."""
         parameters = self.controller.law.system.parameter_values

@@ -11,7 +11,6 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import brief
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
@@ -87,7 +86,6 @@ class ScenarioPlant(ABC):
         """
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
@@ -96,12 +94,11 @@ class IdealConstraints(ScenarioPlant):
         return RobotPlant(robot.model, structure=robot.structure)
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class MultibodyPlant(ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
-    A ball at the tool, or a peg of balls, touches the surfaces of the constraints. With point
+    A ball at the tool touches the surfaces of the constraints. With point
     contact the force is stiffness times depth. With hydroelastic contact the ball is rigid, and the
     pressure of the surface is modulus times depth / thickness.
 
@@ -135,7 +132,6 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
             )
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class CompliantContact(PointMaterial, ScenarioPlant):
     """The plant is a `CompliantPlant`: Drake's point contact as equations of this library.
@@ -162,7 +158,6 @@ class CompliantContact(PointMaterial, ScenarioPlant):
             return CompliantPlant(robot.model, self, structure=robot.structure)
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class OwnPlant(ScenarioPlant):
     """The plant is your own class that follows the contract of `drake_dae.Plant`.

@@ -13,7 +13,9 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import listed
+from drake_dae.errors import ModelError
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -234,6 +236,7 @@ def scenario_reader(keys: tuple[str, ...] = ()) -> Reader[Scenario]:
     return Reader(Scenario, keys)
 
 
+@checked(ModelError)
 def scenario_schema(tags: bool = True) -> dict[str, Any]:
     """The JSON Schema of a scenario as plain data.
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -27,6 +27,7 @@ _EXTENT_STATES = 60
 """The approximate number of states from which the extent of a run is computed."""
 
 
+@runtime_checkable
 class ShownLoop(Protocol):
     """A diagram with a plant and its geometry, such as a `ClosedLoop`."""
 

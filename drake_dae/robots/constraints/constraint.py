@@ -12,7 +12,6 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyConstraintId
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
@@ -93,7 +92,6 @@ class Joint:
     effort_limit: float = np.inf
 
 
-@checked(ModelError)
 class Constraint(ABC):
     """m constraint equations of a robot, and the m constraint forces lambda that enforce them.
 

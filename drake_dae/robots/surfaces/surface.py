@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.system.expressions import as_expression
 from drake_dae.dae.system.signals import Parameter, Signal
@@ -28,7 +27,6 @@ EVEN = np.linspace(-0.5, 0.5, 25)
 """The places of the points of a mesh along each side."""
 
 
-@checked(ModelError)
 class Surface(ABC):
     """A smooth surface in the world.
 

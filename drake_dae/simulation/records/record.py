@@ -108,6 +108,7 @@ class Record:
             return "empty"
         return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s"
 
+    @checked(ModelError)
     def after(self, time: float | None) -> Self:
         """The part of the record later than a time in s; the whole record for None."""
         if time is None:
@@ -172,6 +173,7 @@ class Record:
             },
         )
 
+    @checked(ModelError)
     def save(self, path: str | Path) -> None:
         """Writes the record as one `.npz` file."""
         arrays: dict[str, np.ndarray] = {"time": self.time}
@@ -182,6 +184,7 @@ class Record:
         arrays["about"] = np.array(json.dumps({"versions": versions(), **self.about}))
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
+    @checked(ModelError)
     def to_csv(self, path: str | Path) -> None:
         """Writes the record as text: a line of names with units, then one line for each time.
 

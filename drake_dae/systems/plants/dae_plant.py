@@ -213,7 +213,6 @@ class DaePlant(ParameterizedSystem, Plant):
                 raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {sizes[name]})")
         return function_along(function, given)
 
-    @checked(ModelError)
     def explained(
         self,
         error: SimulationError,

@@ -177,6 +177,7 @@ class TaskController(Diagram, Controller):
         builder.BuildInto(self)
         self.set_name("task_controller")
 
+    @checked(ModelError)
     def rest_state(
         self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:

@@ -190,6 +190,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
         context.SetDiscreteState(0, self.dae.state_vector(state))
         context.SetDiscreteState(1, np.zeros(len(self.contact_force_signals)))
 
+    @checked(ModelError)
     def set_contact(self, context: Context, material: PointMaterial) -> None:
         """Sets stiffness, dissipation, friction and radius, and places the balls on the robot.
 
