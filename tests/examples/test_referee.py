@@ -1,4 +1,4 @@
-"""The referee of `examples/referee`: its values by other routes, and drake_dae beside them."""
+"""The referee of `tests/benchmarks`: its values by other routes, and drake_dae beside them."""
 
 import importlib
 import re
