@@ -3,11 +3,16 @@
 import errno
 import os
 import stat
+import zipfile
 from pathlib import Path
 from typing import BinaryIO
+from zipfile import ZipFile
 
 MOST_BYTES = 1 << 28
 """The largest size of a file of data: so many bytes of numbers take gigabytes in Python."""
+
+MOST_RECORDED = 1 << 31
+"""The largest size of a record, unpacked."""
 
 
 def open_file(path: str | Path) -> BinaryIO:
@@ -36,6 +41,32 @@ def _open_regular(path: str, flags: int) -> int:
         os.close(number)
         raise
     return number
+
+
+def check_file(
+    path: str | Path, error: type[Exception], most: int = MOST_BYTES
+) -> tuple[str, int, int]:
+    """Checks a file that another library will read: its size, and of an archive what is packed.
+
+    Args:
+        path: The file.
+        error: The class of exception to raise.
+        most: How many bytes it may have, also unpacked.
+
+    Returns:
+        Its name, the time of its last change in ns, and its size in bytes.
+    """
+    try:
+        with open_file(path) as file:
+            status = os.fstat(file.fileno())
+            size = status.st_size
+            if size <= most and zipfile.is_zipfile(file):
+                size = max(size, sum(member.file_size for member in ZipFile(file).infolist()))
+    except (OSError, ValueError, zipfile.BadZipFile) as cause:
+        raise error(f"no file '{path}': {getattr(cause, 'strerror', None) or cause}") from None
+    if size > most:
+        raise error(f"'{path}' has {size:,} bytes, unpacked; at most {most:,} are read")
+    return str(path), status.st_mtime_ns, status.st_size
 
 
 def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:

@@ -210,18 +210,18 @@ def test_a_multibody_plant_of_expressions():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda a: absolute(a), r"k cannot hold abs\(x\): abs has no derivatives everywhere"),
-        (lambda a: 1.0 + smaller(a, 1.0), r"k cannot hold .*: min has no"),
-        (lambda a: larger(a, 1.0), r"max has no"),
-        (lambda a: ceil(a), r"ceil has no"),
-        (lambda a: sin(floor(a)), r"floor has no"),
-        (lambda a: if_then_else(a > 0, a, 1.0), r"if_then_else has no"),
-        (lambda a: uninterpreted_function("w", [a]), r"nothing is known of the function w\(x\)"),
-        (lambda a: a + Variable("w"), r"k cannot hold .*: the variable w is neither a state nor"),
-        (lambda a: Variable("b", Variable.Type.BOOLEAN), r"the variable b is neither"),
-        (lambda a: "x", r"k cannot hold x: it is no expression of pydrake.symbolic, but str"),
-        (lambda a: np.nan, r"pendulum: k, entry .* holds a constant that is not finite"),
-        (lambda a: [a, a], r"pendulum: g has shape"),
+        (lambda a: absolute(a), r"\bk\b.*abs\(x\)"),
+        (lambda a: 1.0 + smaller(a, 1.0), r"\bmin\b"),
+        (lambda a: larger(a, 1.0), r"\bmax\b"),
+        (lambda a: ceil(a), "ceil"),
+        (lambda a: sin(floor(a)), "floor"),
+        (lambda a: if_then_else(a > 0, a, 1.0), "if_then_else"),
+        (lambda a: uninterpreted_function("w", [a]), r"\bw\(x\)"),
+        (lambda a: a + Variable("w"), r"\bk\b.*\bw\b"),
+        (lambda a: Variable("b", Variable.Type.BOOLEAN), r"\bb\b"),
+        (lambda a: "x", r"\bk\b.*\bx\b.*str"),
+        (lambda a: np.nan, "pendulum: k, "),
+        (lambda a: [a, a], "pendulum: g "),
     ],
 )
 def test_refusals_name_the_function_and_the_expression(make, message):
@@ -231,7 +231,7 @@ def test_refusals_name_the_function_and_the_expression(make, message):
 
 def test_refused_variables():
     x = Variable("x")
-    with pytest.raises(ModelError, match=r"state must be a list, got Variable"):
+    with pytest.raises(ModelError, match=r"state.*Variable"):
         from_symbolic(x, f=[x], h=[1.0], l=[x])
     for states, parameters, message in (
         ([x, x], {}, "the variable x occurs twice"),
@@ -239,7 +239,7 @@ def test_refused_variables():
         (["x"], {}, r"state\[0\] must be a Variable, got 'x'"),
         ([Variable("n", Variable.Type.INTEGER)], {}, "must be continuous Variables"),
         ([x, Variable("x")], {}, "names must be unique"),
-        ([x], {Variable("c"): [1.0, 2.0]}, r"parameters\[.*\] must be a finite number"),
+        ([x], {Variable("c"): [1.0, 2.0]}, "parameters"),
     ):
         with pytest.raises(ModelError, match=message):
             from_symbolic(

@@ -5,17 +5,15 @@ from typing import TypeVar
 
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import Adder, AffineSystem, MatrixGain
+from pydrake.systems.primitives import Adder, MatrixGain
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import ConstantReference, Reference
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.errors import ModelError, WiringError
+from drake_dae.errors import WiringError
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.sensing.tolerances import Tolerances, ToleranceWatch
 
 Block = TypeVar("Block", bound=System)
 
@@ -109,17 +107,8 @@ def check_parts(
                 "needs a ReferenceGenerator(references, controller.law.layout.reference_degrees)"
             )
         raise WiringError(f"{controller.get_name()} {needs}")
-    needs = "it needs the references of a generator, and there is none"
-    missing = {"tolerances": reference, "observer": contact_reference(controller, reference)}
-    refused = {name: needs for name, source in missing.items() if source is None}
-    refused |= controller.refused
-    problems = [
-        f"{name}: {reason}"
-        for name, reason in refused.items()
-        if (value := getattr(parts, name)) is not None and (name != "exogenous" or value)
-    ]
-    if problems:
-        raise WiringError("; ".join(problems))
+    if parts.observer is not None and contact_reference(controller, reference) is None:
+        raise WiringError("observer: it needs the references of a generator, and there is none")
     sensor = parts.sensor
     if sensor is None:
         return
@@ -133,35 +122,6 @@ def check_parts(
         )
     if not controller.HasInputPort("measured_force"):
         raise WiringError("the law takes no measured force; make it with measured_force=True")
-
-
-def add_watch(
-    builder: DiagramBuilder,
-    plant: Plant,
-    reference: ReferenceGenerator,
-    law: TrackingLaw,
-    tolerances: Tolerances,
-) -> None:
-    """Adds the block that ends a run whose errors exceed the tolerances.
-
-    Raises:
-        WiringError: There is no such output.
-    """
-    dae, layout = plant.dae, law.layout
-    signals, sizes = (
-        (dae.output_signals, dae.force_signals),
-        (layout.reference_size, dae.num_states),
-    )
-    # For a continuous plant, often enough for the time constant.
-    period = plant.time_step or tolerances.window / 20.0
-    try:
-        watch = ToleranceWatch(tolerances, *signals, layout.lowest, sizes, period)
-    except ModelError as error:
-        raise WiringError(str(error)) from None
-    builder.AddSystem(watch)
-    builder.Connect(reference.GetOutputPort("reference"), watch.GetInputPort("reference"))
-    for name in ("controlled_output", "constraint_force", "state"):
-        builder.Connect(plant.GetOutputPort(name), watch.GetInputPort(name))
 
 
 def add_hold(
@@ -185,31 +145,3 @@ def add_hold(
             source = spread.get_output_port()
         builder.Connect(source, total.get_input_port(index))
     builder.Connect(total.get_output_port(), controller.GetInputPort("hold"))
-
-
-def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) -> list[OutputPort]:
-    """Adds the block that stops the integrals of the forces of open contacts.
-
-    Args:
-        builder: The builder of the diagram, with the plant in it.
-        plant: The plant.
-        controller: The controller of the integrals.
-
-    Returns:
-        Its output port, for the controller's `hold`; empty if there is no such integral, or the
-        controller opens contacts and does so itself.
-    """
-    if controller.takes_over or not controller.HasInputPort("hold"):
-        return []
-    law = controller.law
-    rows = law.measured_force.rows if law.measured_force else {}
-    integrates = np.zeros((len(law.integral.outputs), len(plant.contacts)))
-    for row, output in enumerate(law.integral.outputs):
-        for column, normal in enumerate(plant.normals):
-            integrates[row, column] = output in rows and not rows[output][normal].is_zero()
-    if not integrates.any():
-        return []
-    hold = builder.AddSystem(AffineSystem(D=-integrates, y0=integrates.sum(axis=1)))
-    hold.set_name("open_contacts")
-    builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())
-    return [hold.get_output_port()]

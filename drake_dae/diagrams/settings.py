@@ -12,7 +12,6 @@ from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor
-from drake_dae.systems.sensing.tolerances import Tolerances
 
 
 @checked(WiringError)
@@ -38,7 +37,6 @@ class LoopSettings:
             constant if empty.
         plant_exogenous: The references of the plant's exogenous signals; None if they equal the
             law's.
-        tolerances: The tolerated errors; a run that exceeds them ends with an exception.
         signals: Name -> reference of a signal for which a controller waits, such as phases of a
             task; the signal is set where the reference is above 1/2. For any other signal the loop
             has an input port signal_<name>.
@@ -55,7 +53,6 @@ class LoopSettings:
     observer: Observing | None = None
     exogenous: Sequence[Reference] = ()
     plant_exogenous: Sequence[Reference] | None = None
-    tolerances: Tolerances | None = None
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
     commanded: bool = False
     start_time: float = 0.0

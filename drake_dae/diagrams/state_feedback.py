@@ -2,14 +2,12 @@
 
 from dataclasses import dataclass
 
-import casadi as ca
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import RandomSource
 
 from drake_dae.diagrams.sources import add_noise, seed_noise
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.robots.links.links import velocities_are_rates
-from drake_dae.robots.model import RobotModel
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
@@ -63,26 +61,10 @@ def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:
             "velocities from differences need q' = v, and this robot has a body with q' = N(q) v; "
             "leave velocity_bandwidth out"
         )
-    bristles = _copied_bristles(plant.model, period)
     try:
-        return StateSensor(plant.dae.num_states, links.q.numel(), encoders, period, bristles)
+        return StateSensor(plant.dae.num_states, links.q.numel(), encoders, period)
     except ModelError as error:
         raise WiringError(str(error)) from None
-
-
-def _copied_bristles(model: RobotModel, period: float) -> ca.Function | None:
-    """The bristles of friction after a period, of q, v and those before; None without any."""
-    dae, friction = model.dae, model.friction
-    if not friction.signals:
-        return None
-    if any(dae.exogenous.degrees(friction.rate)):
-        raise WiringError(
-            f"encoders do not show the bristles of '{friction.owner}', whose surface moves: leave "
-            "its presliding or the encoders out"
-        )
-    after = friction.after(period)
-    after = ca.substitute(after, dae.parameter_symbol, ca.DM(dae.parameter_values))
-    return ca.Function("bristles", [model.links.q, model.links.v, friction.state], [after])
 
 
 def add_encoders(

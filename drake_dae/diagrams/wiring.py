@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import DiagramBuilder, System
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference, references_by_name
@@ -16,10 +16,8 @@ from drake_dae.diagrams.parts import (
     add_block,
     add_hold,
     add_signals,
-    add_watch,
     check_parts,
     contact_reference,
-    open_holds,
 )
 from drake_dae.diagrams.recorded import (
     further_signals,
@@ -51,9 +49,7 @@ def make_closed_loop(
 ) -> ClosedLoop:
     """Builds the closed loop of a plant, a tracking law and references, with a log and a view.
 
-    While a contact of a `UnilateralRobotPlant` is open, the law continues, so that phi'' = -A(x)
-    lambda_d with the desired force lambda_d. The integral of this force is not updated. With a
-    `ContactPlant` all signals are logged at its steps.
+    With a `ContactPlant` all signals are logged at its steps.
 
     Args:
         plant: A `RobotPlant`, or any other `Plant`.
@@ -68,7 +64,7 @@ def make_closed_loop(
             a scene_graph: `FRAME_RATE` times a second, which shortens the integrator's steps. None
             for no live view; `make_animation` does not need it.
 
-    A loop without view, sampling, limits and tolerances converts to AutoDiffXd, for Drake's
+    A loop without view, sampling and limits converts to AutoDiffXd, for Drake's
     Linearize.
 
     Warns:
@@ -152,8 +148,8 @@ def wire_loop(
     moving, known = add_exogenous(builder, plant, controller, parts)
 
     # An observer estimates model errors for the law, and perhaps its state. Integrals are not
-    # updated while a contact is open or lost, or a drive is at its limit.
-    holds, observer = open_holds(builder, plant, controller), None
+    # updated while a contact is lost, or a drive is at its limit.
+    holds, observer = list[OutputPort](), None
     if observing is not None and goal is not None:
         ports = state, sampling, control, goal, limits
         observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)
@@ -172,8 +168,6 @@ def wire_loop(
             add_block(builder, parts.sensor)
         ways = parts.sensor, parts.sampling, [] if observer is None else [observer]
         noise = add_force_feedback(builder, plant, controller, *ways)
-    if parts.tolerances is not None and reference is not None:
-        add_watch(builder, plant, reference, law, parts.tolerances)
 
     # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
     named = {

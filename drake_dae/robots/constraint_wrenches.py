@@ -41,7 +41,7 @@ class ConstraintWrenches:
         constraints: The constraints that act at a point.
         frames: The frame that each of these acts on.
         with_moment: Whether each of these has a moment besides its force.
-        function: (q, v, states of bristles, lambda, parameters) -> points, forces and moments,
+        function: (q, v, lambda, parameters) -> points, forces and moments,
             shapes (3, k).
     """
 
@@ -62,7 +62,6 @@ class ConstraintWrenches:
             {
                 "q": links.q,
                 "v": links.v,
-                "bristles": model.friction.state,
                 "force": force,
                 "parameters": model.dae.parameter_symbol,
             },
@@ -73,7 +72,6 @@ class ConstraintWrenches:
         )
         self._parameters = model.dae.parameter_vector(parameters).copy()
         self._parts = np.cumsum([links.q.numel(), links.v.numel()])
-        self._bristles = model.friction.state.numel()
 
     def __call__(
         self, state: FloatArray, constraint_force: ArrayLike, parameters: ArrayLike | None = None
@@ -81,17 +79,13 @@ class ConstraintWrenches:
         """The wrenches at one time.
 
         Args:
-            state: x, or only its first part, the link state (q, v), for bristles at rest.
+            state: x, or only its first part, the link state (q, v).
             constraint_force: lambda, shape (m,).
             parameters: Values of all parameters at that time, if some are exogenous.
         """
-        q, v, further = np.split(state, self._parts)
-        # They are the last states, after those of the stages.
-        bristles = (
-            further[further.size - self._bristles :] if further.size else np.zeros(self._bristles)
-        )
+        q, v, _ = np.split(state, self._parts)
         values = self._parameters if parameters is None else parameters
-        tables = self.function(q, v, bristles, constraint_force, values)
+        tables = self.function(q, v, constraint_force, values)
         return Wrenches(*(table.reshape(3, -1, order="F").T for table in tables))
 
 
@@ -110,6 +104,6 @@ def contact_normals(model: RobotModel) -> TracedFunction:
     links = model.links
     kinematics = links.kinematics()
     axes = [a.force_axes for _, _, a in ConstraintSet(model.constraints).acting(kinematics)]
-    moving = ca.vertcat(links.v, model.friction.state)
-    normals = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), moving, 0 * moving)
+    v = links.v
+    normals = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), v, 0 * v)
     return model.dae.trace("normals", {"normals": ca.densify(normals)})

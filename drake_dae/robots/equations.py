@@ -1,7 +1,7 @@
 """The equations of a robot in contact as a DaeSystem.       (43)-(45), (64)-(68), (74)-(78)"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -12,7 +12,6 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.chain import ActuationChain
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.constraints.presliding import FrictionState
 from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.loop_state import LoopState
@@ -42,17 +41,15 @@ def robot_equations(
     driven: ActuationChain,
     loop_joints: LoopState,
     known_forces: Sequence[Load],
-    bristles: FrictionState,
     outputs: Outputs,
     choice: tuple[Parameter, ...],
     nominal: FloatArray,
 ) -> DaeSystem:
-    """(43)-(45), with M on the left; the rows of stages follow those of links, then friction's.
+    """(43)-(45), with M on the left; the rows of stages follow those of links.
 
     Args:
         name: The robot's name in messages.
-        links, bound, driven, loop_joints, known_forces, bristles, outputs: The parts of the robot,
-            with the states of its friction.
+        links, bound, driven, loop_joints, known_forces, outputs: The parts of the robot.
         choice: The parameters of the choice of the control, if any; see `control_choice`.
         nominal: A configuration of the robot at work, shape (nq,).
     """
@@ -68,7 +65,6 @@ def robot_equations(
     torque += loop_joints.force
     motors = loop_joints.motors
     rotors = _moved_rotors(links, driven)
-    c = bristles.state.numel()
 
     def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
         acceleration = rate[nq : nq + nv]
@@ -79,33 +75,29 @@ def robot_equations(
             motion = kinematics.value(bound.rate(kinematics))
             constraint_rate += ca.jtimes(motion, links.q, slip)
         balance = inertial - ca.mtimes(rotors, acceleration) - torque  # (37)
-        stages = ca.mtimes(driven.mass, rate[nq + nv : nq + nv + k]) - driven.drift
-        friction = rate[nq + nv + k :] - bristles.rate
-        return ca.vertcat(rate[:nq] - velocity, balance, stages, friction), constraint_rate
+        stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
+        return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 
     def factorize(rows: Sequence[int]) -> Factors | None:
         first = rows[0] if rows else 0
-        if first > nq or list(rows) != list(range(first, nq + nv + k + c)):
+        if first > nq or list(rows) != list(range(first, nq + nv + k)):
             return None
         bodies = links.articulated_bodies(_rotors_in_links(links, driven))
         if bodies is None:
             return None
-        others = (ca.SX.eye(nq - first), ca.diagcat(driven.mass, ca.SX.eye(c)))
+        others = (ca.SX.eye(nq - first), driven.mass)
         before, after = ((PositiveDefiniteFactorization(e), e.shape[0]) for e in others)
         return BlockFactors([before, (bodies, nv), after])
 
     return DaeSystem(
-        state=ca.vertcat(links.q, links.v, driven.state, bristles.state),
-        mass_matrix=ca.diagcat(
-            ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass, ca.SX.eye(c)
-        ),
-        f=ca.vertcat(velocity, torque - links.bias, driven.drift, bristles.rate),  # (43)
-        g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k + c, m)),
+        state=ca.vertcat(links.q, links.v, driven.state),
+        mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
+        f=ca.vertcat(velocity, torque - links.bias, driven.drift),  # (43)
+        g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
         h=ca.vertcat(
             ca.SX(nq, nu),
             ca.horzcat(ca.mtimes(B, driven.direct), motors),
             ca.horzcat(driven.drive, ca.SX(k, motors.shape[1])),
-            ca.SX(c, nu),
         ),
         k=bound.constraint_output(links.kinematics()),  # (44)
         l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
@@ -121,14 +113,13 @@ def robot_equations(
             *links.position_signals,
             *links.velocity_signals,
             *driven.state_signals,
-            *bristles.signals,
         ),
         constraint_input_signals=bound.force_signals,
         constraint_output_signals=bound.residual_signals,
         control_signals=controls,
         output_signals=outputs.signals,
-        nominal_state=np.concatenate([nominal, np.zeros(nv + k + c)]),
-        state_scale=np.ones(nq + nv + k + c),  # For SI units and angles.
+        nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
+        state_scale=np.ones(nq + nv + k),  # For SI units and angles.
         name=name,
         implicit=implicit,
         factorize=factorize,
@@ -137,17 +128,6 @@ def robot_equations(
         contacts=bound.contacts(links),
         dry=tuple(name for load in known_forces for name in load.dry),
     )
-
-
-def friction_state(
-    links: Links, bound: ConstraintSet, known_forces: Sequence[Load]
-) -> FrictionState:
-    """The states of the friction of all contacts and joints, shape (c, 1); c = 0 without any."""
-    kinematics = links.kinematics()
-    states = [constraint.friction_state(kinematics) for constraint in bound.constraints]
-    states += [load.friction_state(kinematics) for load in known_forces]
-    together = FrictionState.of([state for state in states if state is not None])
-    return replace(together, rate=kinematics.value(together.rate))
 
 
 def check_mass_matrix(dae: DaeSystem, links: Links, nominal: FloatArray) -> None:

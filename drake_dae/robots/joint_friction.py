@@ -1,7 +1,7 @@
 """Coulomb and viscous friction of joints."""
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -11,7 +11,6 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import numbers, positive
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.presliding import Bristles, FrictionState, Presliding
 from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.kinematics import Kinematics, Reaction, position_index
 
@@ -23,18 +22,15 @@ class JointFriction(Load):
 
         tau = -(F_c / sqrt(q'^2 + v_s^2) + d) q'.
 
-    It does not stick: below the Coulomb torque a joint creeps with at most v_s. With `presliding`,
-    bristles take the place of v_s and hold the joint: see `Presliding`; their state is
-    "<joint>.bristle". The parameters "<joint>.coulomb" and "<joint>.viscous" are F_c and d. A law
-    compensates the friction that its model has; with the values 0 in the model, and others in
-    `plant_parameters`, it is unknown.
+    It does not stick: below the Coulomb torque a joint creeps with at most v_s. The parameters
+    "<joint>.coulomb" and "<joint>.viscous" are F_c and d. A law compensates the friction that its
+    model has; with the values 0 in the model, and others in `plant_parameters`, it is unknown.
 
     Attributes:
         joints: Names of joint positions.
         coulomb: F_c in N m (N), not negative, a number or one for each joint.
         viscous: d in N m s (N s/m), likewise.
         stiction_tolerance: v_s in rad/s (m/s), positive.
-        presliding: The bristles of each joint, in rad (m); None for regularized friction.
 
     Raises:
         ModelError: A number is negative or not positive, or the joints are not names, each once.
@@ -44,8 +40,6 @@ class JointFriction(Load):
     coulomb: ArrayLike = 0.0
     viscous: ArrayLike = 0.0
     stiction_tolerance: float = 0.001
-    presliding: Presliding | None = None
-    bristles: tuple[Bristles, ...] = field(init=False, default=(), repr=False, compare=False)
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -68,29 +62,13 @@ class JointFriction(Load):
                 for joint, value in zip(self.joints, values, strict=True)
             ]
         object.__setattr__(self, "parameters", tuple(parameters))
-        if self.presliding is not None:
-            sizes = [ca.SX(number) for number in astuple(self.presliding)]
-            bristles = tuple(Bristles.of([f"{joint}.bristle"], sizes) for joint in self.joints)
-            object.__setattr__(self, "bristles", bristles)
 
     @property
     def dry(self) -> tuple[str, ...]:
         return tuple(f"{joint}.coulomb" for joint in self.joints)
 
     def reaction(self, kinematics: Kinematics) -> Reaction:
-        force = -ca.mtimes(self.resistance(kinematics), kinematics.v)
-        for joint, bristles in zip(self.joints, self.bristles, strict=False):
-            rate, row = self._rate(kinematics, joint)
-            force -= self._number(f"{joint}.coulomb") * bristles.traction(rate) * row.T
-        return Reaction(force)
-
-    def friction_state(self, kinematics: Kinematics) -> FrictionState | None:
-        if not self.bristles:
-            return None
-        pairs = zip(self.joints, self.bristles, strict=True)
-        return FrictionState.of(
-            [b.state_at(self._rate(kinematics, joint)[0]) for joint, b in pairs]
-        )
+        return Reaction(-ca.mtimes(self.resistance(kinematics), kinematics.v))
 
     def resistance(self, kinematics: Kinematics) -> ca.SX:
         size = kinematics.v.numel()
@@ -98,9 +76,8 @@ class JointFriction(Load):
         for joint in self.joints:
             rate, row = self._rate(kinematics, joint)
             factor = self._number(f"{joint}.viscous")
-            if not self.bristles:
-                speed = ca.sqrt(rate**2 + self.stiction_tolerance**2)
-                factor += self._number(f"{joint}.coulomb") / speed
+            speed = ca.sqrt(rate**2 + self.stiction_tolerance**2)
+            factor += self._number(f"{joint}.coulomb") / speed
             total += factor * ca.mtimes(row.T, row)
         return total
 

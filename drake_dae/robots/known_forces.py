@@ -9,7 +9,6 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.presliding import FrictionState
 from drake_dae.robots.links.kinematics import Kinematics, Reaction
 from drake_dae.robots.surfaces.surface import Vector
 
@@ -21,7 +20,6 @@ class Load(ABC):
     2. `resistance` is D(q, v), positive semidefinite, if they are -D v; zero otherwise. A plant in
        discrete steps uses D v of the velocities after the step, which is stable for any step.
     3. `dry` are the names of the parameters that are coefficients of Coulomb friction.
-    4. `friction_state` are further states of the robot that the forces need, and their rates.
     """
 
     parameters: tuple[Parameter, ...]
@@ -34,10 +32,6 @@ class Load(ABC):
     @abstractmethod
     def reaction(self, kinematics: Kinematics) -> Reaction:
         """The reaction on the robot."""
-
-    def friction_state(self, kinematics: Kinematics) -> FrictionState | None:
-        """The states of friction; None if there are none."""
-        return None
 
     def resistance(self, kinematics: Kinematics) -> ca.SX:
         """D of the generalized force -D v, shape (nv, nv)."""
@@ -98,7 +92,6 @@ class KnownWrench(KnownForce):
         return kinematics.reaction(ca.dot(force, velocity) + ca.dot(moment, turning))
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class ScaledForce(KnownForce):
     """A force s(t) F on a point of a frame, whose course s is an exogenous signal.

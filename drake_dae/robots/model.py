@@ -24,7 +24,6 @@ from drake_dae.robots.control_choice import check_outputs, control_choice
 from drake_dae.robots.equations import (
     Outputs,
     check_mass_matrix,
-    friction_state,
     robot_equations,
 )
 from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
@@ -47,17 +46,16 @@ class RobotModel:
     with J = (dphi/dq) N. With friction, G(q, v) takes the place of J^T; viscous friction is part of
     H. A nonholonomic constraint has its rate in place of phi, and r = 1. With rigid joints tau = u;
     stages of actuation add dynamics between u and tau: E s' = drift(q, v, s) + drive u, tau =
-    tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s), followed by the states
-    of friction with `Presliding`; the constraint input is lambda, and the controlled outputs are z
-    = (z_1, z_2), so the number of position outputs is that of actuators minus constraints. If fewer
-    forces are controlled (wheels, mimic joints), or combinations of them (a grasp), `forces`
-    chooses them: z_2 = S(q) lambda, and the number of position outputs is that of actuators minus
-    these. The plant's port always has all of lambda. With fewer outputs than actuators, as in a
-    redundantly actuated parallel robot, `control_weights` w chooses the control with the least sum
-    w_i (u_i - u_0i)^2 among all with the same outputs; see `DaeSystem`. u_0 is the parameter
-    "free_control", zero by default: it affects internal forces and motions that are not outputs.
-    With flexible joints each additional actuator leaves one undamped deflection: rather make the
-    internal force an output.
+    tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s); the constraint input is
+    lambda, and the controlled outputs are z = (z_1, z_2), so the number of position outputs is that
+    of actuators minus constraints. If fewer forces are controlled (wheels, mimic joints), or
+    combinations of them (a grasp), `forces` chooses them: z_2 = S(q) lambda, and the number of
+    position outputs is that of actuators minus these. The plant's port always has all of lambda.
+    With fewer outputs than actuators, as in a redundantly actuated parallel robot,
+    `control_weights` w chooses the control with the least sum w_i (u_i - u_0i)^2 among all with the
+    same outputs; see `DaeSystem`. u_0 is the parameter "free_control", zero by default: it affects
+    internal forces and motions that are not outputs. With flexible joints each additional actuator
+    leaves one undamped deflection: rather make the internal force an output.
 
     Args:
         links: The links, which provide M, H and the frames.
@@ -87,7 +85,7 @@ class RobotModel:
         links, outputs, nominal_positions, name, known_forces: The arguments.
         constraints: The constraints, with those of the plant.
         forces: The force outputs; a name is a `NamedForce`.
-        stages, friction: The attached stages; the states of bristles, and their rates.
+        stages: The attached stages.
         joint_force: tau as an expression of `dae.state`; None with rigid joints.
         control_limits: The largest |u| per actuator; infinite without a limit or if u is not a
             joint force. Those in joints that close loops come last.
@@ -152,7 +150,6 @@ class RobotModel:
         self.loop_joints = LoopState.of(bound, links)
         self.nominal_positions = nominal = self._nominal(nominal_positions)
         steered = (*signals, *(s for f in self.forces for s in f.signals(bound)))
-        self.friction = friction_state(links, bound, self.known_forces)
         equations = robot_equations(
             name,
             links,
@@ -160,7 +157,6 @@ class RobotModel:
             driven,
             self.loop_joints,
             self.known_forces,
-            self.friction,
             Outputs(h_1, S, steered),
             choice,
             nominal,
@@ -175,9 +171,7 @@ class RobotModel:
         phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
         self.placing = StaticPlacement(self.dae, links.q, phi, h_1)
         chosen = self.dae.m[h_1.numel() :, :]
-        self.balance = StaticBalance(
-            self.dae, links, self.friction.state, chosen, bool(self.stages)
-        )
+        self.balance = StaticBalance(self.dae, links, chosen, bool(self.stages))
         if self.stages:
             self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
 
@@ -233,6 +227,7 @@ class RobotModel:
         """Names and units of z_1."""
         return self.dae.output_signals[: self.dae.num_outputs - self._num_forces]
 
+    @checked(ModelError)
     def configuration(
         self,
         outputs: ArrayLike | None,
@@ -265,6 +260,7 @@ class RobotModel:
             of_outputs = self.dae.parameter_vector(output_parameters)
         return self.placing.solve(wanted, q, values, of_outputs)
 
+    @checked(ModelError)
     def rest_state(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
@@ -289,6 +285,7 @@ class RobotModel:
         load = vector(f"{self.name}: forces", forces, self._num_forces)
         return self.balance.state(q, load, values)
 
+    @checked(ModelError)
     def rest_forces(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:

@@ -117,26 +117,22 @@ class StaticBalance:
     Entries of lambda that are outputs themselves (a row of the identity) are not unknowns.
 
     Args:
-        dae: The robot's system, with the state (q, v, s, friction).
+        dae: The robot's system, with the state (q, v, s).
         robot: The links, with positions and velocities.
-        friction: The states of friction, shape (c, 1), which are zero here.
         S: The matrix of the given combinations of lambda, shape (k, m); without redundant
             constraints.
         has_stages: Whether there are stages; without them any state of the links is one at rest.
     """
 
-    def __init__(
-        self, dae: DaeSystem, robot: Links, friction: ca.SX, S: ca.SX, has_stages: bool
-    ) -> None:
+    def __init__(self, dae: DaeSystem, robot: Links, S: ca.SX, has_stages: bool) -> None:
         self._has_stages = has_stages
         q, v = robot.q, robot.v
-        links, still = q.numel() + v.numel(), ca.vertcat(v, friction)
-        end = dae.num_states - friction.numel()
+        links = q.numel() + v.numel()
         control = ca.SX.sym("u", dae.num_controls)
         force = ca.SX.sym("lambda", dae.num_constraints)
         load = ca.SX.sym("z_2", S.shape[0])
         balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
-        balance = ca.substitute(balance[q.numel() : end], still, ca.SX.zeros(still.numel()))
+        balance = ca.substitute(balance[q.numel() :], v, ca.SX.zeros(v.numel()))
         alone = [_unit_row(S[i, :]) for i in range(S.shape[0])]
         determined = {place: i for i, place in enumerate(alone) if place is not None}
         forces = ca.SX(force)
@@ -145,12 +141,12 @@ class StaticBalance:
         combined = [i for i, place in enumerate(alone) if place is None]
         rows = (ca.mtimes(S, force) - load)[combined]
         balance = ca.substitute(ca.vertcat(balance, rows), force, forces)
-        all_forces = ca.substitute(dae.forces(forces), still, ca.SX.zeros(still.numel()))
+        all_forces = ca.substitute(dae.forces(forces), v, ca.SX.zeros(v.numel()))
         free = [i for i in range(dae.num_constraints) if i not in determined]
-        unknown = ca.vertcat(dae.state[links:end], control, force[free])
+        unknown = ca.vertcat(dae.state[links:], control, force[free])
         self._unknowns = unknown.numel()
-        self._robot, self._stages = dae.name, end - links
-        self._still, self._unbent = np.zeros(v.numel()), np.zeros(friction.numel())
+        self._robot, self._stages = dae.name, dae.num_states - links
+        self._still = np.zeros(v.numel())
         self._function = TracedFunction(
             f"{dae.name} equilibrium",
             {"q": q, "z_2": load, "s, u, free forces": unknown, "parameters": dae.parameter_symbol},
@@ -168,7 +164,7 @@ class StaticBalance:
             ModelError: No drive holds the robot there.
         """
         if not self._has_stages:  # Forces enter no state.
-            return np.concatenate([q, self._still, self._unbent])
+            return np.concatenate([q, self._still])
         state, _, left = self.rest(q, forces, parameters)
         if left > 1e-6 * (1.0 + float(np.max(np.abs(forces), initial=0.0))):
             raise ModelError(
@@ -204,7 +200,7 @@ class StaticBalance:
 
         solution, _ = newton(np.zeros(self._unknowns), linearize)
         residuals, _, constraint_force = self._function(q, forces, solution, parameters)
-        state = np.concatenate([q, self._still, solution[: self._stages], self._unbent])
+        state = np.concatenate([q, self._still, solution[: self._stages]])
         return state, constraint_force, float(np.max(np.abs(residuals), initial=0.0))
 
 

@@ -13,7 +13,9 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import listed
+from drake_dae.errors import ModelError
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -38,7 +40,6 @@ from drake_dae.scenario.parts.families import (
     Sampling,
     Stage,
     Task,
-    Tolerances,
 )
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.simulation.simulate import check_config, check_duration
@@ -135,13 +136,14 @@ class Scenario:
             of the largest effort limit, or 1 N m without limits.
         largest_errors: The largest permitted errors for computed gains: those are then the
             smoothest ones within them, and without a bound the ones with the least errors.
-        plant: The plant: ideal constraints, opening contacts, or Drake's own contact in a discrete
-            MultibodyPlant with the surfaces as geometry.
+        plant: The plant: ideal constraints, contact that gives way, or Drake's own contact in a
+            discrete MultibodyPlant with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; continuous if left out.
         encoders: The measurement of positions and velocities for the law, with `sampling`; exact if
             left out.
         saturation: Whether controls are limited to the effort limits of the robot's file.
-        tolerances: The tolerated errors; a run that exceeds them ends with the reason.
+        tolerances: Output name -> the error in its unit that the verdict of a run tolerates. For
+            others it is 1 % of the range of the references in their unit.
         may_diverge: Whether a run continues when its errors or states diverge; otherwise it ends
             with the reason.
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
@@ -186,7 +188,7 @@ class Scenario:
     sampling: Sampling | None = None
     encoders: Encoders | None = None
     saturation: bool = False
-    tolerances: Tolerances | None = None
+    tolerances: dict[str, float] = field(default_factory=dict)
     may_diverge: bool = False
     references: dict[str, Reference] = field(default_factory=dict)
     task: Task | None = None
@@ -234,6 +236,7 @@ def scenario_reader(keys: tuple[str, ...] = ()) -> Reader[Scenario]:
     return Reader(Scenario, keys)
 
 
+@checked(ModelError)
 def scenario_schema(tags: bool = True) -> dict[str, Any]:
     """The JSON Schema of a scenario as plain data.
 

@@ -62,11 +62,11 @@ def test_the_dictionary_is_json(name):
 
 
 BAD_ARGUMENTS = {
-    "a list as region": ({"region": [(0, 1)]}, "region must be a dictionary or None"),
-    "text as seed": ({"seed": "a"}, "seed must be a whole number, got 'a'"),
-    "no function": ({"reference": [0.0] * 3, "times": [0, 1]}, "reference must be a function"),
-    "no value": ({"reference": lambda t: None, "times": [0, 1]}, "must have size 3 .* got None"),
-    "text": ({"reference": lambda t: "a", "times": [0, 1]}, r"reference\(0\) must be real numbers"),
+    "a list as region": ({"region": [(0, 1)]}, "region"),
+    "text as seed": ({"seed": "a"}, "seed.*'a'"),
+    "no function": ({"reference": [0.0] * 3, "times": [0, 1]}, "reference"),
+    "no value": ({"reference": lambda t: None, "times": [0, 1]}, "3 .*None"),
+    "text": ({"reference": lambda t: "a", "times": [0, 1]}, r"reference\(0\)"),
 }
 
 
@@ -78,7 +78,7 @@ def test_arguments_of_a_wrong_kind_are_refused(what):
 
 
 def test_what_is_no_system_is_refused():
-    with pytest.raises(ModelError, match="analyze: system must be a DaeSystem, got None"):
+    with pytest.raises(ModelError, match=r"system.*None"):
         analyze(None)
 
 

@@ -92,9 +92,9 @@ def test_a_highest_derivative_may_jump():
 
 
 CONTRADICTIONS = {
-    "derivatives left out": (lambda t, r: r * [1, 0, 0], "q0' = 0 at .* q0 changes by"),
-    "a factor of 1 %": (lambda t, r: r * [1, 1.01, 1.01], "q0' = .* but q0 changes by"),
-    "a wrong sign": (lambda t, r: r * [1, 1, -1], "q0'' = .* but q0' changes by"),
+    "derivatives left out": (lambda t, r: r * [1, 0, 0], "q0' = 0 .*q0"),
+    "a factor of 1 %": (lambda t, r: r * [1, 1.01, 1.01], "q0' = .*q0"),
+    "a wrong sign": (lambda t, r: r * [1, 1, -1], "q0'' = .*q0'"),
 }
 
 
@@ -102,5 +102,5 @@ CONTRADICTIONS = {
 def test_references_that_contradict_themselves_are_refused(what):
     changes, message = CONTRADICTIONS[what]
     system = double_integrator(output_signals=["q0"])
-    with pytest.raises(ModelError, match=f"double integrator: the reference contra.* {message}"):
+    with pytest.raises(ModelError, match=rf"double integrator: .*{message}"):
         analyze(system, reference=rising(changes), times=np.linspace(0.0, 5.0, 51))

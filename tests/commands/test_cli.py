@@ -55,7 +55,8 @@ def test_it_prints_the_summary(demo):
     assert out.splitlines()[0].startswith(f"{DEFAULT_SCENARIO}: built in ")
     written, watch = out.splitlines()[-2:]
     assert written == f"written to {folder}/: {', '.join(FILES)}"
-    assert watch == f"watch it: drake-dae play {folder}"
+    assert watch.startswith("watch it: ")
+    assert watch.endswith(f" play {folder}")
     assert "Tracked as predicted: errors stay within" in text
     assert re.search(r"simulated +2 s in \d+ steps, [\d.]+ s, [\d.]+ times real time", text)
     for name in ("tool.y", "tool.z", "joint7", "wall.force", "joint1_motor"):

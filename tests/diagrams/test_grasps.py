@@ -302,46 +302,46 @@ def test_what_is_free_moves_in_the_animation(name, body):
 @pytest.mark.parametrize(
     ("name", "setting", "words"),
     [
-        ("three_fingers", "robot.free=[]", ["robot.file: ", "body 'object' is free", "robot.free"]),
-        ("three_fingers", "robot.free=[objct]", ["robot.free: 'objct' is no body that can"]),
-        ("three_fingers", "robot.free=[world]", ["robot.free: 'world' is no body that can"]),
-        ("biped", "robot.free=[trunk]", ["robot.free: 'trunk' is not free: joint 'pitch'"]),
-        ("three_fingers", "robot.free=object", ["robot.free: expected a list, got 'object'"]),
-        ("three_fingers", "forces.0.first=grip", ["forces.0: no constraint 'grip'; did you mean"]),
-        ("three_fingers", "forces.1.frame=obj", ["forces.1: constraint 'grip2' acts not on 'obj'"]),
-        ("three_fingers", "forces.1.second=grip2", ["forces.1: a squeeze is between two"]),
-        ("three_fingers", "forces.1.third=grip2", ["forces.1: !Squeeze has no key 'third'"]),
+        ("three_fingers", "robot.free=[]", ["robot.file: ", "'object'", "robot.free"]),
+        ("three_fingers", "robot.free=[objct]", ["robot.free: ", "'objct'"]),
+        ("three_fingers", "robot.free=[world]", ["robot.free: ", "'world'"]),
+        ("biped", "robot.free=[trunk]", ["robot.free: ", "'trunk'", "'pitch'"]),
+        ("three_fingers", "robot.free=object", ["robot.free: ", "'object'"]),
+        ("three_fingers", "forces.0.first=grip", ["forces.0: ", "'grip'"]),
+        ("three_fingers", "forces.1.frame=obj", ["forces.1: ", "'grip2'", "'obj'"]),
+        ("three_fingers", "forces.1.second=grip2", ["forces.1: "]),
+        ("three_fingers", "forces.1.third=grip2", ["forces.1: ", "!Squeeze", "'third'"]),
         (
             "three_fingers",
             "forces.2=!Squeeze {frame: object}",
-            ["forces.2: !Squeeze needs", "'first'"],
+            ["forces.2: ", "!Squeeze", "'first'"],
         ),
         (
             "three_fingers",
             "forces.2=!Squeze {}",
-            ["forces.2: expected ", "!Squeeze", "got !Squeze"],
+            ["forces.2: ", "!Squeeze", "!Squeze"],
         ),
         (
             "three_fingers",
             "forces.2=3",
-            ["forces.2: expected one of !Squeeze, !ForceCombination, text", "got 3"],
+            ["forces.2: ", "!Squeeze", "!ForceCombination", "3"],
         ),
         (
             "three_fingers",  # What moves the puck, too.
             "forces.2=!ForceCombination {name: a, weights: {grip1.fx: 1, grip2.fx: 1, "
             "grip3.fx: 1}}",
-            ["outputs: Assumption (5)", "object_x", "cannot be steered independently"],
+            ["outputs: ", "(5)", "object_x"],
         ),
-        ("biped", "forces.0=!ForceCombination {weights: {}, name: a}", ["forces.0: 'a' needs"]),
+        ("biped", "forces.0=!ForceCombination {weights: {}, name: a}", ["forces.0: ", "'a'"]),
         (
             "biped",
             "forces.0=!ForceCombination {weights: {front.forc: 1}, name: a}",
-            ["forces.0: no constraint force 'front.forc'; did you mean 'front.force'?"],
+            ["forces.0: ", "'front.forc'", "'front.force'"],
         ),
         (
             "biped",
             "forces.0=!ForceCombination {weights: {front.force: a}, name: a}",
-            ["forces.0.weights.front.force: expected a number, got 'a'"],
+            ["forces.0.weights.front.force: ", "'a'"],
         ),
     ],
 )

@@ -72,8 +72,8 @@ def test_the_analysis_knows_what_moves():
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("exogenous={plate.positio: []}", "exogenous: no parameter 'plate.positio'; did you mean"),
-        ("exogenous={plate.rpy: []}", "plate.rpy: 3 numbers are needed, got 0"),
+        ("exogenous={plate.positio: []}", r"exogenous: .*'plate.positio'"),
+        ("exogenous={plate.rpy: []}", r"plate.rpy: .*3.*0"),
         (
             "exogenous={plate.rpy: [!PointToPoint {start: [0, 0, 0], end: [1, 0, 0], duration: 1,"
             " order: 1}]}",

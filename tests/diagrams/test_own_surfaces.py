@@ -67,7 +67,7 @@ def test_a_height_map_is_held_as_predicted(name, tmp_path):
     """Four derivatives of the map behind springs; the tool follows the bump, not the wall."""
     bump(tmp_path)
     file = json.dumps(str(tmp_path / "bump.csv"))
-    surface = f"constraints.0.surface=!HeightMap {{file: {file}, {PLACE}}}"
+    surface = f"constraints.0.surface=!MeasuredSurface {{file: {file}, {PLACE}}}"
     loop, _, record = run_scenario(scenario(name, surface, *SHORT))
     predicted = loop.predicted_error(record)
     # Behind springs the integrator's own error, 1e-5 N, is amplified.
@@ -82,7 +82,7 @@ def test_files_are_beside_the_scenario_and_what_smoothing_costs_is_in_the_summar
     bump(tmp_path)
     text = find_scenario("two_link_wall").read_text()
     old = text[text.index("  surface: !Plane") : text.index("outputs:")]
-    new = f"  surface: !HeightMap {{file: bump.csv, {PLACE}}}\n"
+    new = f"  surface: !MeasuredSurface {{file: bump.csv, {PLACE}}}\n"
     (tmp_path / "mine.yaml").write_text(text.replace(old, new))
     monkeypatch.chdir("/")
     options = [f"--set={one}" for one in (*SHORT, "duration=0.01", "write.plots=false")]
@@ -90,7 +90,7 @@ def test_files_are_beside_the_scenario_and_what_smoothing_costs_is_in_the_summar
         main(["simulate", str(tmp_path / "mine.yaml"), "--out", str(tmp_path / "run"), *options])
         == 0
     )
-    told = "wall: HeightMap 'bump.csv': the largest and rms distances"
+    told = "wall: MeasuredSurface 'bump.csv'"
     assert told in capsys.readouterr().out
     text = (tmp_path / "run" / "summary.txt").read_text()
     assert told in text
@@ -108,7 +108,7 @@ def test_where_the_robot_leaves_the_data_is_reported(tmp_path):
     bump(tmp_path)
     file = json.dumps(str(tmp_path / "bump.csv"))
     place = PLACE.replace("[0.8, 0.8]", "[0.8, 0.08]")
-    surface = f"constraints.0.surface=!HeightMap {{file: {file}, {place}, scale: 0.01}}"
+    surface = f"constraints.0.surface=!MeasuredSurface {{file: {file}, {place}, scale: 0.01}}"
     loop, _, record = run_scenario(scenario("two_link_wall", surface, *SHORT, "duration=0.02"))
     _, told = surface_remarks(loop.plant.model, record)
     assert "wall: the robot is beyond the edge of the data by up to 1" in told
@@ -119,8 +119,8 @@ def test_a_mesh_in_a_scenario(tmp_path):
     side = np.linspace(-0.4, 0.4, 41)
     bell = 0.05 * np.exp(-8.0 * (side**2 + side[:, None] ** 2))
     file = json.dumps(str(obj_of_grid(tmp_path / "bell.obj", side, side, bell)))
-    mesh = f"constraints.0.surface=!MeshSurface {{file: {file}, point: [1.2, 0, 0]}}"
-    assert scenario("two_link_wall", mesh).constraints[0].surface.relief.largest < 1e-3
+    mesh = f"constraints.0.surface=!MeasuredSurface {{file: {file}, point: [1.2, 0, 0]}}"
+    assert scenario("two_link_wall", mesh).constraints[0].surface.fit.largest < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -131,16 +131,15 @@ def test_a_mesh_in_a_scenario(tmp_path):
         ("!ImplicitSurface {function: z, parameters: [1]}", ".parameters", "names with values"),
         ("!ImplicitSurface {function: z, parameters: {a: x}}", ".parameters.a", "a number"),
         ("!ImplicitSurface {expression: z}", "", "needs the key 'function'"),
-        ("!HeightMap {size: [1, 1]}", "", "give either heights"),
-        ("!HeightMap {size: [1], heights: [[0, 1], [1, 2]]}", ".size", "expected 2 numbers"),
-        ("!HeightMap {size: [1, 1], heights: [[0, a], [1, 2]]}", ".heights", "a list of rows"),
-        ("!HeightMap {size: [1, 1], heights: [[0, 1], [1]]}", ".heights", "different lengths"),
-        ("!HeightMap {size: [1, 1], heights: 3}", "", "two rows of two heights are the least"),
-        ("!HeightMap {size: [1, 1], file: 3}", ".file", "expected the name of a file, got 3"),
-        ("!HeightMap {size: [1, 1], file: none.csv}", "", "no file '"),
-        ("!MeshSurface {file: none.stl}", "", "no file '"),
-        ("!MeshSurface {}", "", "needs the key 'file'"),
-        ("!MeshSurface {file: a.obj, normal: up}", ".normal", "expected 3 numbers"),
+        ("!MeasuredSurface {size: [1, 1]}", "", "heights"),
+        ("!MeasuredSurface {size: [1], heights: [[0, 1], [1, 2]]}", ".size", "[1]"),
+        ("!MeasuredSurface {size: [1, 1], heights: [[0, a], [1, 2]]}", ".heights", "rows"),
+        ("!MeasuredSurface {size: [1, 1], heights: [[0, 1], [1]]}", ".heights", "lengths"),
+        ("!MeasuredSurface {size: [1, 1], heights: 3}", "", "heights"),
+        ("!MeasuredSurface {size: [1, 1], file: 3}", ".file", "got 3"),
+        ("!MeasuredSurface {size: [1, 1], file: none.csv}", "", "none.csv"),
+        ("!MeasuredSurface {file: none.stl}", "", "none.stl"),
+        ("!MeasuredSurface {file: a.obj, normal: up}", ".normal", "3 numbers"),
     ],
 )
 def test_wrong_surfaces_are_reported_at_their_key(surface, key, words):
@@ -158,7 +157,7 @@ def test_a_mesh_that_seems_to_be_in_millimetres_is_reported(scale, is_told, tmp_
     (tmp_path / "sheet.obj").write_text("\n".join([*rows, "f 1 3 4", "f 1 4 2\n"]))
     (tmp_path / "task.yaml").write_text(
         "robot: {file: package://drake_dae_models/seven_joint_arm.urdf, base: {weld: base}}\n"
-        "constraints: [{frame: tool, name: part, surface: !MeshSurface {file: sheet.obj, "
+        "constraints: [{frame: tool, name: part, surface: !MeasuredSurface {file: sheet.obj, "
         f"point: [0.4, -0.2, 0.2], scale: {scale}}}}}]\n"
         "references: {part.force: 10, tool.x: 0.6, tool.y: 0.0}\n"
     )

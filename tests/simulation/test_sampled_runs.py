@@ -175,7 +175,7 @@ def test_a_step_that_fails_has_its_time_and_reason(short_runs):
     state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
     state[7:] = 1e9  # rad/s
     loop.set_state(context, state)
-    with pytest.raises(SimulationError, match=r"at t = 0.* s"):
+    with pytest.raises(SimulationError, match="t = 0"):
         simulate(loop.diagram, context, 0.06, chosen.integrator)
 
 

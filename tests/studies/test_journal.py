@@ -67,7 +67,7 @@ def test_processes_that_begin_at_the_same_instant_lose_no_row(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"version": "2.0"}, r"version .* '1\.0' .* '2\.0'|version = '1\.0' there, '2\.0' here"),
+        ({"version": "2.0"}, r"version.*1.0.*2.0"),
         ({"duration": "2.0"}, "duration"),
         ({"gains": "1"}, "gains"),
     ],

@@ -235,5 +235,5 @@ def test_a_rollout_is_that_of_the_scenario_alone():
 def test_steps_do_not_begin_before_zero():
     """Drake's periodic events do not, so such a plant would stand still until then."""
     found = scenario("wall_point_contact", "compiled=false", "integrator.start_time=-1")
-    with pytest.raises(ScenarioError, match=r"start_time: .* begin at 0 s"):
+    with pytest.raises(ScenarioError, match="start_time"):
         build_scenario(found)

@@ -268,25 +268,25 @@ def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
 @pytest.mark.parametrize(
     ("variations", "words"),
     [
-        ([], "at least one variation"),
-        ([{"start.error.tool.z": 1.0}], "start: has no key 'error'; did you mean 'errors'"),
-        ([{"duration": 1.0}, {"duration": "a"}], "duration: expected a number, got 'a'"),
+        ([], "variation"),
+        ([{"start.error.tool.z": 1.0}], r"start: .*'error'.*'errors'"),
+        ([{"duration": 1.0}, {"duration": "a"}], r"duration: .*'a'"),
         (
             [{"duration": value} for value in (1.0, float("nan"), 2.0)],
-            "duration: expected a number, got nan",
+            r"duration: .*nan",
         ),
         (
             [{"force_feedback.seed": 0.0}, {"force_feedback.seed": 1}],
-            "force_feedback: !ModelForce has no key 'seed'",
+            r"force_feedback: .*'seed'",
         ),
-        ([{"duration": -1.0}], "duration: a duration must be positive, got -1.0"),
-        ([{"outputs.3.axes": "z"}], "outputs: no entry '3'; entries: 0"),
-        ([{"a..b": 1}], "expected a dotted key"),
-        ([{"duration": object()}], "duration: expected plain data"),
-        ([{"start.errors.tool.x": 0.1}], "start.errors: no output 'tool.x'; did you mean 'tool.z'"),
-        ([{"plant_parameters.link1.mas": 1.0}], "no parameter 'link1.mas'; did you mean"),
-        ([{"start.positions.joint9": 0.1}], "start.positions: no joint position 'joint9'"),
-        ([{"plant_parameters.wall.position": [1.0, 2.0]}], "wall.position' has 3 entries"),
+        ([{"duration": -1.0}], r"duration: .*-1.0"),
+        ([{"outputs.3.axes": "z"}], r"outputs: .*'3'"),
+        ([{"a..b": 1}], "a..b"),
+        ([{"duration": object()}], "duration: "),
+        ([{"start.errors.tool.x": 0.1}], r"start.errors: .*'tool.x'"),
+        ([{"plant_parameters.link1.mas": 1.0}], "'link1.mas'"),
+        ([{"start.positions.joint9": 0.1}], r"start.positions: .*'joint9'"),
+        ([{"plant_parameters.wall.position": [1.0, 2.0]}], r"wall.position' .*3"),
     ],
 )
 def test_what_cannot_be_is_reported_before_anything_runs(variations, words, tmp_path):
@@ -296,9 +296,9 @@ def test_what_cannot_be_is_reported_before_anything_runs(variations, words, tmp_
     assert not file.parent.exists()
 
 
-@pytest.mark.parametrize(("workers", "words"), [(0, "from 1"), (1.5, "a whole number")])
-def test_workers_are_counted(workers, words, tmp_path):
-    with pytest.raises(ValueError, match=words):
+@pytest.mark.parametrize("workers", [0, 1.5])
+def test_workers_are_counted(workers, tmp_path):
+    with pytest.raises(ValueError, match=f"workers.*{workers}"):
         dd.sweep(chosen(), [{}], tmp_path / "runs.db", workers=workers)
 
 
@@ -340,7 +340,7 @@ def test_the_table_and_the_summary():
     assert row[-5:] == ["0", "0", "0.1", "0.2", "2"]
     assert repr(study) == "Study(4 runs: 2 finished, 1 failed, 1 no start)"
     np.testing.assert_array_equal(study.values("steps"), [7.0, 7.0, 7.0, np.nan])
-    with pytest.raises(ModelError, match="no figure 'step'; did you mean 'steps'"):
+    with pytest.raises(ModelError, match=r"'step'.*'steps'"):
         study.values("step")
 
 

@@ -84,7 +84,7 @@ def report_run(
     job = judge_job(
         record,
         predicted,
-        {} if scenario.tolerances is None else scenario.tolerances.outputs,
+        scenario.tolerances,
         [
             *shortfalls(record, limits),
             *exceeded,
@@ -123,7 +123,6 @@ def _contact_remarks(scenario: Scenario, loop: ClosedLoop, record: Record) -> li
     material = scenario.plant.material
     return [
         *surface_remarks(loop.plant.model, record),
-        *loop.plant.remarks,
         *ball_remarks(None if material is None else material.radius),
     ]
 
@@ -153,7 +152,6 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
             _has_unknown_friction(scenario, loop)
         ),
         "the contact is compliant": not loop.plant.is_ideal,
-        "a contact was open": "mode" in record and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,

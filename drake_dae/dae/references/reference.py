@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -41,9 +41,6 @@ class Reference(ABC):
 
     parameters: Mapping[str, Any] = MappingProxyType({})
     """Name -> values of the numbers that a study changes, each of shape (k,)."""
-
-    is_table: ClassVar[bool] = False
-    """Whether its function takes less time than its expression, as that of many polynomials."""
 
     @property
     @abstractmethod
@@ -88,7 +85,6 @@ class Reference(ABC):
         return ""
 
 
-@checked(ReferenceSignalError)
 class FormulaReference(Reference):
     """A reference that is a CasADi expression of time; differentiated exactly."""
 
@@ -179,11 +175,10 @@ def stack_references(
         ReferenceSignalError: A reference is not smooth enough.
     """
     parts = with_degrees(references, degrees)
-    if not any(reference.is_table for reference in references):
-        time = ca.SX.sym("t")
-        rows = [reference.expression(part, time) for reference, part in parts]
-        if all(row is not None for row in rows):
-            return at_time(time, ca.vertcat(*rows))
+    time = ca.SX.sym("t")
+    rows = [reference.expression(part, time) for reference, part in parts]
+    if all(row is not None for row in rows):
+        return at_time(time, ca.vertcat(*rows))
     functions = [reference.derivatives(part) for reference, part in parts]
 
     def evaluate(time: float) -> FloatArray:

@@ -76,17 +76,6 @@ class ForceMeasurement:
         """Returns the measured value of an output, m_i v."""
         return ca.mtimes(self.rows[output], self.symbol)
 
-    def inputs_for(self, values: ca.SX) -> ca.SX:
-        """Returns the least v for which the measured outputs have given values.
-
-        Args:
-            values: z, shape (p, 1); of the measured outputs.
-        """
-        rows, wanted = ca.vertcat(*self.rows.values()), values[list(self.rows), :]
-        if len(self.inputs) == len(self.rows):
-            return ca.mtimes(rows.T, wanted)
-        return ca.mtimes(rows.T, ca.solve(ca.densify(ca.mtimes(rows, rows.T)), wanted))
-
     def chain(self, chain: ca.SX) -> ca.SX:
         """Returns the output chains with the measurement in place of the model's l*_i.
 

@@ -162,23 +162,6 @@ class TrackingLaw:
         """Name -> symbol of each input of `function`."""
         return dict(self._inputs)
 
-    def commanded_derivatives(self, reference: ca.SX) -> ca.SX:
-        """Returns ubar of (28) for a reference, as an expression of state and parameters, (p, 1).
-
-        A measured force is assumed to equal its reference, and integrals to be 0.
-
-        Args:
-            reference: R, an expression of shape (sum (mu_i + 1), 1).
-        """
-        values = {"reference": ca.densify(reference)}
-        if self.measured_force is not None:
-            wanted = values["reference"][self.layout.lowest.tolist(), :]
-            values["measured_force"] = self.measured_force.inputs_for(wanted)
-        if self.integral.outputs:
-            values["integral"] = ca.SX.zeros(len(self.integral.outputs))
-        symbols = ca.vertcat(*[self._inputs[name] for name in values])
-        return ca.substitute(self._ubar, symbols, ca.vertcat(*values.values()))
-
     def trace_motion(self) -> TracedFunction | None:
         """Traces x' and v of a plant that equals the law's model, under the law; see `motion_for`.
 

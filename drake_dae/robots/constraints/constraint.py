@@ -12,13 +12,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyConstraintId
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal, moving
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.presliding import FrictionState
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.layer import Layer
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Vector
 
@@ -65,8 +62,6 @@ class Touch:
         clearance: A point in the world, shape (3, 1) -> its distance into the free side, in m.
         velocity: A point in the world, shape (3, 1) -> the velocity of the object there, in m/s.
         is_exact: Whether the distance is exact also off the object; else it is to first order.
-        bent: The sliding velocity and the normal, in the world -> the traction of its bristles in
-            the world, shape (3, 1), and their state; None without bristles.
     """
 
     frame: str
@@ -75,7 +70,6 @@ class Touch:
     clearance: Callable[[ca.SX], ca.SX]
     velocity: Callable[[ca.SX], ca.SX] = lambda point: ca.SX(3, 1)
     is_exact: bool = True
-    bent: Callable[[ca.SX, ca.SX], tuple[ca.SX, FrictionState]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +92,6 @@ class Joint:
     effort_limit: float = np.inf
 
 
-@checked(ModelError)
 class Constraint(ABC):
     """m constraint equations of a robot, and the m constraint forces lambda that enforce them.
 
@@ -137,11 +130,8 @@ class Constraint(ABC):
     14. `solids` and `layer` are the geometry for Drake's own contact: objects in the world that act
         on frame B of its first application at the point there.
     15. `touch` describes the contact point, if there is a free side; `residual` is then the
-        clearance of that point, except beyond the ends of a body that the law does not know. With
-        `ends`, `edges` are the distances of the foot of that point from the edges of the face.
+        clearance of that point.
     16. `add_to` adds it to a MultibodyPlant, if Drake has such a constraint.
-    17. `friction_state` are the states of its friction and their rates; they do not depend on
-        constraint forces.
 
     Attributes:
         name: The prefix of the names of its forces, residuals and parameters.
@@ -164,7 +154,7 @@ class Constraint(ABC):
     def sliding(self, kinematics: Kinematics) -> ca.SX | None:
         """The sliding velocity relative to the other object, m/s, shape (3, 1).
 
-        None without friction, or with friction of its own that impacts do not include.
+        None without friction.
         """
         return None
 
@@ -192,10 +182,6 @@ class Constraint(ABC):
 
     def drag(self, kinematics: Kinematics) -> Reaction | None:
         """The forces on the robot independent of constraint forces; None if there are none."""
-        return None
-
-    def friction_state(self, kinematics: Kinematics) -> FrictionState | None:
-        """The states of its friction; None if it has none."""
         return None
 
     def moving(self, names: Container[str]) -> Self:
@@ -244,25 +230,6 @@ class Constraint(ABC):
         return None
 
     @property
-    def ends(self) -> bool:
-        """Whether its surface has edges or holes, which the law does not know."""
-        return False
-
-    @property
-    def whole(self) -> Self:
-        """The same constraint with the surface that laws have, which does not end."""
-        return self
-
-    @property
-    def opening(self) -> tuple[float, float] | None:
-        """The radius and the chamfer of the hole in its surface in m; None without a hole."""
-        return None
-
-    def edges(self, frames: Frames) -> ca.SX:
-        """The distances of its point from the edges of its surface in m; see `Surface.edges`."""
-        return ca.SX(0, 1)
-
-    @property
     def remark(self) -> str:
         """The approximations of its surface, as text; empty if there are none."""
         return ""
@@ -301,7 +268,7 @@ class Constraint(ABC):
 
     def layer(
         self, values: FloatArray, point: FloatArray, size: float, depth: float
-    ) -> Layer | None:
+    ) -> PosedShape | None:
         """A mesh below a piece of the surface, for hydroelastic contact; None without a surface.
 
         Args:

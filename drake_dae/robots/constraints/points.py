@@ -1,8 +1,7 @@
 """Points on a surface, and points at a fixed distance."""
 
-from copy import copy
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -13,10 +12,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
-from drake_dae.robots.constraints.friction import Friction, bristles_of, friction_parameters
-from drake_dae.robots.constraints.presliding import Bristles, FrictionState, Presliding
+from drake_dae.robots.constraints.friction import Friction, friction_parameters
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.layer import Layer
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
 from drake_dae.trace.smoothness import length_of
@@ -43,12 +40,6 @@ class PointOnSurface(Constraint):
     have these parameters; use 0 for a surface that has them but no friction. If friction reverses
     the effect of lambda on phi'', the Painleve paradox occurs: see `dae.system.contacts`.
 
-    With `presliding` the vector s is the traction of bristles, which bend before the point slides
-    and hold it at rest: see `Presliding`. Their state "<name>.bristle_x", ... is in the axes of the
-    surface, and follows the velocity along the surface also while the contact is open. It replaces
-    v_s; the numbers are the parameters "<name>.presliding_distance", "<name>.static_ratio",
-    "<name>.stribeck_speed" and "<name>.damping_time".
-
     With flexible joints, motors or hydraulics the law differentiates s, whose slopes are 1 / v_s.
     With error control the prediction holds for all of them down to v_s = 0.001 m/s. At reversals of
     the sliding direction the control then rises by a factor of 3 to 18 with flexible joints and
@@ -66,11 +57,9 @@ class PointOnSurface(Constraint):
         friction: mu, not negative; None for no friction and no such parameters.
         stiction_tolerance: v_s in m/s, Drake's stiction tolerance; only with friction.
         viscous_friction: d in N s/m, not negative; None for none, without a parameter.
-        presliding: The bristles; None for regularized friction.
 
     Raises:
-        ModelError: A coefficient is negative, the speed not positive, or there is presliding
-            without friction.
+        ModelError: A coefficient is negative, or the speed not positive.
     """
 
     frame: str
@@ -81,9 +70,7 @@ class PointOnSurface(Constraint):
     friction: float | None = None
     stiction_tolerance: float = 1e-3
     viscous_friction: float | None = None
-    presliding: Presliding | None = None
     parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
-    bristles: Bristles | None = field(init=False, default=None, repr=False, compare=False)
     is_unilateral: ClassVar[tuple[bool, ...]] = (True,)
 
     def __post_init__(self) -> None:
@@ -96,10 +83,7 @@ class PointOnSurface(Constraint):
             self.friction,
             self.stiction_tolerance,
             self.viscous_friction,
-            self.presliding,
         )
-        if self.presliding is not None:
-            object.__setattr__(self, "bristles", bristles_of(self.name, frictional))
         surface, shape = with_parameters(self.name, self.surface)
         object.__setattr__(self, "surface", surface)
         object.__setattr__(self, "parameters", (position, *turns, *frictional, *shape))
@@ -140,20 +124,7 @@ class PointOnSurface(Constraint):
         """The friction on the point; None without friction."""
         if (sliding := self.sliding(kinematics)) is None:
             return None
-        bent = None if self.bristles is None else self._bent(sliding, self._normal(kinematics))
-        traction = None if bent is None else bent[0]
-        return Friction.of(self.name, self.parameters, sliding, traction)
-
-    def friction_state(self, kinematics: Kinematics) -> FrictionState | None:
-        sliding = self.sliding(kinematics)
-        if self.bristles is None or sliding is None:
-            return None
-        return self._bent(sliding, self._normal(kinematics))[1]
-
-    def _bent(self, sliding: ca.SX, normal: ca.SX) -> tuple[ca.SX, FrictionState]:
-        """The traction of the bristles in the world, and their state."""
-        assert self.bristles is not None
-        return self.bristles.bent(sliding, normal, self.rotation)
+        return Friction.of(self.name, self.parameters, sliding)
 
     def sliding(self, kinematics: Kinematics) -> ca.SX | None:
         if self.is_ideal:
@@ -204,10 +175,9 @@ class PointOnSurface(Constraint):
             self.frame,
             self.point,
             self._normal(frames),
-            lambda point: self.surface.clearance(self.offset_of(point)),
+            lambda point: self.surface.distance(self.offset_of(point)),
             self.surface_velocity,
             self.surface.has_exact_distance,
-            None if self.bristles is None else self._bent,
         )
 
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
@@ -216,23 +186,6 @@ class PointOnSurface(Constraint):
             push, drag = push + frictional.pull, frictional.drag
         point = kinematics.position(self.frame, self.point)
         return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
-
-    @property
-    def ends(self) -> bool:
-        return self.surface.ends
-
-    @property
-    def whole(self) -> Self:
-        changed = copy(self)
-        object.__setattr__(changed, "surface", self.surface.whole)
-        return changed
-
-    @property
-    def opening(self) -> tuple[float, float] | None:
-        return self.surface.opening
-
-    def edges(self, frames: Frames) -> ca.SX:
-        return self.surface.edges(self.offset(frames))
 
     @property
     def remark(self) -> str:
@@ -259,10 +212,9 @@ class PointOnSurface(Constraint):
         pose = self.placement(values)
         return tuple(solid.moved(pose) for solid in self.surface.solids())
 
-    def layer(self, values: FloatArray, point: FloatArray, size: float, depth: float) -> Layer:
+    def layer(self, values: FloatArray, point: FloatArray, size: float, depth: float) -> PosedShape:
         pose = self.placement(values)
-        layer = self._shaped(values).layer(pose.inverse() @ point, size, depth)
-        return replace(layer, solid=layer.solid.moved(pose))
+        return self._shaped(values).layer(pose.inverse() @ point, size, depth).moved(pose)
 
 
 @checked(ModelError)

@@ -1,6 +1,5 @@
 """A layer of tetrahedra below a surface, for Drake's hydroelastic contact."""
 
-from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -25,36 +24,6 @@ _RIM = 1.2
 
 _APEX = 2.0
 """The depth of the lowest vertex, relative to the longer side."""
-
-
-@dataclass(frozen=True, eq=False)
-class Layer:
-    """A piece of a surface as the upper side of a mesh of tetrahedra.
-
-    Attributes:
-        solid: The mesh, with the reference point of the surface at the origin.
-        facets: The numbers of cells along both sides, of two triangles each.
-        size: The lengths of both sides, in m.
-        rim: The width of the outermost cells, where the pressure falls to zero, in m.
-        distance: The largest distance of the middle of a triangle from the surface, in m, without
-            the rim.
-        angle: The largest angle between the normals of a triangle and of the surface, in rad.
-    """
-
-    solid: PosedShape
-    facets: tuple[int, int]
-    size: tuple[float, float]
-    rim: float
-    distance: float
-    angle: float
-
-    def __str__(self) -> str:
-        (rows, columns), (length, width) = self.facets, self.size
-        return (
-            f"a mesh of {length:.3g} m x {width:.3g} m with {rows} x {columns} cells for Drake's "
-            f"contact, off by up to {1e6 * self.distance:.2g} um and {np.degrees(self.angle):.2g} "
-            f"degrees, except in its rim of {1e3 * self.rim:.3g} mm"
-        )
 
 
 def facets_needed(grid: FloatArray) -> tuple[int, int]:
@@ -95,9 +64,7 @@ def sides(facets: int, length: float, depth: float) -> FloatArray:
     return np.concatenate([[-0.5], inner, [0.5]])
 
 
-def layer_below(
-    grid: FloatArray, surface: TracedFunction, depth: float, size: tuple[float, float]
-) -> Layer:
+def layer_below(grid: FloatArray, surface: TracedFunction, depth: float) -> PosedShape:
     """A layer below the points of a grid.
 
     The pressure of a hydroelastic mesh is linear in each tetrahedron, zero on its boundary, and the
@@ -109,7 +76,6 @@ def layer_below(
         grid: Points on the surface, in m, shape (r, c, 3).
         surface: Point -> distance and its gradient.
         depth: The thickness of the compliant layer, in m.
-        size: The lengths of both sides of the grid, in m.
 
     Raises:
         ModelError: There is no surface at some points, or it is too curved.
@@ -145,23 +111,7 @@ def layer_below(
         )
     turned = volumes < 0.0
     tetrahedra[turned] = tetrahedra[turned][:, [0, 2, 1, 3]]
-
-    # Without the rim, where the pressure falls.
-    inner = np.pad(np.ones((rows - 3, columns - 3), bool), 1).ravel()
-    faces = [np.column_stack([cell[0], cell[b], cell[3]])[inner] for b in (1, 2)]
-    triangles = points[np.vstack(faces)]
-    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    found = [surface(point) for point in triangles.mean(axis=1)]
-    slopes = np.array([gradient for _, gradient in found])
-    sines = np.linalg.norm(np.cross(across, slopes), axis=1) / np.linalg.norm(across, axis=1)
-    return Layer(
-        PosedShape(_mesh(points, tetrahedra), RigidTransform()),
-        (rows - 1, columns - 1),
-        size,
-        _RIM * depth,
-        float(max(abs(distance.item()) for distance, _ in found)),
-        float(np.arcsin(np.max(sines))),
-    )
+    return PosedShape(_mesh(points, tetrahedra), RigidTransform())
 
 
 def _check_whole(grid: FloatArray) -> None:

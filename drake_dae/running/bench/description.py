@@ -215,8 +215,7 @@ def shown_function(bench: Bench, columns: Mapping[str, ca.SX], values: ca.SX) ->
         plant, model = robot.plant, robot.plant.robot("a bench")
         prefix = f"{plant.get_name()}." if isinstance(loop, Diagram) else ""
         state, links = columns[f"{prefix}state"], model.links.q.numel() + model.links.v.numel()
-        bristles = state[state.numel() - model.friction.state.numel() :]
-        state = ca.vertcat(state[:links], bristles)
+        state = state[:links]
         size = model.dae.parameter_symbol.numel()
         parameters = parameters_of(plant, size, f"{prefix}exogenous")
         parts.append(robot.function(state, columns[f"{prefix}constraint_force"], parameters))

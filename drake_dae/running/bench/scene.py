@@ -169,8 +169,8 @@ def _function(
 ) -> ca.Function:
     links, dae = model.links, model.dae
     force = ca.SX.sym("force", dae.num_constraints)
-    bristles, parameters = model.friction.state, dae.parameter_symbol
-    inputs = [links.q, links.v, bristles, force, parameters]
+    parameters = dae.parameter_symbol
+    inputs = [links.q, links.v, force, parameters]
     wrench_columns = wrenches.function.function.call(inputs)[:3]
     surface_poses = list[ca.SX]()
     for constraint in surfaces:
@@ -187,7 +187,7 @@ def _function(
     value = [
         ca.vertcat(ca.SX(0, 1), *(ca.vec(ca.densify(part)) for part in parts)) for parts in columns
     ]
-    arguments = [ca.vertcat(links.q, links.v, bristles), force, parameters]
+    arguments = [ca.vertcat(links.q, links.v), force, parameters]
     return ca.Function("scene", arguments, ca.cse(value))
 
 

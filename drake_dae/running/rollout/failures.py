@@ -81,8 +81,6 @@ def _reason(
         function.evaluate(*arguments)
         if function.is_valid:
             continue
-        if call.block.failure is not None:
-            return call.block.failure(time, arguments)
         if TIME in call.computation.sources:
             return NonFiniteError(
                 f"the reference is not finite at t = {time:g} s", time, function.outputs[0].copy()
@@ -93,7 +91,7 @@ def _reason(
         if not isinstance(call.block.system, ParameterizedSystem) or PARAMETERS not in given:
             return error
         inputs = [given["control"]] if "control" in given else []
-        return call.block.system.explained(error, given[PARAMETERS], *inputs, held=given.get(HELD))
+        return call.block.system.explained(error, given[PARAMETERS], *inputs)
     return None
 
 

@@ -143,8 +143,7 @@ def predicted(best: AdvisedGains) -> str:
         "These gains are the best for one direction alone: "
         f"{1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N rms "
         f"if an unknown force of {MODEL_ERROR:g} N appears every {EVERY:g} s, {by_noise} of it by "
-        f"noise, and a change of the controls of {best.roughness:.2g} N m from sample to sample. "
-        "What noise does in the whole loop is predicted by `drake-dae analyze`"
+        f"noise, and a change of the controls of {best.roughness:.2g} N m from sample to sample"
     )
 
 

@@ -130,9 +130,7 @@ def _longest(
         along = jacobian - touch.normal @ (touch.normal.T @ jacobian)
         mobilities.append(along @ factors.solve(along.T))
         friction = material.friction
-        if touch.bent is not None:
-            friction = 0.0  # Bristles have a law of their own.
-        elif friction is None and constraint.friction_parameter:
+        if friction is None and constraint.friction_parameter:
             friction = float(parameters[dae.parameter_slice(constraint.friction_parameter)][0])
         names.append(constraint.name)
         coefficients.append(friction or 0.0)

@@ -111,7 +111,6 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
         encoders=None,
         observer=None,
         identified=[],
-        tolerances=None,
     )
     loop = build_loop(ideal, model, structure)
     context = start_scenario(ideal, loop)

@@ -53,8 +53,7 @@ class Controller(System):
     3. Laws. `law` is the tracking law that acts in contact, of a system of the plant's sizes, and
        `all_parameters` are the parameters of its function. `set_gains` changes its gains in a
        context; a controller with fixed gains refuses.
-    4. Plants and parts. `check_plant` refuses a plant that does not fit. `refused` are the settings
-       of a loop that it does not support, each with a sentence.
+    4. Plants. `check_plant` refuses a plant that does not fit.
     5. Computed afterwards. With `follows` its control is `law.function` of the logged state,
        reference, forces, integrals and parameters. Otherwise it is logged. `derived` are further
        signals of a record, computed from the others. `compared` are outputs and their references
@@ -72,7 +71,6 @@ class Controller(System):
 
     law: TrackingLaw
     shown: tuple[str, ...] = ()
-    refused: Mapping[str, str] = {}
     phase_names: tuple[str, ...] = ()
     follows: bool = False
     takes_over: bool = False

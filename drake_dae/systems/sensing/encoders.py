@@ -121,12 +121,10 @@ class StateSensor(LeafSystem):
     """The state x = (q, v, ...) of a robot, measured by `Encoders`, for a law.
 
     The measurement of t_k = k period is held until the next sample; entries of x after q and v are
-    not changed, except for the bristles of friction, which no sensor shows: the output has copies
-    of them, driven by the measured velocities. At t_k itself the output is a function of the state
-    at that instant, so that a law sampled at t_k uses the measurement of t_k. Its updates are
-    unrestricted, so that it sees that instant even if a discrete MultibodyPlant steps then. Drake's
-    DiscreteDerivative is not suitable: its difference is one sample old, and it is updated after
-    such a plant.
+    not changed. At t_k itself the output is a function of the state at that instant, so that a law
+    sampled at t_k uses the measurement of t_k. Its updates are unrestricted, so that it sees that
+    instant even if a discrete MultibodyPlant steps then. Drake's DiscreteDerivative is not
+    suitable: its difference is one sample old, and it is updated after such a plant.
 
     Input ports:
         state: x, shape (n,).
@@ -141,8 +139,6 @@ class StateSensor(LeafSystem):
         num_positions: k, the number of positions and of velocities at the start of x.
         encoders: The encoders.
         period: The time between samples in s.
-        bristles: The bristles after a period, shape (c,), of q, v and the bristles before, which
-            are the last entries of x; None for c = 0.
 
     Attributes:
         encoders, period: The arguments.
@@ -161,7 +157,6 @@ class StateSensor(LeafSystem):
         num_positions: int,
         encoders: Encoders,
         period: float,
-        bristles: ca.Function | None = None,
     ) -> None:
         super().__init__()
         self.set_name("state_sensor")
@@ -174,22 +169,19 @@ class StateSensor(LeafSystem):
             for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
         )
         self._count, self._rounds = num_positions, bool(self._resolution.any())
-        self._bristles, self._bent = bristles, 0 if bristles is None else bristles.numel_out()
         self._port = self.DeclareVectorInputPort("state", size)
         self._noise = None
         if encoders.has_noise:
             self._noise = self.DeclareVectorInputPort("noise", 2 * num_positions)
-        # The index of the held sample, its measurement, and the bristles.
-        held = np.full(1 + 2 * num_positions + self._bent, np.nan)
+        # The index of the held sample, and its measurement.
+        held = np.full(1 + 2 * num_positions, np.nan)
         self._held = self.DeclareDiscreteState(held)
         self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, weakly(self._sample))
         self.DeclareVectorOutputPort("estimated_state", size, weakly(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         state = np.array(self._port.Eval(context))
-        measured = self._measured(context, state)[1:]
-        state[: 2 * self._count] = measured[: 2 * self._count]
-        state[state.size - self._bent :] = measured[2 * self._count :]
+        state[: 2 * self._count] = self._measured(context, state)[1:]
         output.SetFromVector(state)
 
     def _sample(self, context: Context, state: State) -> EventStatus:
@@ -198,7 +190,7 @@ class StateSensor(LeafSystem):
         return EventStatus.Succeeded()
 
     def _measured(self, context: Context, state: FloatArray) -> FloatArray:
-        """The index of the current sample, its measurement, and the bristles."""
+        """The index of the current sample, and its measurement."""
         held = context.get_discrete_state(self._held).CopyToVector()
         sample = np.floor(context.get_time() / self.period + _SAME)
         if held[0] == sample:
@@ -217,14 +209,11 @@ class StateSensor(LeafSystem):
             a = np.exp(-self.encoders.velocity_bandwidth * self.period)
             before = held[1 + count : 1 + 2 * count]
             v = a * before + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
-        bent = state[state.size - self._bent :]
-        if self._bristles is not None and np.isfinite(held[0]):
-            bent = self._bristles(q, v, held[1 + 2 * count :]).full().ravel()
-        return np.concatenate([[sample], q, v, bent])
+        return np.concatenate([[sample], q, v])
 
     def traced(self) -> Block:
         count, size = self._count, self._port.size()
-        time, held = ca.SX.sym("time"), ca.SX.sym("held", 1 + 2 * count + self._bent)
+        time, held = ca.SX.sym("time"), ca.SX.sym("held", 1 + 2 * count)
         state, noise = ca.SX.sym("state", size), ca.SX.sym("noise", 2 * count)
         sample = ca.floor(time / self.period + _SAME)
         q, v = state[:count] + self._bias, state[count : 2 * count]
@@ -244,13 +233,9 @@ class StateSensor(LeafSystem):
             before = held[1 + count : 1 + 2 * count]
             filtered = a * before + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
             v = ca.if_else(has_sample, filtered, v)
-        bent = state[size - self._bent :]
-        if self._bristles is not None:
-            bent = ca.if_else(has_sample, self._bristles(q, v, held[1 + 2 * count :]), bent)
-        fresh = ca.vertcat(sample, q, v, bent)
+        fresh = ca.vertcat(sample, q, v)
         current = ca.if_else(ca.eq(held[0], sample), held, fresh)
-        others = state[2 * count : size - self._bent]
-        shown = ca.vertcat(current[1 : 1 + 2 * count], others, current[1 + 2 * count :])
+        shown = ca.vertcat(current[1:], state[2 * count :])
         first = ca.substitute(fresh, held, ca.SX.nan(held.numel(), 1))
         first_sources = [source for source in sources if source != HELD]
         first_inputs = [symbol for symbol in inputs if symbol is not held]

@@ -96,7 +96,7 @@ def test_many_polynomials_are_looked_up(compiled):
     ("points", "corner", "message"),
     [
         ([[0.0, 0.0]], 0.1, r"\(1, 2\)"),
-        ([[0.0], [1.0], [1.0]], 0.1, r"1 and 2"),
+        ([[0.0], [1.0], [1.0]], 0.1, "1 and 2"),
         ([[0.0], [1.0]], 0.0, r"corner.*0"),
         ([[0.0], [1.0]], 1e-6, r"corner.*1e-06"),
         ([[0.0], [1.0, 2.0]], 0.1, "points"),

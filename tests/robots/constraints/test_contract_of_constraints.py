@@ -33,7 +33,6 @@ from drake_dae import (
     MultibodyExpressions,
     Plane,
     PointOnSurface,
-    Presliding,
     PrismaticLoopJoint,
     RevoluteLoopJoint,
     RollingBall,
@@ -43,7 +42,6 @@ from drake_dae import (
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints import Constraint, WeldedFrames
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.constraints.presliding import FrictionState
 from drake_dae.trace.functions import TracedFunction
 
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}
@@ -87,12 +85,6 @@ def rough_at(place, _):
     surface = Plane(tuple(place @ POINT), (1.0, 2.0, -2.0))
     friction = {"friction": 0.4, "stiction_tolerance": 0.05, "viscous_friction": 20.0}
     return PointOnSurface("tip", surface, POINT, "rough", (0.0, 0.0, 0.0), **friction)
-
-
-def bristled_at(place, _):
-    surface = Plane(tuple(place @ POINT), (1.0, 2.0, -2.0))
-    friction = {"friction": 0.4, "presliding": Presliding(0.01, 1.2, 0.5)}
-    return PointOnSurface("tip", surface, POINT, "bristled", (0.0, 0.0, 0.0), **friction)
 
 
 def saddle_at(place, _):
@@ -232,7 +224,6 @@ MEMBERS = {
     "rod": (rod_at, {"tip", "base"}),
     "frictional": (frictional_at, {"tip", "world"}),
     "rough": (rough_at, {"tip", "world"}),
-    "bristled": (bristled_at, {"tip", "world"}),
     "blade": (blade_at, {"tip", "world"}),
     "wheel": (wheel_at, {"tip", "world"}),
     "second wheel": (second_wheel_at, {"tip", "world"}),
@@ -271,9 +262,8 @@ def case(name, seed):
     plain = constraint.residual(links)
     speed = links.velocity_map @ links.v
     wrenches, signals = ConstraintSet([constraint]).wrenches(kinematics, force)
-    bristles = FrictionState.of([*filter(None, [constraint.friction_state(kinematics)])])
     parts = [*links.parameters, *constraint.parameters]
-    symbols = ca.vertcat(*[p.symbol for p in parts], bristles.state)
+    symbols = ca.vertcat(*[p.symbol for p in parts])
     function = TracedFunction(
         name,
         {"q": links.q, "v": links.v, "force": force, "parameters": symbols},
@@ -289,7 +279,6 @@ def case(name, seed):
     )
     frames = [signal.name.split(".")[1] for signal in signals[::6]]
     values = np.concatenate([p.value for p in (*links.parameters, *constraint.parameters)])
-    values = np.append(values, np.zeros(len(bristles.signals)))
     load = random.uniform(1.0, 50.0, force.numel())
 
     def evaluate(v=v, load=load):
@@ -312,9 +301,6 @@ def test_rows_are_as_many_as_names(given):
     assert found["residual"].size <= count
     names = [s.name for s in (*constraint.force_signals, *constraint.residual_signals)]
     names += [p.name for p in constraint.parameters]
-    if (bristles := constraint.friction_state(robot().kinematics())) is not None:
-        names += [signal.name for signal in bristles.signals]
-        assert bristles.state.shape == bristles.rate.shape == (len(bristles.signals), 1)
     assert len(set(names)) == len(names)
     assert all(name.startswith(f"{constraint.name}.") for name in names)
 
@@ -466,8 +452,6 @@ def test_a_push_drives_the_residual_up():
             continue
         found.add(name)
         G = ConstraintSet([constraint]).force_matrix(links)[:, pushing]
-        if (bristles := constraint.friction_state(links.kinematics())) is not None:
-            G = ca.substitute(G, bristles.state, ca.SX.zeros(*bristles.state.shape))
         J = ca.jacobian(constraint.residual(links)[pushing], links.q) @ links.velocity_map
         symbols = ca.vertcat(*[p.symbol for p in (*links.parameters, *constraint.parameters)])
         values = np.concatenate([p.value for p in (*links.parameters, *constraint.parameters)])
@@ -476,5 +460,5 @@ def test_a_push_drives_the_residual_up():
         )(links.plant.GetPositions(context), v, values)
         up = rows.reshape(-1) @ np.linalg.solve(links.plant.CalcMassMatrix(context), columns)
         assert up > 0.0
-    rough = {"frictional", "rough", "bristled"}
+    rough = {"frictional", "rough"}
     assert found == {"plane", "ball", "saddle", "formula", "rolling", *rough}

@@ -17,7 +17,7 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 from runs import some
 
-from drake_dae import Cylinder, Ellipsoid, HeightMap, ImplicitSurface, Plane, Torus
+from drake_dae import Cylinder, Ellipsoid, ImplicitSurface, MeasuredSurface, Plane, Torus
 from drake_dae import Sphere as Ball
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -33,7 +33,7 @@ SURFACES = {
     "ellipsoid": (Ellipsoid((0, 0, 0), (0.2, 0.2, 0.2)), (0, 0, 0.2), 10.0),
     "torus": (Torus((0, 0, 0), (0, 0, 1), 0.3, 0.1), (0.4, 0, 0), 12.5),
     "implicit": (ImplicitSurface("z - 2.5*x**2"), (0, 0, 0), -5.0),
-    "heights": (HeightMap((0.04, 0.1), HEIGHTS), (0, 0, 0.002), 0.002 * (4.0 / 0.1) ** 2),
+    "heights": (MeasuredSurface((0.04, 0.1), HEIGHTS), (0, 0, 0.002), 0.002 * (4.0 / 0.1) ** 2),
 }
 
 
@@ -76,12 +76,10 @@ def test_a_ball_is_pushed_off_a_mesh_along_the_normal_of_its_surface(name):
     """
     surface, place, curvature = SURFACES[name]
     layer = surface.layer(place, 0.08, DEPTH)
-    assert layer.distance < 5e-6
-    assert np.degrees(layer.angle) < 0.3
     p = ca.SX.sym("p", 3)
     distance = surface.distance(p)
     function = TracedFunction("d", {"p": p}, {"d": distance, "n": ca.gradient(distance, p)})
-    force, depth, random = forces_on_a_ball(layer.solid), 2e-4, np.random.default_rng(1)
+    force, depth, random = forces_on_a_ball(layer), 2e-4, np.random.default_rng(1)
     for size in (0.0, *[3e-3] * 8):
         point = np.array(place) + size * random.uniform(-1.0, 1.0, 3)
         for _ in range(5):
@@ -96,14 +94,24 @@ def test_a_ball_is_pushed_off_a_mesh_along_the_normal_of_its_surface(name):
 
 
 def test_a_mesh_is_as_fine_as_its_surface_is_curved():
+    """Its vertices but for the lowest stand on the surface and at the depth below it, by pairs."""
+
+    def vertices(surface, place, size):
+        text = surface.layer(place, size, DEPTH).form.source().in_memory().mesh_file.contents()
+        lines = text.decode().splitlines()
+        count = next(int(line.split()[1]) for line in lines if line.startswith("POINTS"))
+        begin = next(k for k, line in enumerate(lines) if line.startswith("POINTS")) + 1
+        return np.array([[float(x) for x in line.split()] for line in lines[begin : begin + count]])
+
     plane, dome = (SURFACES[name][0] for name in ("plane", "ellipsoid"))
-    flat, curved = plane.layer((0, 0, 0), 0.1, DEPTH), dome.layer((0, 0, 0.2), 0.1, DEPTH)
-    assert flat.facets == (6, 6)
-    assert (flat.distance, flat.angle) == pytest.approx((0.0, 0.0), abs=1e-9)
-    assert min(curved.facets) > 20
-    assert "off by up to" in str(curved)
-    heights = SURFACES["heights"][0].layer((0, 0, 0), 9.0, DEPTH)
-    assert heights.size == pytest.approx((0.04, 0.1))
+    flat, curved = vertices(plane, (0, 0, 0), 0.1), vertices(dome, (0, 0, 0.2), 0.1)
+    assert len(flat) == 2 * 7 * 7 + 1
+    assert len(curved) > 2 * 20 * 20
+    np.testing.assert_allclose(flat[:-1:2] @ [0.5**0.5, 0, 0.5**0.5], 0.0, atol=1e-9)
+    np.testing.assert_allclose(flat[1:-1:2] @ [0.5**0.5, 0, 0.5**0.5], -DEPTH, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(curved[:-1:2], axis=1), 0.2, atol=1e-9)
+    heights = vertices(SURFACES["heights"][0], (0, 0, 0), 9.0)[:-1:2]
+    assert np.ptp(heights[:, :2], axis=0) == pytest.approx((0.04, 0.1))
 
 
 @pytest.mark.parametrize(

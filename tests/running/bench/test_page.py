@@ -212,5 +212,5 @@ def test_what_cannot_be_exported_is_refused(name, reason, tmp_path, capsys):
 def test_without_a_compiler_it_says_how_to_get_one(tmp_path, monkeypatch):
     monkeypatch.setattr(compiler, "find_spec", lambda name: None)
     built = build_commanded(scenario("two_link_wall"))
-    with pytest.raises(MachineCodeError, match=r"pip install 'drake_dae\[compiler\]'"):
+    with pytest.raises(MachineCodeError, match=r"drake_dae\[compiler\]"):
         write_page(built.loop, built.context, tmp_path / "no.html")

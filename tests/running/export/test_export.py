@@ -89,7 +89,7 @@ def test_the_test_program_finds_what_is_wrong(two_link, tmp_path):
     assert re.search(r"control\[\d\] of sample 0 is .*, and Python has", done.stdout)
     assert "FAILED" in done.stdout
     (tmp_path / "arm.c").write_text(source)
-    with pytest.raises(AssertionError, match="not with -ffast-math"):
+    with pytest.raises(AssertionError, match="-ffast-math"):
         outcome(tmp_path, "arm", "-O1 -ffast-math")
 
 
@@ -221,7 +221,7 @@ def test_names_become_names_of_c(name, file, prefix, tmp_path):
     export_code(loop, context, name, tmp_path)
     assert f"int {prefix}_law(" in (tmp_path / f"{file}.h").read_text()
     for bad in ("", "...", "123"):
-        with pytest.raises(ModelError, match="a name of C has letters"):
+        with pytest.raises(ModelError, match=re.escape(repr(bad))):
             export_code(loop, context, bad, tmp_path)
 
 
@@ -238,7 +238,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert "BSD 3-Clause" in terms
     # Only a law with samples has steps.
     told = printed.splitlines()[-1]
-    assert told.startswith("not among them: the whole controller as one step: the controller acts")
+    assert told.startswith("not among them: the whole controller")
     (tmp_path / "file").touch()
     assert main(["export", "two_link_wall", "--out", "file"]) == 1
     assert "file: File exists" in capsys.readouterr().err
@@ -256,11 +256,3 @@ def test_an_observer_is_among_what_holds_between_samples(tmp_path, capsys):
     assert "int two_link_wall_loop_update_0(" in (tmp_path / "two_link_wall.h").read_text()
     done = outcome(tmp_path, "two_link_wall", "-O0")
     assert done.returncode == 0, done.stdout
-
-
-def test_the_command_reports_what_a_loop_of_ones_own_lacks(tmp_path, capsys):
-    words = ["export", "wall_bounce", "--set", "saturation=true", "--out", str(tmp_path)]
-    assert main(words) == 0
-    told = capsys.readouterr().out.splitlines()[-1]
-    first = "not among them: the limits of the drives, except in the controller; how contacts open"
-    assert told.startswith(first)

@@ -231,7 +231,7 @@ def test_angles_that_are_too_large_for_the_lanes_are_no_less_accurate(monkeypatc
 @pytest.mark.slow
 @pytest.mark.parametrize("first", some([0, 3]))
 def test_samples_go_on_beside_a_run_that_fails(monkeypatch, first):
-    """Compliant contact at 1 kHz, where one run, also the first, exceeds its tolerances.
+    """Compliant contact at 1 kHz, where one run, also the first, leaves all numbers.
 
     Round-off of sums of other order, 1e-15 of what is summed, in 300 steps.
     """
@@ -240,7 +240,6 @@ def test_samples_go_on_beside_a_run_that_fails(monkeypatch, first):
         "sampling={period: 1.0e-3, delay: 1.0e-3}",
         "constraint_damping=!Poles {all: [-50.0]}",
         "gains.all=[-25.0]",
-        "tolerances={outputs: {wall.force: 50}, after: 0.1}",
     )
     chosen = scenario("two_link_wall", *settings)
     loop, context = build_scenario(chosen)
@@ -248,7 +247,7 @@ def test_samples_go_on_beside_a_run_that_fails(monkeypatch, first):
     rows = []
     for index, mass in enumerate(np.linspace(6.0, 6.2, COUNT)):
         loop.plant.set_parameter(own, "link2.mass", mass)
-        loop.plant.set_parameter(own, "wall.position", [1.2 - 0.01 * (index == first), 0.0, 0.0])
+        loop.plant.set_parameter(own, "wall.position", [1.2 - 1e50 * (index == first), 0.0, 0.0])
         start, parameters = start_values(loop, context)
         rows.append(parameters)
     times = 1e-3 * np.arange(301)
@@ -317,7 +316,7 @@ def test_diagrams_that_differ_in_constants_share_their_code(monkeypatch):
 
 def test_what_lanes_do_not_know_is_refused():
     function = ca.Function("odd", [X], [ca.erf(X)])
-    with pytest.raises(ModelError, match="odd has an operation that lanes"):
+    with pytest.raises(ModelError, match="odd"):
         emitted(function, "odd", [])
 
 

@@ -375,25 +375,26 @@ def test_what_cannot_be_rolled_out_is_refused():
     chosen = scenario("two_link_wall", *fixed())
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
-    with pytest.raises(InconsistentStateError, match="not on the constraint"):
+    with pytest.raises(InconsistentStateError) as caught:
         rollout(loop, start + 0.1, parameters, [0.0, 0.1])
+    assert np.abs(caught.value.residual).max() > 0.01
     for arguments, told in (
-        ((start[:-1], parameters, [0.0, 0.1]), r"starts must have shape \(4,\)"),
-        ((start, parameters[:-1], [0.0, 0.1]), "parameters must have shape"),
-        ((start, parameters, [0.0]), "times must be two or more"),
-        ((start, parameters, [0.0, 0.0]), "strictly increasing"),
-        (([start] * 3, [parameters] * 2, [0.0, 0.1]), "2 rows of parameters for 3 starts"),
+        ((start[:-1], parameters, [0.0, 0.1]), r"starts.*\(4,\)"),
+        ((start, parameters[:-1], [0.0, 0.1]), "parameters"),
+        ((start, parameters, [0.0]), "times"),
+        ((start, parameters, [0.0, 0.0]), "times"),
+        (([start] * 3, [parameters] * 2, [0.0, 0.1]), r"2 .*3 "),
     ):
         with pytest.raises(ModelError, match=told):
             rollout(loop, *arguments)
     implicit = SimulatorConfig()
     implicit.integration_scheme, implicit.use_error_control = "implicit_euler", False
-    with pytest.raises(ModelError, match="no fixed steps of implicit_euler; choose explicit_euler"):
+    with pytest.raises(ModelError, match="implicit_euler"):
         rollout(loop, start, parameters, [0.0, 0.1], config=implicit)
     path = TrajectoryReference(PiecewisePolynomial.CubicHermite([0, 1], [[0.3, 0.3]], [[0, 0]]))
     plant = RobotPlant(loop.plant.model, structure=loop.controller.law.structure)
     other = make_closed_loop(plant, loop.controller.law, [path, ConstantReference(10.0)])
-    with pytest.raises(ModelError, match="a TrajectoryReference is no expression of time"):
+    with pytest.raises(ModelError, match="TrajectoryReference"):
         rollout(other, start, parameters, [0.0, 0.1])
 
 

@@ -169,7 +169,7 @@ CASES = {
     "a measured surface": Case(
         "seven_joint_wall",
         (
-            "constraints.0.surface=!HeightMap {size: [0.8, 0.8], heights: [[0, 0, 0, 0], "
+            "constraints.0.surface=!MeasuredSurface {size: [0.8, 0.8], heights: [[0, 0, 0, 0], "
             "[0, 0.01, 0.02, 0], [0, 0.02, 0.01, 0], [0, 0, 0, 0]], point: [0.7, 0, 0.6], "
             "normal: [-1, 0, 0]}",
         ),

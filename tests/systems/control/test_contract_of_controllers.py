@@ -9,16 +9,15 @@ from polishing import PERIOD, laws, soft_wall, task_loop
 from drake_dae import (
     Approach,
     ConstantReference,
-    Encoders,
     ForceSensor,
     LoopSettings,
+    Observing,
     Press,
     ReferenceGenerator,
     RobotPlant,
     Sampling,
     Task,
     TaskController,
-    Tolerances,
     TrackingController,
     TrackingLaw,
     poles,
@@ -115,27 +114,16 @@ def test_rule_3_laws(controller):
         assert not np.array_equal(controller.all_parameters(context), values)
 
 
-def test_rule_4_plants_and_parts(controller):
+def test_rule_4_plants(controller):
     with pytest.raises(WiringError, match=r"14.*7"):
         controller.check_plant(
             RobotPlant(arm("seven_joint").model, structure=arm("seven_joint").structure)
         )
-    parts = {
-        "exogenous": [ConstantReference(0.0)],
-        "plant_exogenous": [ConstantReference(0.0)],
-        "control_limits": [1.0, 1.0],
-        "encoders": Encoders(1e-5),
-        "tolerances": Tolerances({"tool.z": 0.1}),
-    }
-    for name in controller.refused:
-        if name in parts:
-            with pytest.raises(WiringError, match=rf"^{name}"):
-                wired(controller, **{name: parts[name]})
 
 
 def test_what_takes_references_is_refused_where_there_are_none():
-    with pytest.raises(WiringError, match="tolerances"):
-        wired(MEMBERS["resting"](), tolerances=Tolerances({"tool.z": 0.1}))
+    with pytest.raises(WiringError, match="observer"):
+        wired(MEMBERS["resting"](), observer=Observing(10.0))
 
 
 def test_references_are_where_the_controller_takes_them(controller):

@@ -28,7 +28,6 @@ from drake_dae import (
     TrajectoryReference,
     WaypointsReference,
 )
-from drake_dae.dae.references.paced import PacedReference
 from drake_dae.errors import ReferenceSignalError
 
 PATH = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
@@ -75,11 +74,6 @@ MEMBERS = {
     "system": SystemReference(Swing(), [2, 2]),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
     "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),
-    "paced": PacedReference(PolylineReference(EDGES, LIMITS, 0.2), 0.7),
-    "paced file": PacedReference(
-        CsvReference(str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3, tolerance=0.2),
-        1.1,
-    ),
 }
 
 TIMES = (0.41, 0.93, 1.62)
@@ -90,7 +84,6 @@ ROUGH = {
     "line": LineReference(0.0, 1.0, LIMITS, order=2),
     "polyline": PolylineReference([[0.0], [1.0]], LIMITS, 0.1, order=2),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t, ca.fabs(t - 1.0)]), (1,)),
-    "paced": PacedReference(LineReference(0.0, 1.0, LIMITS, order=2), 0.7),
     "point to point": PointToPointReference(0.0, 1.0, 0.0, 1.0, order=1),
     "expression": ExpressionReference(lambda t: ca.fabs(t - 1.0)),
     "trajectory": TrajectoryReference(PiecewisePolynomial.FirstOrderHold([0, 1, 2], [[0, 1, 0]])),

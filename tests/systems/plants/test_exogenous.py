@@ -239,7 +239,7 @@ def test_the_linear_model_knows_what_moves():
 
 
 def test_what_moves_must_be_a_parameter():
-    with pytest.raises(ModelError, match="no parameter 'lenght'; did you mean 'length'"):
+    with pytest.raises(ModelError, match=r"'lenght'.*'length'"):
         rod(exogenous=["lenght"])
 
 
@@ -255,5 +255,5 @@ def test_chains_that_need_too_many_derivatives_are_refused():
         m=ca.SX(0, 1),
         parameters=[w],
     )
-    with pytest.raises(ModelError, match="more than 10 derivatives of 'w' are needed"):
+    with pytest.raises(ModelError, match=r"10.*'w'"):
         find_constraint_structure(system)

@@ -337,7 +337,7 @@ def test_sensor_has_no_direct_feedthrough_from_force():
     ("make", "error", "message"),
     [
         (lambda: ForceSensor(1), ModelError, "close"),
-        (lambda: ForceSensor(1, -0.1), ModelError, r"-0.1"),
+        (lambda: ForceSensor(1, -0.1), ModelError, "-0.1"),
         (
             lambda: TrackingLaw(
                 arm("two_link").model.dae, poles(-4.0), measured_force=True, force_gain=-0.5

@@ -99,7 +99,7 @@ def test_a_release_that_has_left_does_not_wait_for_the_force():
 @pytest.mark.parametrize("name", MEMBERS)
 def test_phase_takes_time(name):
     phase = MEMBERS[name][0]
-    with pytest.raises(ModelError, match=rf"{phase.name}: over must be positive, got 0\.0"):
+    with pytest.raises(ModelError, match=rf"{phase.name}: over.*0\.0"):
         replace(phase, over=0.0)
 
 

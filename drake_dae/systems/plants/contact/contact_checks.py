@@ -3,18 +3,18 @@
 from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
-from pydrake.geometry import Box, HalfSpace, Sphere
+from pydrake.geometry import HalfSpace, Sphere
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray, numbers, show, unknown_name
+from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.picture import PosedShape
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 
 
 def check_model(model: RobotModel, material: ContactMaterial) -> None:
@@ -38,57 +38,22 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
         )
     if not model.constraints:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
-    check_without_bristles(model)
     for constraint in model.constraints:
         values = own_values(constraint, model.dae, model.dae.parameter_values)
         solids = constraint.solids(values)
-        if material.contact_model == "hydroelastic":
-            # A ball meets the edges of a box, and a mesh is smooth.
-            if any(isinstance(solid.form, Box) for solid in solids):
-                raise ModelError(
-                    f"hydroelastic contact has no edges, as '{constraint.name}' has; use point "
-                    "contact (contact_model: point)"
-                )
-        elif not solids:
+        if material.contact_model != "hydroelastic" and not solids:
             raise ModelError(
                 f"'{constraint.name}' has no solid for Drake's point contact, as a "
-                "PointOnSurface has on a Plane or Plate, or on the outside of a Sphere or a "
+                "PointOnSurface has on a Plane, or on the outside of a Sphere or a "
                 "Cylinder. Use hydroelastic contact (contact_model: hydroelastic), which meshes "
                 "any smooth surface, or `plant: !CompliantContact`"
             )
-    check_pegs(model, material)
-
-
-def check_pegs(model: RobotModel, material: PointMaterial) -> None:
-    """Refuses a peg whose constraint the robot does not have.
-
-    Raises:
-        ModelError: It has none; the message has the name.
-    """
-    names = [constraint.name for constraint in model.constraints]
-    for peg in material.pegs:
-        if peg.constraint not in names:
-            raise ModelError(f"pegs: {unknown_name('constraint', peg.constraint, names)}")
-
-
-def check_without_bristles(model: RobotModel) -> None:
-    """Refuses friction with bristles, whose states a plant in discrete steps does not have.
-
-    Raises:
-        ModelError: A contact or a joint has presliding.
-    """
-    if model.friction.signals:
-        raise ModelError(
-            f"'{model.friction.owner}' has presliding, and a contact plant with a time_step has no "
-            "bristles: its steps are too long for them. Use `plant: !CompliantContact {time_step: "
-            "0}` or `plant: !IdealConstraints`"
-        )
 
 
 def solids_of(
     constraint: Constraint, values: FloatArray, point: FloatArray, material: ContactMaterial
-) -> tuple[tuple[PosedShape, ...], str]:
-    """The solids of a constraint in the world, and a remark on their deviation from its surface.
+) -> tuple[PosedShape, ...]:
+    """The solids of a constraint in the world.
 
     Args:
         constraint: The contact.
@@ -102,7 +67,7 @@ def solids_of(
     solids = constraint.solids(values)
     exact = solids and all(isinstance(solid.form, HalfSpace | Sphere) for solid in solids)
     if material.contact_model == "point" or exact:
-        return solids, ""
+        return solids
     # Drake's own mesh of a long cylinder is too coarse: 2 N of ripple in a force of 20 N.
     try:
         layer = constraint.layer(values, point, material.piece, material.thickness)
@@ -110,7 +75,7 @@ def solids_of(
         raise ModelError(f"{constraint.name}: {error}") from None
     if layer is None:
         raise ModelError(f"'{constraint.name}' is no contact with a surface: use an ideal plant")
-    return (layer.solid,), f"{constraint.name} around {show(point)} m is {layer}"
+    return (layer,)
 
 
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:

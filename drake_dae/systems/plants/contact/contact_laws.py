@@ -1,11 +1,10 @@
 """Drake's laws of point contact, continuous and discrete, as expressions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 
-from drake_dae.robots.constraints.presliding import FrictionState
 from drake_dae.systems.plants.contact.point_contact import PointContact
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
 from drake_dae.trace.smoothness import as_constant
@@ -46,7 +45,7 @@ def contact_force(contact: PointContact, v: ca.SX, compliance: Compliance) -> ca
         f_n = k x max(0, 1 + d x'),    f_t = -mu f_n step5(|v_t| / v_s) v_t / |v_t| - c v_t,
 
     with the depth x > 0 and step5(s) = s^3 (10 - 15 s + 6 s^2) up to s = 1, and 1 beyond. Viscous
-    friction c is not Drake's. With bristles their traction takes the place of step5 v_t / |v_t|.
+    friction c is not Drake's.
 
     Args:
         contact: The contact.
@@ -63,19 +62,8 @@ def contact_force(contact: PointContact, v: ca.SX, compliance: Compliance) -> ca
     slow = s**2 * (10 - 15 * s + 6 * s**2) / tolerance
     slope = ca.if_else(s < 1, slow, 1 / ca.fmax(speed, tolerance))
     traction = slope * sliding
-    if contact.bent is not None:
-        traction, _ = contact.bent(sliding, contact.normal)
     along = -contact.friction * push * traction - contact.viscous_friction * sliding
     return ca.if_else(contact.depth > 0, contact.normal * push + along, ca.SX(3, 1))
-
-
-def bristle_rates(contact: PointContact, v: ca.SX) -> FrictionState | None:
-    """The bristles of a contact, with their present rates; None without."""
-    if contact.bent is None:
-        return None
-    _, state = contact.bent(contact.along(_relative(contact, v)), contact.normal)
-    closed = ca.if_else(contact.depth > 0, state.rate, state.open_rate)
-    return replace(state, rate=closed)
 
 
 def _relative(contact: PointContact, v: ca.SX) -> ca.SX:

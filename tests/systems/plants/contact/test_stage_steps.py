@@ -179,13 +179,13 @@ def test_ports_show_the_stages():
 
 def test_step_that_is_too_long_is_refused_with_one_that_would_do():
     """w h = 2 is 20 ms for 100 rad/s. Of a motor that turns nothing heavy it is R h / L = 2."""
-    with pytest.raises(ModelError, match=r"0\.025 s is too long.* 100 rad/s.*Take 0\.02 s or"):
+    with pytest.raises(ModelError, match=r"0\.025.*100.*0\.02"):
         contact_plant(0.025, SPRINGS)
-    with pytest.raises(ModelError, match=r"0\.01 s is too long.* 300 rad/s.*Take 0\.0066 s or"):
+    with pytest.raises(ModelError, match=r"0\.01.*300.*0\.0066"):
         contact_plant(0.01, DcMotors(1e-4, 0.01, 3.0))  # R / L, which takes h <= 2 L / R.
 
 
 def test_what_nothing_damps_is_refused():
     """Valves without leakage are springs whose force is new with the velocity before."""
-    with pytest.raises(ModelError, match="1e-05 s"):
+    with pytest.raises(ModelError, match="1e-05"):
         contact_plant(1e-3, ElectrohydraulicServos(2e6, 0.0))

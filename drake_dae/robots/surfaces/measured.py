@@ -1,0 +1,338 @@
+"""A measured surface: heights over a plane, from a table or from a mesh, as a smooth function."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from math import ceil
+from pathlib import Path
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, brief, numbers, positive, show, vector
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.files import check_file
+from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
+from drake_dae.robots.surfaces.surface import Pair, Surface, Vector, tangents, triple, unit_vector
+
+MESHES = (".obj", ".stl", ".ply", ".off", ".dae", ".gltf", ".glb")
+"""Kinds of meshes that are read: none of them is packed."""
+
+CELLS, BEYOND = 16, 3
+"""The default number of bells along the longer side; bells beyond each edge, for a fit there."""
+
+LEAST, CALM = np.logspace(-8, -2, 7), 1.5
+"""Relative singular values below which the data do not determine a component. The smallest is taken
+with which the surface stays near the plane beyond its edges: by CALM times the range of heights."""
+
+MOST_HEIGHTS, MOST_LENGTH = 10_000_000, 1e9
+"""The largest number of heights, and their largest size in m."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class MeasuredSurface(Surface):
+    """Heights over a plane, phi = (z - h(x, y)) / sqrt(1 + h_x^2 + h_y^2) to first order, smoothed:
+
+        h(x, y) = c_0 + c_1 x + c_2 y + sum_r a_r(x) b_r(y),
+
+    a plane and sums a_r, b_r of bell curves, by least squares, with derivatives of all orders. z is
+    along the normal, x and y along `tangents(normal)`: for the normal z they are x and y, for a
+    wall sideways and upward. Beyond its edges the surface approaches the plane. Of a mesh it is
+    the side that is seen along the normal, which must be without holes and overhangs.
+
+    Attributes:
+        size: The lengths of the rectangle, m, shape (2,); None for all of a mesh.
+        heights: Heights above the plane through `point`, shape (r, c): a row is along the first
+            coordinate, and the rows follow each other along the second.
+        file: A file instead: a table (.csv, .npy, .npz with one array), or a mesh for trimesh.
+        point: The middle of a table, or the origin of a mesh, whose axes are the world's, m.
+        normal: The direction of the heights and of the free side, of any length, shape (3,).
+        scale: The length of a unit of the heights, or of the mesh, m.
+        resolution: The distance of the bells, m; finer details are smoothed. If None, a sixteenth
+            of the longer side, but no less than the heights of a table are apart.
+
+    Raises:
+        ModelError: There are no data, or they cannot be read; a mesh has a hole or an overhang.
+    """
+
+    size: Pair | None = None
+    heights: ArrayLike | None = None
+    file: str | Path | None = None
+    point: Vector = (0.0, 0.0, 0.0)
+    normal: Vector = (0.0, 0.0, 1.0)
+    scale: float = 1.0
+    resolution: float | None = None
+
+    coordinate_signals: ClassVar = (Signal("along", "m"), Signal("across", "m"))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "point", triple("point", self.point))
+        object.__setattr__(self, "normal", unit_vector("normal", self.normal))
+        if self.size is not None:
+            size = vector("size", self.size, 2)
+            object.__setattr__(self, "size", (float(size[0]), float(size[1])))
+        for name, number in (("scale", self.scale), ("resolution", self.resolution)):
+            positive(name, 1.0 if number is None else number)
+        for length in self.size or ():
+            positive("size", length)
+        if (self.heights is None) == (self.file is None):
+            raise ModelError("give either heights, row by row, or a file with them")
+        if self.heights is not None:
+            rows = tuple(map(tuple, _table("heights", self.heights).tolist()))
+            object.__setattr__(self, "heights", rows)
+        _ = self.fit  # Data that cannot be read are told here.
+
+    @property
+    def fit(self) -> "_Fit":
+        """The smooth heights."""
+        return _fit(self, None if self.file is None else check_file(self.file, ModelError))
+
+    @property
+    def position(self) -> Vector:
+        return self.point
+
+    def distance(self, offset: ca.SX) -> ca.SX:
+        x, y = ca.vertsplit(self.coordinates(offset))
+        height, slope_x, slope_y = self.fit.height(x, y)
+        z = ca.dot(ca.DM(self.normal), offset)
+        return (z - height) / ca.sqrt(1 + slope_x**2 + slope_y**2)
+
+    def coordinates(self, offset: ca.SX) -> ca.SX:
+        return ca.vertcat(*[ca.dot(ca.DM(t), offset) for t in tangents(self.normal)])
+
+    @property
+    def extent(self) -> FloatArray:
+        return self.fit.extent
+
+    @property
+    def remark(self) -> str:
+        source = f" '{Path(self.file).name}'" if self.file else ""
+        largest, width = 1e3 * self.fit.largest, 1e3 * max(self.fit.widths)
+        off = f"MeasuredSurface{source} is off its data by at most {largest:.2g} mm"
+        return f"{off}; details finer than {width:.2g} mm are smoothed away"
+
+    def picture(self, center: ArrayLike, size: float) -> PosedShape:
+        even = np.linspace(-0.5, 0.5, 3 * CELLS + 1)
+        grid = self._piece(np.zeros(3), size, (even, even))
+        return PosedShape(mesh_of_grid(grid.swapaxes(0, 1)), RigidTransform())
+
+    def _lengths(self, size: float) -> Pair:
+        length, width = np.ptp(self.extent, axis=0)
+        return float(length), float(width)
+
+    def _piece(
+        self, center: FloatArray, size: float, places: tuple[FloatArray, FloatArray]
+    ) -> FloatArray:
+        x, y = (
+            side.mean() + np.ptp(side) * part
+            for side, part in zip(self.extent.T, places, strict=True)
+        )
+        along, across = tangents(self.normal)
+        level = x[:, None, None] * along + y[:, None] * across
+        return level + self.fit.heights(x, y).T[..., None] * np.array(self.normal)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The smooth heights h(x, y): a plane, and bells exp(-(x - x_j)^2 / 2 d^2) along x and y.
+
+    Their distance d is their width: so they span polynomials to 1e-8 and are still distinct.
+    """
+
+    extent: FloatArray  # The first and last x and y of the data, shape (2, 2).
+    plane: FloatArray  # c_0, c_1, c_2.
+    places: Sequence[FloatArray]  # x_j, along x and along y.
+    widths: Sequence[float]
+    factors: Sequence[FloatArray]  # Of the bells in a_r, shape (kx, r), and b_r, shape (ky, r).
+    largest: float  # The largest distance of the data from h.
+
+    def height(self, x: ca.SX, y: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """h at a place, dh/dx and dh/dy."""
+        sums: list[ca.SX] = []
+        for i, value in enumerate((x, y)):
+            off = (value - ca.DM(self.places[i])) / self.widths[i]
+            bells = ca.exp(-(off**2) / 2)
+            both = ca.horzcat(bells, -off / self.widths[i] * bells)
+            sums += ca.horzsplit(ca.mtimes(ca.DM(self.factors[i].T), both))
+        a, da, b, db = sums
+        base, slope_x, slope_y = (float(c) for c in self.plane)
+        height = base + slope_x * x + slope_y * y + ca.dot(a, b)
+        return height, slope_x + ca.dot(da, b), slope_y + ca.dot(a, db)
+
+    def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """h on a grid, shape (len(y), len(x))."""
+        a, b = (
+            _bells(values, self.places[i], self.widths[i]) @ self.factors[i]
+            for i, values in enumerate((x, y))
+        )
+        return self.plane[0] + self.plane[1] * x + self.plane[2] * y[:, None] + b @ a.T
+
+
+def _bells(values: FloatArray, places: FloatArray, width: float) -> FloatArray:
+    """All bells at some places, shape (values, bells)."""
+    return np.asarray(np.exp(-(((values[:, None] - places) / width) ** 2) / 2))
+
+
+@lru_cache(maxsize=16)
+def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
+    """The least-squares fit; kept as long as the file, of which the stamp tells, is the same."""
+    if surface.file is not None and Path(surface.file).suffix.lower() in MESHES:
+        x, y, heights, distance = _mesh_heights(surface, Path(surface.file))
+    else:
+        if surface.size is None:
+            raise ModelError("a table of heights needs its size, two lengths in m")
+        rows = surface.heights if surface.file is None else _read_table(Path(surface.file))
+        heights = surface.scale * np.array(rows)
+        x, y = (
+            length * np.linspace(-0.5, 0.5, count)
+            for length, count in zip(surface.size, heights.shape[::-1], strict=True)
+        )
+        distance = max(x[1] - x[0], y[1] - y[0], max(surface.size) / CELLS)
+    if not (largest := float(np.max(np.abs(heights)))) <= MOST_LENGTH:
+        raise ModelError(f"heights of up to {largest:.3g} m are no surface; is the scale right?")
+    flat = np.stack([np.ones_like(heights), 0 * heights + x, 0 * heights + y[:, None]], axis=-1)
+    plane = np.linalg.lstsq(flat.reshape(-1, 3), heights.ravel())[0].astype(float)
+    rest = heights - flat @ plane
+    places, widths, at, beyond = [], [], [], []
+    for side in (x, y):
+        length = side[-1] - side[0]
+        count = max(ceil(length / (surface.resolution or distance) - 1e-9), 1)
+        width = float(length / count)
+        place = side[0] + width * np.arange(-BEYOND, count + BEYOND + 1)
+        around = np.linspace(place[0] - 3 * width, place[-1] + 3 * width, 3 * place.size)
+        places.append(place)
+        widths.append(width)
+        at.append(_bells(side, place, width))
+        beyond.append(_bells(around, place, width))
+    for least in LEAST:
+        (basis_x, to_x), (basis_y, to_y) = (_spanned(bells, least) for bells in at)
+        shares = basis_y.T @ rest @ basis_x
+        outside = beyond[1] @ (to_y @ shares @ to_x.T) @ beyond[0].T
+        if np.max(np.abs(outside)) <= CALM * np.ptp(rest):
+            break
+    # In heights and not in factors, which magnify the round-off of the data a million times.
+    left, sizes, right = np.linalg.svd(shares, full_matrices=False)
+    a, b = to_x @ right.T, to_y @ (left * sizes)
+    terms_a, terms_b = at[0] @ a, at[1] @ b
+    # A few terms are often enough: a wave along one axis takes one. The others are smaller than the
+    # residual of the fit, or than round-off.
+    rms = float(np.sqrt(np.mean((rest - terms_b @ terms_a.T) ** 2)))
+    negligible = max(0.1 * rms, 1e-10 * float(np.ptp(rest)))
+    added = np.max(np.abs(terms_a), axis=0) * np.max(np.abs(terms_b), axis=0)
+    n = int(np.sum(np.cumsum(added[::-1])[::-1] > negligible))
+    largest = float(np.max(np.abs(rest - terms_b[:, :n] @ terms_a[:, :n].T)))
+    extent = np.column_stack([x[[0, -1]], y[[0, -1]]])
+    return _Fit(extent, plane, places, widths, (a[:, :n], b[:, :n]), largest)
+
+
+def _spanned(bells: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
+    """The space of bells: orthonormal values at the data, and the bells' factors for them."""
+    values, sizes, factors = np.linalg.svd(bells, full_matrices=False)
+    kept = sizes > least * sizes[0]
+    return values[:, kept], factors[kept].T / sizes[kept]
+
+
+def _read_table(file: Path) -> FloatArray:
+    """The heights in a file, first row lowest."""
+    try:
+        if file.suffix.lower() == ".csv":
+            text = file.read_text(encoding="utf-8-sig")
+            mark = next((mark for mark in ";\t," if mark in text), None)
+            data: Any = np.loadtxt(text.splitlines(), delimiter=mark, ndmin=2)
+        else:
+            data = np.load(file, mmap_mode="r", allow_pickle=False)
+            if isinstance(data, np.lib.npyio.NpzFile):
+                (name,) = data.files
+                data = data[name]
+    except Exception as error:  # NumPy, whose headers are Python, raises many kinds.
+        text = f"'{file.name}' is no table of heights (.csv, .npy, .npz) and no mesh"
+        raise ModelError(f"{text} ({', '.join(MESHES)}): {brief(str(error))}") from None
+    return _table(f"'{file.name}'", data)
+
+
+def _table(what: str, rows: Any) -> FloatArray:
+    """A table of heights."""
+    heights = numbers(f"{what}: heights", rows)
+    if heights.ndim != 2 or min(heights.shape) < 2 or heights.size > MOST_HEIGHTS:
+        raise ModelError(f"{what}: heights are two rows of two at least, got {heights.shape}")
+    if not np.all(np.isfinite(heights)):
+        row, column = np.argwhere(~np.isfinite(heights))[0] + 1
+        raise ModelError(f"{what}: row {row}, column {column} is no height")
+    return heights
+
+
+def _mesh_heights(
+    surface: MeasuredSurface, file: Path
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """The places x and y of a grid, the heights of a mesh there, and the default resolution."""
+    vertices, triangles = read_mesh(file)
+    axes = np.column_stack([*tangents(surface.normal), np.array(surface.normal)])
+    vertices = surface.scale * vertices @ axes
+    low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
+    lengths = high - low if surface.size is None else np.array(surface.size)
+    if not np.all((lengths > 0.0) & (lengths < MOST_LENGTH)):
+        raise ModelError(f"the mesh is {show(lengths)} m wide, which is no surface of a robot")
+    distance = float(np.max(lengths)) / CELLS
+    counts = (2 * max(ceil(n / (surface.resolution or distance)), 4) + 1 for n in lengths)
+    x, y = (
+        middle + length * np.linspace(-0.5, 0.5, count)
+        for middle, length, count in zip((low + high) / 2, lengths, counts, strict=True)
+    )
+    corners, extent = vertices[triangles], float(np.max(np.ptp(vertices, axis=0)))
+    edges = corners[:, 1:] - corners[:, :1]
+    areas = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+    facing = areas * np.linalg.det(axes) / extent**2  # A reflection turns all triangles.
+    seen = facing > 1e-12 if np.any(facing > 1e-12) else facing < -1e-12
+    least, slack = corners[..., :2].min(axis=1) - 1e-9 * extent, 2e-9 * extent
+    most = corners[..., :2].max(axis=1) + slack
+    lowest = np.full((len(y), len(x)), np.inf)
+    highest = -lowest
+    for k in np.flatnonzero(seen):
+        columns = slice(*np.searchsorted(x, [least[k, 0], most[k, 0]]))
+        rows = slice(*np.searchsorted(y, [least[k, 1], most[k, 1]]))
+        across, up = np.meshgrid(x[columns] - corners[k, 0, 0], y[rows] - corners[k, 0, 1])
+        one, other = edges[k]
+        s, t = (across * other[1] - up * other[0]), (one[0] * up - one[1] * across)
+        s, t = s / areas[k], t / areas[k]
+        inside = (s > -1e-9) & (t > -1e-9) & (s + t < 1 + 1e-9)
+        height = corners[k, 0, 2] + s * one[2] + t * other[2]
+        lowest[rows, columns][inside] = np.minimum(lowest[rows, columns], height)[inside]
+        highest[rows, columns][inside] = np.maximum(highest[rows, columns], height)[inside]
+    for bad, what in (
+        (~np.isfinite(lowest), "has a hole; give a size that it covers"),
+        (highest - lowest > 1e-6 * extent, "overlaps itself; choose another normal or size"),
+    ):
+        if bad.any():
+            row, column = np.argwhere(bad)[np.count_nonzero(bad) // 2]
+            raise ModelError(f"at {show([x[column], y[row]])} m across the normal the mesh {what}")
+    return x, y, highest, distance
+
+
+def read_mesh(file: Path) -> tuple[FloatArray, NDArray[np.int64]]:
+    """The vertices of a mesh, shape (n, 3), in its unit, and its triangles, shape (k, 3).
+
+    Raises:
+        ModelError: It cannot be read, or the package trimesh is not installed.
+    """
+    check_file(file, ModelError)
+    if file.suffix.lower() not in MESHES:
+        raise ModelError(f"'{file.name}' is none of the meshes that are read: {', '.join(MESHES)}")
+    try:
+        import trimesh
+    except ImportError:
+        raise ModelError(f"'{file.name}': pip install 'drake_dae[meshes]' to read meshes") from None
+    try:
+        mesh: Any = trimesh.load(file, force="mesh")
+        vertices, triangles = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
+        corners = vertices[triangles]
+        if not (corners.size and corners.shape[1:] == (3, 3) and np.all(np.isfinite(corners))):
+            raise ValueError("it has no triangles, or no numbers")
+    except Exception as error:  # trimesh has no exceptions of its own.
+        raise ModelError(f"no mesh in '{file.name}': {brief(str(error))}") from None
+    return vertices, triangles
