@@ -90,7 +90,7 @@ def test_branches_of_the_manifold_are_no_singularity():
 
 def test_infinite_matrices_are_no_singularity():
     """B = 1/(x0 - 0.02) changes its sign through infinity."""
-    with pytest.raises(ModelError, match="system: "):
+    with pytest.raises(ModelError, match="test: "):
         find_structure(system_of(1, f=lambda x: 0, h=lambda x: 1 / x, l=lambda x: x))
     structure = find_structure(
         system_of(1, f=lambda x: 0, h=lambda x: 1 / (x - 0.02), l=lambda x: x)
