@@ -137,10 +137,10 @@ def test_a_sweep_varies_a_guard(file, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("task.phases.0.on_failure=park", "task: phase 1 of the task, feel: on_failure: no phase"),
+        ("task.phases.0.on_failure=park", r"task: .*feel: on_failure: .*'park'"),
         (
             "task.phases.1.guards.0.of=heat",
-            r"task\.phases\.1\.guards\.0\.of: expected one of",
+            r"task\.phases\.1\.guards\.0\.of: ",
         ),
         ("task.phases.1.guards.0.above=.nan", r"task\.phases\.1\.guards\.0.*above"),
         ("task.phases.0.speed=0", r"task\.phases\.0.*speed"),

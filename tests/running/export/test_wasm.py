@@ -120,11 +120,3 @@ def test_without_zig_it_says_what_to_install(tmp_path, monkeypatch):
     loop, context = build_scenario(scenario("two_link_wall"))
     with pytest.raises(MachineCodeError, match=r"drake_dae\[compiler\]"):
         export_wasm(loop, context, "arm", tmp_path)
-
-
-def test_what_has_no_part_to_export_is_refused(tmp_path, capsys):
-    assert main(["export", "wall_bounce", "--format=wasm", f"--out={tmp_path / 'no'}"]) == 1
-    said = capsys.readouterr().err
-    assert "nothing of it can be exported: the loop changes at moments that a run has to" in said
-    assert "the controller: the controller acts continuously" in said
-    assert not (tmp_path / "no").exists()
