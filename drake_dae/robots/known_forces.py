@@ -92,7 +92,6 @@ class KnownWrench(KnownForce):
         return kinematics.reaction(ca.dot(force, velocity) + ca.dot(moment, turning))
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class ScaledForce(KnownForce):
     """A force s(t) F on a point of a frame, whose course s is an exogenous signal.

@@ -227,6 +227,7 @@ class RobotModel:
         """Names and units of z_1."""
         return self.dae.output_signals[: self.dae.num_outputs - self._num_forces]
 
+    @checked(ModelError)
     def configuration(
         self,
         outputs: ArrayLike | None,
@@ -259,6 +260,7 @@ class RobotModel:
             of_outputs = self.dae.parameter_vector(output_parameters)
         return self.placing.solve(wanted, q, values, of_outputs)
 
+    @checked(ModelError)
     def rest_state(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
@@ -283,6 +285,7 @@ class RobotModel:
         load = vector(f"{self.name}: forces", forces, self._num_forces)
         return self.balance.state(q, load, values)
 
+    @checked(ModelError)
     def rest_forces(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:

@@ -13,7 +13,9 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import listed
+from drake_dae.errors import ModelError
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.problems import without_tags
@@ -134,8 +136,8 @@ class Scenario:
             of the largest effort limit, or 1 N m without limits.
         largest_errors: The largest permitted errors for computed gains: those are then the
             smoothest ones within them, and without a bound the ones with the least errors.
-        plant: The plant: ideal constraints, opening contacts, or Drake's own contact in a discrete
-            MultibodyPlant with the surfaces as geometry.
+        plant: The plant: ideal constraints, contact that gives way, or Drake's own contact in a
+            discrete MultibodyPlant with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; continuous if left out.
         encoders: The measurement of positions and velocities for the law, with `sampling`; exact if
             left out.
@@ -234,6 +236,7 @@ def scenario_reader(keys: tuple[str, ...] = ()) -> Reader[Scenario]:
     return Reader(Scenario, keys)
 
 
+@checked(ModelError)
 def scenario_schema(tags: bool = True) -> dict[str, Any]:
     """The JSON Schema of a scenario as plain data.
 

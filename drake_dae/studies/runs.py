@@ -76,8 +76,8 @@ class RunResult:
 
 
 _OF_A_RUN = re.compile(
-    r"description|duration|may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?|(encoders|sampling)\.seed|"
-    r"force_feedback\.(seed|bias|drift)"
+    r"description|duration|may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?|"
+    r"encoders\.seed|force_feedback\.(seed|bias|drift)"
 )
 """Keys whose values are set in a context, for any scenario."""
 

@@ -64,6 +64,7 @@ class Study:
         """Names of all figures, with units."""
         return tuple(dict.fromkeys(name for result in self.results for name in result.figures))
 
+    @checked(ModelError)
     def values(self, figure: str) -> FloatArray:
         """A figure of every run, shape (number of runs,); nan for runs without this figure.
 

@@ -11,6 +11,10 @@ ZERO = 1e-9
 NEGLIGIBLE = 1e-11
 """A factor below this, relative to the other factors in its row or column, is zero."""
 
+FLOOR = 1e-14
+"""An entry below this, relative to the largest of its whole matrix, is round-off: scaled to length
+one, such a row would count as any other."""
+
 SINGULAR = 1e-6
 """A matrix with a singular value below this, its rows and columns scaled, is singular."""
 
@@ -63,6 +67,23 @@ def unit_rows(matrix: FloatArray) -> FloatArray:
 def smallest_singular_value(matrix: FloatArray) -> float:
     """Returns the smallest singular value of a matrix with no more rows than columns."""
     return float(np.linalg.svd(matrix, compute_uv=False)[-1])
+
+
+def significant(matrix: FloatArray) -> FloatArray:
+    """Returns a matrix in which entries below FLOOR, relative to its largest, are zero."""
+    sizes = np.abs(matrix)
+    return np.where(sizes > FLOOR * np.max(sizes, initial=0.0), matrix, 0.0)
+
+
+def rank_of(matrix: FloatArray, least: float) -> int:
+    """Returns the rank of a matrix: its rows and columns scaled, above its round-off.
+
+    Args:
+        matrix: The matrix.
+        least: Singular values below this, relative to the largest, are zero.
+    """
+    matrix = significant(matrix)
+    return int(np.linalg.matrix_rank(equilibrated(matrix), least)) if matrix.size else 0
 
 
 def equilibrated(matrix: FloatArray) -> FloatArray:

@@ -104,7 +104,8 @@ class NormalForm:
         Returns:
             (y, zeta, xi), shape (n,), named by `coordinate_signals`.
         """
-        return self._coordinates(state, self.system.parameter_vector(parameters))[0]
+        x = self.system.state_vector(state)
+        return self._coordinates(x, self.system.parameter_vector(parameters))[0]
 
     def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns dPhi/dx, shape (n, n); it is singular where Phi is no change of coordinates.
@@ -113,7 +114,9 @@ class NormalForm:
             state: x, shape (n,).
             parameters: Values of all parameters; the defaults if None.
         """
-        return self._at(np.asarray(state, dtype=float), self.system.parameter_vector(parameters))[1]
+        return self._at(self.system.state_vector(state), self.system.parameter_vector(parameters))[
+            1
+        ]
 
     def state(
         self,

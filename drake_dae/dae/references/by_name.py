@@ -153,6 +153,8 @@ def references_by_name(
         ReferenceSignalError: A name has no output, an output has no reference or two, or a
             reference does not fit or is not smooth enough.
     """
+    if len(degrees) != len(outputs):
+        raise ReferenceSignalError(f"{len(outputs)} outputs have {len(degrees)} degrees")
     assignments = []
     for name, reference in references.items():
         try:

@@ -18,7 +18,6 @@ from drake_dae.dae.references.travel import PathLimits, Travel, rest_to_rest
 from drake_dae.errors import ReferenceSignalError
 
 
-@checked(ReferenceSignalError)
 class PathReference(FormulaReference):
     """A motion along a path, r(t) = p(s(t - start_time)), from rest to rest.
 

@@ -9,10 +9,8 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.references.reference import Reference, check_continuity
-from drake_dae.errors import ReferenceSignalError
 
 UNROLLED = 200
 """The largest number of polynomials that an expression contains one by one; more are looked up in
@@ -111,7 +109,6 @@ class PiecewisePolynomials:
         return np.arange(self.factors.shape[2], dtype=float)
 
 
-@checked(ReferenceSignalError)
 class PiecewiseReference(Reference):
     """A piecewise polynomial reference with `order` continuous derivatives."""
 

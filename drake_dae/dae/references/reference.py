@@ -85,7 +85,6 @@ class Reference(ABC):
         return ""
 
 
-@checked(ReferenceSignalError)
 class FormulaReference(Reference):
     """A reference that is a CasADi expression of time; differentiated exactly."""
 

@@ -97,7 +97,6 @@ def basis_pieces(degree: int) -> FloatArray:
     return pieces
 
 
-@checked(ReferenceSignalError)
 class SplineReference(PiecewiseReference):
     """A reference that is a `TimeSpline`."""
 

@@ -12,7 +12,7 @@ from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import are_dependent
-from drake_dae.trace.round_off import Sized, multiply
+from drake_dae.trace.round_off import Sized, multiply, significant
 
 
 class Samples:
@@ -113,7 +113,7 @@ class Samples:
     def dependent(self, functions: ca.SX) -> bool:
         """Returns whether the differentials of functions are linearly dependent at every state."""
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
-        return all(are_dependent(gradient * self.scale) for (gradient,) in gradients)
+        return all(are_dependent(significant(gradient * self.scale)) for (gradient,) in gradients)
 
 
 def fields_at(

@@ -12,7 +12,7 @@ from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples
 from drake_dae.trace.newton import are_dependent
-from drake_dae.trace.round_off import SINGULAR, equilibration
+from drake_dae.trace.round_off import SINGULAR, equilibration, significant
 
 _ON_MANIFOLD = 1e-8
 """The residual of a constraint that a state on N* may have. It appears in the gradient of an output
@@ -164,5 +164,6 @@ def _fit(matrix: FloatArray, others: list[int], row: int) -> tuple[FloatArray, f
 
 def _scaled(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A matrix with rows and columns of about length one, and the divisors of its rows."""
+    matrix = significant(matrix)
     rows, columns = equilibration(matrix)
     return matrix / rows[:, None] / columns, rows

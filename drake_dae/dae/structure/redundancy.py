@@ -15,7 +15,7 @@ from drake_dae.dae.structure.dependence import Combination, redundant_constraint
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import DEPENDENT, ROUND_OFF
-from drake_dae.trace.round_off import equilibrated, positive
+from drake_dae.trace.round_off import FLOOR, equilibrated, positive, rank_of, significant
 
 SEARCH = 200
 """The largest number of steps to a state where all constraints hold; a dozen are enough."""
@@ -28,11 +28,6 @@ this fraction of the best."""
 @checked(ModelError)
 def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> DaeSystem:
     """Returns a system with the same motion in which redundant constraints are removed.
-
-    Removing constraint i also removes the constraint input v_i. The motion is unchanged, because
-    the remaining columns of g span the same space. The forces of the remaining constraints depend
-    on this choice: (1)-(3) determine the sum g(x) v, but not how it is distributed among redundant
-    constraints.
 
     A constraint goes with the constraint input of the same number. The motion is the same, since
     the inputs that remain act in all directions in which those that go did. The forces of the
@@ -98,7 +93,9 @@ class _Redundant(Manifold):
         scale = self.system.scale
         z = self.system.state_vector(state) / scale
         gradients = self.gradients(scale * z, parameters) * scale
-        length = positive(np.linalg.norm(gradients, axis=1))
+        length = np.linalg.norm(gradients, axis=1)
+        largest = float(np.max(length, initial=0.0))
+        length = positive(np.where(length > FLOOR * largest, length, largest))
         residual = self.residual(scale * z, parameters) / length
         damping = 1.0
         for _ in range(SEARCH):
@@ -135,8 +132,8 @@ def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
 def independent_constraints(samples: Samples) -> list[int]:
     """Selects constraints that are well independent of each other at all sampled states."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
-    remainders = [equilibrated(gradient) for (gradient,) in values]
-    most = min(_rank(gradient) for (gradient,) in values)
+    remainders = [equilibrated(significant(gradient)) for (gradient,) in values]
+    most = min(rank_of(gradient, DEPENDENT) for (gradient,) in values)
     remaining: list[int] = []
     while len(remaining) < most:
         independence = np.min([np.linalg.norm(matrix, axis=1) for matrix in remainders], axis=0)
@@ -173,27 +170,28 @@ def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None
         gradient=ca.jacobian(system.k, system.state), moved=ca.jacobian(system.k, moving)
     )
     for (gradient, moved), fields in zip(gradients, samples.fields, strict=True):
-        if _rank(gradient[remaining]) < _rank(gradient):
+        if _is_less(gradient, remaining):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: its gradients are not combinations of "
                 "the gradients of the remaining constraints"
             )
-        both = np.hstack([gradient, moved])
-        if _rank(both[remaining]) < _rank(both):
+        if _is_less(np.hstack([gradient, moved]), remaining):
             names = ", ".join(f"'{signal.name}'" for signal in system.exogenous.signals)
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: where the exogenous signals {names} "
                 "move, the constraints left out are no longer implied by the remaining ones"
             )
-        if _rank(fields["g"].T[remaining]) < _rank(fields["g"].T):
+        if _is_less(fields["g"].T, remaining):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: its columns of g are not combinations "
                 "of the remaining columns"
             )
 
 
-def _rank(matrix: FloatArray) -> int:
-    return int(np.linalg.matrix_rank(equilibrated(matrix), DEPENDENT)) if matrix.size else 0
+def _is_less(rows: FloatArray, remaining: list[int]) -> bool:
+    """Whether some rows of a matrix have a smaller rank than all of them."""
+    rows = significant(rows)
+    return rank_of(rows[remaining], DEPENDENT) < rank_of(rows, DEPENDENT)
 
 
 def _fewer(

@@ -1,6 +1,6 @@
 """Feedback gains, the error dynamics that they assign, and their exact response.   (30)-(34)"""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -9,7 +9,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, show, vector
+from drake_dae.arrays import FloatArray, brief, numbers, show, vector
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.errors import GainError
 
@@ -84,6 +84,7 @@ class FeedbackGains:
         """The poles of the errors, the eigenvalues of E, in 1/s, shape (N,)."""
         return np.linalg.eigvals(self.error_matrix).astype(complex)
 
+    @checked(GainError)
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
         """Returns the exact tracking error exp(E t) e(0) of (30), (31).
 
@@ -186,7 +187,6 @@ def gain_coefficients(
     return design
 
 
-@checked(GainError)
 def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
     """Designs gains from full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ... of (72)-(73).
 
@@ -195,24 +195,31 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
             matrices (lowest derivative first) that couple the outputs of this degree, in the
             outputs' order. Rigid joints: `gain_matrices([Lambda_1, Lambda_2])`.
     """
+    for k, group in enumerate(groups):
+        if isinstance(group, str) or not isinstance(group, Collection):
+            raise GainError(f"gain_matrices: groups[{k}] must be matrices, got {brief(group)}")
+    blocks = [
+        [numbers(f"gain_matrices: groups[{k}]", block, GainError) for block in group]
+        for k, group in enumerate(groups)
+    ]
 
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
         occurring = sorted({degree for degree in degrees if degree}, reverse=True)
-        if len(groups) != len(occurring):
+        if len(blocks) != len(occurring):
             raise GainError(
                 f"the outputs have the degrees {occurring}. Give a group of gain matrices for "
-                f"each degree: {len(occurring)} are needed, got {len(groups)}"
+                f"each degree: {len(occurring)} are needed, got {len(blocks)}"
             )
         matrix = np.zeros((len(names), sum(degrees)))
         starts = DerivativeLayout(tuple(degrees)).starts
-        for degree, group in zip(occurring, groups, strict=True):
+        for degree, group in zip(occurring, blocks, strict=True):
             members = [i for i, d in enumerate(degrees) if d == degree]
             if len(group) != degree:
                 raise GainError(
                     f"outputs of degree {degree} take {degree} matrices, got {len(group)}"
                 )
             for order, block in enumerate(group):
-                block = np.atleast_2d(numbers("a gain matrix", block, GainError))
+                block = np.atleast_2d(block)
                 if block.shape != (len(members), len(members)):
                     raise GainError(
                         f"a gain matrix has shape {block.shape}, but "

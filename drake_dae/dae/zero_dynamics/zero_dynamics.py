@@ -60,6 +60,7 @@ class ZeroDynamics:
     def __repr__(self) -> str:
         return f"ZeroDynamics('{self.system.name}', dimension={self.dimension})"
 
+    @checked(ModelError)
     def state(
         self,
         reference: ArrayLike,
@@ -80,6 +81,7 @@ class ZeroDynamics:
             goal, self._guess(guess), self.system.parameter_vector(parameters)
         )
 
+    @checked(ModelError)
     def motion(
         self,
         reference: Reference,
@@ -112,6 +114,7 @@ class ZeroDynamics:
         start, p = self._guess(guess), self.system.parameter_vector(parameters)
         return follow(self._pinned, reference, grid, start, self._moving(p, exogenous))
 
+    @checked(ModelError)
     def equilibrium(
         self,
         outputs: ArrayLike,
@@ -141,6 +144,7 @@ class ZeroDynamics:
             goal, self._guess(guess), self.system.parameter_vector(parameters)
         )
 
+    @checked(ModelError)
     def eigenvalues(
         self,
         state: ArrayLike,
@@ -179,6 +183,7 @@ class ZeroDynamics:
             )
         return linearized_eigenvalues(self._pinned, self._equilibria.sizes, x, goal, p)[0]
 
+    @checked(ModelError)
     def stability(
         self,
         state: ArrayLike | None = None,
@@ -216,6 +221,7 @@ class ZeroDynamics:
         place = f"{where} with {self._pinned.describe(goal)}"
         return judge(values, errors, rest.state, place, rest.degenerate)
 
+    @checked(ModelError)
     def equilibria(
         self,
         guesses: ArrayLike | None = None,
@@ -246,6 +252,7 @@ class ZeroDynamics:
         goal = self._goal(self.structure.manifold.project(starts[0], p), outputs, p)
         return self._equilibria.find_all(goal, starts, p)
 
+    @checked(ModelError)
     def stability_along(
         self,
         reference: Reference,

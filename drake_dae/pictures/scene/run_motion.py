@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -16,7 +16,6 @@ from drake_dae.pictures.scene.view import FRAME_RATE
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.surface import tangents
-from drake_dae.simulation.records.events import flashes
 from drake_dae.simulation.records.record import Record
 from drake_dae.systems.plants.contract import Plant
 
@@ -28,6 +27,7 @@ _EXTENT_STATES = 60
 """The approximate number of states from which the extent of a run is computed."""
 
 
+@runtime_checkable
 class ShownLoop(Protocol):
     """A diagram with a plant and its geometry, such as a `ClosedLoop`."""
 
@@ -55,8 +55,6 @@ class RunMotion:
         desired: Link states at rest (q, 0) with the desired outputs, until these are out of reach,
             shape (j, nq + nv) with j <= k.
         acting: The function of the constraint wrenches, for the parameters at the start.
-        flashes: The brightness of each constraint's flash at an impact, 0 to 1, shape (k,
-            constraints).
         friction: Name of a constraint -> its coefficient of friction in the plant.
     """
 
@@ -69,7 +67,6 @@ class RunMotion:
     wrenches: Sequence[Wrenches]
     desired: FloatArray
     acting: ConstraintWrenches
-    flashes: FloatArray
     friction: Mapping[str, float]
 
     @property
@@ -161,18 +158,16 @@ def follow(
             replace(wrench, forces=force)
             for wrench, force in zip(wrenches, contact_forces, strict=True)
         ]
-    start_time, names = float(record.time[0]), [item.name for item in acting.constraints]
     return RunMotion(
         plant,
         model,
         times,
-        start_time,
+        float(record.time[0]),
         states,
         values,
         wrenches,
         _desired_states(model, states, desired, values),
         acting,
-        flashes(record.events, names, start_time + times),
         plant.friction(plant_context),
     )
 

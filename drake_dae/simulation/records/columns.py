@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, listed, number_in
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
@@ -19,7 +18,6 @@ _LABEL = re.compile(r"\s*(.+?)(?:\s+\[([^\]]*)\])?\s*")
 """A name, and perhaps its unit in brackets."""
 
 
-@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """A vector signal over time.

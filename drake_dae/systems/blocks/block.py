@@ -20,7 +20,6 @@ from pydrake.systems.framework import (
     SystemScalarConverter,
 )
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, numbers, vector
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
@@ -37,7 +36,6 @@ NO_TIME_DERIVATIVE = "it samples, and a sample has no derivative by the time"
 """The reason why a sampled block does not convert to AutoDiffXd."""
 
 
-@checked(ModelError)
 class DifferentiableSystem(LeafSystem):
     """A LeafSystem with vector ports that converts to AutoDiffXd, alone or in a diagram.
 
@@ -99,7 +97,6 @@ class DifferentiableSystem(LeafSystem):
         return _converted(self)
 
 
-@checked(ModelError)
 class ParameterizedSystem(DifferentiableSystem):
     """A LeafSystem whose numeric parameter 0 begins with all parameters of a DaeSystem.
 
@@ -184,13 +181,11 @@ class ParameterizedSystem(DifferentiableSystem):
         self._steps.tolerate(context, self.explained(error, parameters, *inputs))
         return function.nowhere()
 
-    @checked(ModelError)
     def explained(
         self,
         error: SimulationError,
         parameters: FloatArray,
         *inputs: FloatArray,
-        held: FloatArray | None = None,
     ) -> SimulationError:
         """Returns the error of a function without a value, or a more precise one.
 
@@ -198,7 +193,6 @@ class ParameterizedSystem(DifferentiableSystem):
             error: The error, with time and state.
             parameters: Values of all parameters.
             inputs: The other inputs of the function, such as the control.
-            held: The discrete state; that of the last evaluation if None.
         """
         return error
 

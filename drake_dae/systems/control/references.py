@@ -104,6 +104,7 @@ class ReferenceGenerator(DifferentiableSystem):
         function = self.function if context is None else self._in(context)
         return signal_along(function, self.get_output_port().size(), moments)
 
+    @checked(ReferenceSignalError)
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of its references in a context.
 

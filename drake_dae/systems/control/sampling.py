@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import check_whole_number
 from drake_dae.errors import ModelError, NonFiniteError, WiringError
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
@@ -96,6 +97,7 @@ class ControlHold(LeafSystem):
 
     def __init__(self, size: int, sampling: Sampling) -> None:
         super().__init__()
+        check_whole_number("size", size, 1)
         self.set_name("control_hold")
         self.sampling = sampling
         self.sample_period = sampling.period

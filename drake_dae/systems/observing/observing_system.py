@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, DependencyTicket
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -18,7 +17,6 @@ from drake_dae.systems.observing.observed import Observed
 from drake_dae.systems.observing.observer_rates import Observing
 
 
-@checked(ModelError)
 class ObservingSystem(ParameterizedSystem):
     """A sampled observer of a law's disturbance and coefficients of friction.
 

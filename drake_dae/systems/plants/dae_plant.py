@@ -213,13 +213,11 @@ class DaePlant(ParameterizedSystem, Plant):
                 raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {sizes[name]})")
         return function_along(function, given)
 
-    @checked(ModelError)
     def explained(
         self,
         error: SimulationError,
         parameters: FloatArray,
         *inputs: FloatArray,
-        held: FloatArray | None = None,
     ) -> SimulationError:
         """Returns the error with dependent constraints, or in a Painleve paradox its outcome."""
         if not isinstance(error, SingularityError):

@@ -111,10 +111,8 @@ def test_isolated_singularities_are_not_mended():
 def test_at_rest_another_nominal_control_is_asked_for(make, count):
     error = violation(make())
     name = count.split()[-1]
-    assert f'give another nominal_control, for example nominal_control={{"{name}": 1.0}}; ' in str(
-        error
-    )
-    assert str(error).endswith(f"integrators: {count}")
+    assert f'nominal_control={{"{name}": 1.0}}' in str(error)
+    assert count in str(error)
     assert error.state[make().num_states] == 0.0
 
 

@@ -404,7 +404,7 @@ def test_wrong_inputs():
         normal_form.state([0.0, 0.0, np.nan, 0.0])
     with pytest.raises(ModelError, match="state"):
         normal_form.state([0.0, 0.0, 0.5, 0.0], [1.0, 2.0])
-    with pytest.raises(ModelError, match=r"'state'.*3"):
+    with pytest.raises(ModelError, match="state"):
         normal_form.coordinates([0.0, 0.0, 0.5])
     logarithm = DaeSystem.from_functions(
         1, f=lambda x: 0, h=lambda x: 1, l=lambda x: ca.log(x), nominal_state=[1.0]

@@ -52,16 +52,14 @@ def test_the_rows_that_follow_are_named_with_their_factors():
     np.testing.assert_allclose(corner.factors, [3.0, -1.0], rtol=1e-9)
     assert (again.name, again.others) == ("wall again", ("wall",))
     np.testing.assert_allclose(again.factors, [1000.0], rtol=1e-9)
-    text = str(found)
-    assert "'corner' ~ 3 floor - 1 wall; 'wall again' ~ 1000 wall" in text
-    assert "distribution of the forces among them is not determined" in text
+    assert "'corner' ~ 3 floor - 1 wall; 'wall again' ~ 1000 wall" in str(found)
 
 
 def test_rows_are_named_also_where_their_derivatives_have_no_room():
     """Eight derivatives in six states."""
     found = violation(mass_point(lambda q: [q[0], q[1], 3 * q[0] - q[1], 1000 * q[1]]))
     assert found.cause is ViolationKind.NO_FORCE
-    assert "gradients of constraints: 'y2' ~ 3 y0 - 1 y1; 'y3' ~ 1000 y1" in str(found)
+    assert "'y2' ~ 3 y0 - 1 y1; 'y3' ~ 1000 y1" in str(found)
 
 
 def test_factors_that_depend_on_the_state_are_reported():
@@ -70,7 +68,6 @@ def test_factors_that_depend_on_the_state_are_reported():
     assert found.cause is ViolationKind.REDUNDANT
     assert not found.combinations[0].constant
     np.testing.assert_allclose(found.combinations[0].factors, 2 + np.sin(found.state[1]), rtol=1e-9)
-    assert " y0, with factors that depend on the state" in str(found)
 
 
 def test_a_singular_configuration_is_one():
@@ -83,8 +80,6 @@ def test_a_singular_configuration_is_one():
     assert found.cause is ViolationKind.SINGULAR_CONFIGURATION
     assert found.combinations[0].name == "y1"
     np.testing.assert_allclose(found.combinations[0].factors, [1.0], rtol=1e-9)
-    assert "This is a singular configuration" in str(found)
-    assert "a law cannot" in str(found)
     # Around it nothing is wrong: on the branch x = 0 the gradients are (0, 1, 0) and (y, 1, 0).
     beside = mass_point(k, nominal=[0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     assert find_structure(beside, spread=0.01).constraint_degrees == (2, 2)
@@ -111,9 +106,7 @@ def test_a_regular_difference_is_not_called_redundant(factor):
     (combination,) = found.combinations
     assert (combination.name, combination.others) == ("y1", ("y0",))
     np.testing.assert_allclose(combination.factors, [factor], rtol=1e-9)
-    assert "No constraint is redundant" in str(found)
-    assert "Write this difference in place of the constraint" in str(found)
-    # What the message says to write.
+    # The difference in its place.
     assert find_structure(hidden(lambda x: [x[0], x[1]])).constraint_degrees == (1, 2)
 
 
@@ -131,7 +124,7 @@ def test_inputs_that_do_not_act_independently_at_one_state():
         )
     )
     assert found.cause is ViolationKind.CONSTRAINT_RANK
-    assert "rows of A(x): 'y1' ~ 1 y0" in str(found)
+    assert "'y1' ~ 1 y0" in str(found)
 
 
 def test_the_analysis_names_them_too():

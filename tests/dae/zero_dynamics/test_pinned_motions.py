@@ -209,7 +209,7 @@ def test_wrong_arguments_are_refused():
             dynamics.motion(lambda t: still, times)
     with pytest.raises(ModelError, match="times"):
         dynamics.motion(lambda t: still, [0.0, np.inf])
-    with pytest.raises(ModelError, match=r"reference must have size 6 .* \(2, 2\).*got 2"):
+    with pytest.raises(ModelError, match=r"reference.*6.*\(2, 2\).*2"):
         dynamics.motion(lambda t: still[:2], [0.0, 1.0])
     with pytest.raises(ModelError, match="reference"):
         dynamics.state(still[:2])
@@ -227,11 +227,11 @@ def test_wrong_arguments_are_refused():
 
 def test_outputs_out_of_reach_are_named():
     dynamics = zero_dynamics(free_arm())
-    with pytest.raises(InconsistentStateError, match=r"free arm: the outputs x = 2, y = 0") as info:
+    with pytest.raises(InconsistentStateError, match=r"free arm: .*x = 2, y = 0") as info:
         dynamics.state([2.0, 0, 0, 0, 0, 0])
     # The nearest the tip gets is 0.2 short.
     assert np.max(np.abs(info.value.residual)) > 0.1
-    with pytest.raises(InconsistentStateError, match="no value"):
+    with pytest.raises(InconsistentStateError, match="z0"):
         zero_dynamics(double_integrator(l=lambda x: ca.sqrt(x[0]), nominal_state=[1, 0])).state(
             [1.0, 0.0, 0.0], [-1.0, 0.0]
         )

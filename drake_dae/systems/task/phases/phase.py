@@ -9,7 +9,6 @@ from typing import ClassVar, Literal
 
 import casadi as ca
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
@@ -73,7 +72,6 @@ class Moment:
         return condition.limit - value if condition.above is not None else value - condition.limit
 
 
-@checked(ModelError)
 @dataclass(frozen=True, kw_only=True)
 class Phase(ABC):
     """A part of a task, with its own goals for the outputs and its own end.
