@@ -41,8 +41,8 @@ help:
 	@echo 'make benchmark   speed, with ratios, beside peers that it installs; some 10 minutes'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: hours'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
-	@echo 'make peers [ARGS=--ours]  our law beside others, into examples/contact_peers/table.md'
-	@echo 'make referee     constraint forces of five engines and the right ones, into examples/referee/table.md'
+	@echo 'make peers       our law beside others on the same contact, as a table: half an hour'
+	@echo 'make referee     constraint forces of five engines and the right ones, into tests/benchmarks/referee/table.md'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make equations   from each equation of the paper to its line and its test'
@@ -87,11 +87,11 @@ friction: $(VENV)/installed
 	$(BIN)/python examples/unknown_friction
 
 peers: $(VENV)/installed
-	PYTHONPATH=examples $(BIN)/python -m contact_peers $(ARGS)
+	$(BIN)/python tests/benchmarks/contact_peers.py
 
 # Engines that are not installed are left out: .[referee] brings them.
 referee: $(VENV)/installed-dev
-	PYTHONPATH=examples $(BIN)/python -m referee $(ARGS)
+	PYTHONPATH=tests/benchmarks $(BIN)/python -m referee $(ARGS)
 
 house: $(VENV)/installed-dev
 	$(BIN)/python tests/support/draw_house.py $(HOUSE)

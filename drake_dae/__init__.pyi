@@ -91,8 +91,6 @@ from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
 from .robots.outputs import TiltFromNormal as TiltFromNormal
 from .robots.surfaces.implicit import ImplicitSurface as ImplicitSurface
 from .robots.surfaces.measured import MeasuredSurface as MeasuredSurface
-from .robots.surfaces.plate import Hole as Hole
-from .robots.surfaces.plate import Plate as Plate
 from .robots.surfaces.surfaces import Cylinder as Cylinder
 from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
 from .robots.surfaces.surfaces import Plane as Plane
@@ -109,7 +107,6 @@ from .scenario.commanded import build_commanded as build_commanded
 from .scenario.files import load_scenario as load_scenario
 from .scenario.model import complete_scenario as complete_scenario
 from .scenario.new.new_scenario import new_scenario as new_scenario
-from .scenario.plants import Unilateral as Unilateral
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .simulation.records.record import Record as Record
@@ -136,17 +133,13 @@ from .systems.observing.observer import DisturbanceObserver as DisturbanceObserv
 from .systems.observing.observer_rates import Observing as Observing
 from .systems.plants.contact.compliant_plant import CompliantPlant as CompliantPlant
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
-from .systems.plants.contact.contact_material import Peg as Peg
 from .systems.plants.contact.contact_material import PointMaterial as PointMaterial
 from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
 from .systems.plants.contact.disturbance_forces import DisturbanceForce as DisturbanceForce
-from .systems.plants.contact_events import ContactChange as ContactChange
-from .systems.plants.contact_events import ContactEvent as ContactEvent
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
 from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
-from .systems.plants.unilateral.plant import UnilateralRobotPlant as UnilateralRobotPlant
 from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor
 from .systems.sensing.force_sensor import ForceSensor as ForceSensor

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from arms import arm, fixed_step, law
 from numpy.typing import ArrayLike, NDArray
-from polishing import laws, polisher, task_loop
+from polishing import laws, soft_wall, task_loop
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.symbolic import Variable
@@ -43,7 +43,6 @@ from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
 from drake_dae.studies.runs import Outcome, RunResult
-from drake_dae.systems.plants.contact_events import ContactChange
 
 
 @cache
@@ -151,7 +150,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Signal: lambda: dd.Signal("a"),
     dd.TrackingLaw: lambda: law("two_link"),
     Constraint: lambda: arm("two_link").model.constraints[0],
-    ContactChange: lambda: ContactChange.IMPACT,
     Context: lambda: context_of(None),
     Links: lambda: arm("two_link").model.links,
     MultibodyPlant: lambda: arm("two_link").plant,
@@ -203,9 +201,9 @@ PLACES: dict[str, Callable[[], Any]] = {
     "free_law": lambda: laws()[1],
     "force of open_contact": lambda: "wall.force",
     "system of open_contact": lambda: arm("two_link").model.dae,
-    "plant of wire_loop": lambda: dd.UnilateralRobotPlant(polisher(), {"wall": 0.0}),
+    "plant of wire_loop": lambda: soft_wall(),
     "controller of wire_loop": lambda: dd.TaskController(
-        dd.Task([dd.Approach()]), laws()[0], laws()[1]
+        dd.Task([dd.Approach()]), laws()[0], laws()[1], sample_period=1e-3
     ),
     "integrators": lambda: {"joint1_motor": 1},
     "count": lambda: 3,
@@ -214,7 +212,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "time": lambda: ca.SX.sym("t"),
     "values": lambda: -1.0,
     "values of gain_coefficients": lambda: [4.0, 4.0],
-    "contacts of UnilateralRobotPlant": lambda: {"wall": 0.5},
     "state of DaeSystem": lambda: ca.SX.sym("x", 1),
     "state of from_symbolic": lambda: [Variable("x")],
     "f of from_symbolic": lambda: [1.0],

@@ -70,7 +70,6 @@ def _left_out(scenario: Scenario, loop: ClosedLoop) -> list[str]:
     parts = {
         "the limits of the drives, except in the controller": scenario.saturation,
         f"Drake's own contact: {closed}, and ideal": not loop.plant.is_ideal,
-        f"how contacts open: {closed}": bool(loop.plant.contacts),
     }
     return [text for text, is_run in parts.items() if is_run]
 

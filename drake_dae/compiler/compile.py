@@ -16,12 +16,10 @@ from drake_dae.compiler.wires import Port, Wires, leaf_port
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.traced import (
     DERIVATIVE,
-    GAPS,
     HELD,
     MARGINS,
     NOISE,
     PARAMETERS,
-    RATES,
     STATE,
     Block,
     Computation,
@@ -150,16 +148,9 @@ def _compiled(
     arguments = [columns[name] for name in (*ARGUMENTS, "noise")]
     rates = _rates(expressions, blocks, places["held"], arguments)
     values |= {f"update_{i}": updated for i, (_, updated) in enumerate(rates)}
-    guards = dict[str, list[ColumnPlace]]()
-    for name, in_samples in (("guard", False), ("watch", True)):
-        guarded = [
-            block
-            for block in blocks.values()
-            if block.guard is not None and block.guard.in_samples is in_samples
-        ]
-        guards[name] = []
-        if guarded:
-            values[name], guards[name] = _guards(expressions, guarded)
+    guarded, watched = [each for each in blocks.values() if each.guard], list[ColumnPlace]()
+    if guarded:
+        values["watch"], watched = _guards(expressions, guarded)
     _check_stepped(blocks, places["state"])
     return CompiledDiagram(
         wires,
@@ -173,8 +164,7 @@ def _compiled(
         tuple(places["noise"]),
         tuple(rate for rate, _ in rates),
         blocks,
-        tuple(guards["guard"]),
-        tuple(guards["watch"]),
+        tuple(watched),
         expressions,
         columns,
         values,
@@ -280,19 +270,18 @@ def _rates(
 def _guards(
     expressions: Expressions, blocks: Sequence[Block]
 ) -> tuple[list[ca.SX], list[ColumnPlace]]:
-    """Margins, gaps, gap rates and validity of all guards; the slice of each block's margins."""
-    columns, places = [ca.SX(0, 1)] * 3, list[ColumnPlace]()
+    """Margins and validity of all guards; the slice of each block among the margins."""
+    margins, places = ca.SX(0, 1), list[ColumnPlace]()
 
     def stack_guards() -> list[ca.SX]:
+        nonlocal margins
         for block in blocks:
             assert block.guard is not None
             call = expressions.call(block, block.guard.computation)
-            for i, name in enumerate((MARGINS, GAPS, RATES)):
-                value = call.results[call.computation.outputs.index(name)]
-                columns[i], part = appended(columns[i], value)
-                if name == MARGINS:
-                    places.append(ColumnPlace(block.system, part))
+            value = call.results[call.computation.outputs.index(MARGINS)]
+            margins, part = appended(margins, value)
+            places.append(ColumnPlace(block.system, part))
         return []
 
     _, valid = expressions.checked(stack_guards)
-    return [*columns, valid], places
+    return [margins, valid], places

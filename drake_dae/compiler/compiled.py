@@ -36,9 +36,7 @@ class CompiledDiagram:
         inputs: The inputs of a part of a diagram, also parameters: (name, slice).
         rates: The updates, one function for each period, offset and kind.
         blocks: System -> block, in the order of Drake's states.
-        guards: For blocks that react at event times which a run locates: the slice of each block
-            among the margins of `guard`.
-        watched: For blocks that check their guards only at samples: the slice of each block among
+        watched: For blocks with a guard: the slice of each block among
             the margins of `watch`.
     """
 
@@ -53,7 +51,6 @@ class CompiledDiagram:
     noise: tuple[ColumnPlace, ...]
     rates: tuple[UpdateRate, ...]
     blocks: Mapping[System, Block]
-    guards: tuple[ColumnPlace, ...]
     watched: tuple[ColumnPlace, ...]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
@@ -80,16 +77,8 @@ class CompiledDiagram:
         return self._function("row", self._values["row"])
 
     @cached_property
-    def guard(self) -> ca.Function:
-        """(time, state, held, parameters) -> margins, gaps, gap rates of `guards`, validity.
-
-        The values of all blocks are stacked; see `Guard`. Requires that `guards` is not empty.
-        """
-        return self._function("guard", self._values["guard"])
-
-    @cached_property
     def watch(self) -> ca.Function:
-        """(time, state, held, parameters) -> margins, gaps, gap rates of `watched`, validity.
+        """(time, state, held, parameters) -> margins of `watched`, validity.
 
         Requires that `watched` is not empty.
         """
@@ -108,15 +97,15 @@ class CompiledDiagram:
 
     @property
     def changes(self) -> bool:
-        """Whether a block has a guard, so that it reacts to events such as impacts."""
-        return bool(self.guards or self.watched)
+        """Whether a block has a guard, as a task of phases."""
+        return bool(self.watched)
 
     @cached_property
     def staged(self) -> Mapping[str, ca.Function]:
         """Name -> function, with all that depends only on time and parameters precomputed.
 
         "given" is (time, parameters) -> the precomputed column. "rate", "row", "newton",
-        "update_0", ..., "guard" and "watch" are the functions of these names, with this column as
+        "update_0", ... and "watch" are the functions of these names, with this column as
         an additional argument after the parameters.
         """
         column, values, substituted = self._expressions.given_column()
@@ -298,10 +287,10 @@ class CompiledDiagram:
             block = self.blocks[system]
             if block.projection is None:
                 continue
-            arguments = self._expressions.parameters(block), self._expressions.source(block, HELD)
+            parameters = self._expressions.parameters(block)
             x = start = self._columns["state"][part]
             for _ in range(count):
-                change = block.projection.newton(x, start, *arguments)
+                change = block.projection.newton(x, start, parameters)
                 x = x + ca.DM(block.projection.scale) * change
             state[part], length = x, ca.fmax(length, ca.norm_2(change))
         return [state, length]

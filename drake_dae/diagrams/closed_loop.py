@@ -1,10 +1,9 @@
 """A closed loop: a diagram with named parts, and the record of a run."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context, Diagram, OutputPort
@@ -129,7 +128,7 @@ class ClosedLoop:
 
         It includes `desired_output` r, `tracking_error` z - r (29), and further signals of the
         controller; see its class. Each row is computed with the parameters and gains of its time.
-        At an impact or a change of phase, values are those before it.
+        At a change of phase, values are those before it.
 
         Args:
             context: The diagram's context.
@@ -142,11 +141,7 @@ class ClosedLoop:
         logged = Record.from_log(self.log, self.logged, context, after)
         if self.plant.functions:
             logged = completed(logged, self, context)
-        record = self.with_errors(logged, context).while_finite()
-        begin = -np.inf if after is None else after
-        end = record.time[-1] if record.time.size else -np.inf
-        events = self.plant.events(self.plant.GetMyContextFromRoot(context))
-        return replace(record, events=tuple(event for event in events if begin < event.time <= end))
+        return self.with_errors(logged, context).while_finite()
 
     @checked(WiringError)
     def with_errors(self, record: Record, context: Context | None = None) -> Record:

@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import Adder, AffineSystem, MatrixGain
+from pydrake.systems.primitives import Adder, MatrixGain
 
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.references import ConstantReference, Reference
@@ -145,31 +145,3 @@ def add_hold(
             source = spread.get_output_port()
         builder.Connect(source, total.get_input_port(index))
     builder.Connect(total.get_output_port(), controller.GetInputPort("hold"))
-
-
-def open_holds(builder: DiagramBuilder, plant: Plant, controller: Controller) -> list[OutputPort]:
-    """Adds the block that stops the integrals of the forces of open contacts.
-
-    Args:
-        builder: The builder of the diagram, with the plant in it.
-        plant: The plant.
-        controller: The controller of the integrals.
-
-    Returns:
-        Its output port, for the controller's `hold`; empty if there is no such integral, or the
-        controller opens contacts and does so itself.
-    """
-    if controller.takes_over or not controller.HasInputPort("hold"):
-        return []
-    law = controller.law
-    rows = law.measured_force.rows if law.measured_force else {}
-    integrates = np.zeros((len(law.integral.outputs), len(plant.contacts)))
-    for row, output in enumerate(law.integral.outputs):
-        for column, normal in enumerate(plant.normals):
-            integrates[row, column] = output in rows and not rows[output][normal].is_zero()
-    if not integrates.any():
-        return []
-    hold = builder.AddSystem(AffineSystem(D=-integrates, y0=integrates.sum(axis=1)))
-    hold.set_name("open_contacts")
-    builder.Connect(plant.GetOutputPort("mode"), hold.get_input_port())
-    return [hold.get_output_port()]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import DiagramBuilder, System
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
 from drake_dae.arguments import checked
 from drake_dae.dae.references import Reference, references_by_name
@@ -18,7 +18,6 @@ from drake_dae.diagrams.parts import (
     add_signals,
     check_parts,
     contact_reference,
-    open_holds,
 )
 from drake_dae.diagrams.recorded import (
     further_signals,
@@ -50,9 +49,7 @@ def make_closed_loop(
 ) -> ClosedLoop:
     """Builds the closed loop of a plant, a tracking law and references, with a log and a view.
 
-    While a contact of a `UnilateralRobotPlant` is open, the law continues, so that phi'' = -A(x)
-    lambda_d with the desired force lambda_d. The integral of this force is not updated. With a
-    `ContactPlant` all signals are logged at its steps.
+    With a `ContactPlant` all signals are logged at its steps.
 
     Args:
         plant: A `RobotPlant`, or any other `Plant`.
@@ -151,8 +148,8 @@ def wire_loop(
     moving, known = add_exogenous(builder, plant, controller, parts)
 
     # An observer estimates model errors for the law, and perhaps its state. Integrals are not
-    # updated while a contact is open or lost, or a drive is at its limit.
-    holds, observer = open_holds(builder, plant, controller), None
+    # updated while a contact is lost, or a drive is at its limit.
+    holds, observer = list[OutputPort](), None
     if observing is not None and goal is not None:
         ports = state, sampling, control, goal, limits
         observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatCone, Rgba, SceneGraph, Sphere
+from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatCone, Rgba, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.inline import InlinePage
 from drake_dae.pictures.moments import RunEvent, event_kinds, events_of, sorted_events
 from drake_dae.pictures.scene.arrows import (
     FORCE_COLOR,
@@ -57,7 +56,6 @@ from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import Limits
 
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
-_FLASH = Rgba(1.0, 0.75, 0.1, 0.6)
 _CONE = Rgba(0.95, 0.6, 0.15, 0.35)
 
 _FOREVER = 2**31 - 1
@@ -69,6 +67,14 @@ _SIDES = 6
 _OVERLAY = Path(__file__).with_name("overlay.html")
 
 
+class InlinePage(str):
+    """An HTML page as text; a notebook displays it in a frame."""
+
+    def _repr_html_(self) -> str:
+        page = html.escape(str(self), quote=True)
+        return f'<iframe srcdoc="{page}" style="width: 100%; height: 600px; border: 0"></iframe>'
+
+
 @checked(ModelError)
 def make_animation(
     loop: ShownLoop, record: Record, context: Context, title: str = ""
@@ -78,7 +84,7 @@ def make_animation(
     The page shows the time, the constraint forces as arrows with their sizes, and the actual path
     over the desired one; it repeats the run. A time bar shows the phases of a task and the events
     of the run, and jumps to any time; the address "page.html#t=2.5" shows the run at 2.5 s. An
-    impact is a flash. An open contact has no arrow. A contact with friction has a friction cone.
+    open contact has no arrow. A contact with friction has a friction cone.
 
     Args:
         loop: A loop of a `RobotPlant`.
@@ -139,7 +145,6 @@ def animate(
     for cone in cones:
         _add_cone(meshcat, acting.constraints[cone.row], cone, 0.5 * ARROW * size)
     meshcat.StartRecording(frames_per_second=FRAME_RATE)
-    flash_paths = _add_flashes(meshcat, course, 0.05 * size)
     for frame, time in enumerate(course.times):
         state, wrench = course.states[frame], course.wrenches[frame]
         if links is not None and links_context is not None:
@@ -156,10 +161,6 @@ def animate(
             meshcat.SetTransform(path, RigidTransform(rotation, wrench.points[cone.row]), time)
             scale = 1.0 if wrench.forces[cone.row].any() else LEAST_SCALE
             meshcat.SetProperty(f"{path}/form", "scale", [scale] * 3, time)
-        for row, path in flash_paths.items():
-            meshcat.SetTransform(path, RigidTransform(wrench.points[row]), time)
-            brightness = max(course.flashes[frame, row], LEAST_SCALE)
-            meshcat.SetProperty(f"{path}/ball", "scale", [brightness] * 3, time)
     meshcat.StopRecording()
     recording = meshcat.get_mutable_recording()
     recording.set_loop_mode(MeshcatAnimation.LoopMode.kLoopRepeat)
@@ -205,18 +206,6 @@ def _add_cone(
     radius = side * np.sin(angle)
     shape = MeshcatCone(side * np.cos(angle), radius, radius)
     meshcat.SetObject(f"{path_of(constraint, 'cone')}/form", shape, _CONE)
-
-
-def _add_flashes(meshcat: Meshcat, course: RunMotion, radius: float) -> dict[int, str]:
-    """Adds a ball for each constraint with impacts; returns constraint index -> path in Meshcat."""
-    paths = {
-        row: path_of(constraint, "impact")
-        for row, constraint in enumerate(course.acting.constraints)
-        if course.flashes[:, row].any()
-    }
-    for path in paths.values():
-        meshcat.SetObject(f"{path}/ball", Sphere(radius), _FLASH)
-    return paths
 
 
 def _draw_paths(

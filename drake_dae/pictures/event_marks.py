@@ -1,12 +1,11 @@
-"""Marks in plots over time: events, open contacts, and phases of a task."""
+"""Marks in plots over time: events, and phases of a task."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from drake_dae.pictures.moments import RunEvent, RunEventKind, event_kinds
-from drake_dae.simulation.open_contacts import open_spans
+from drake_dae.pictures.moments import RunEvent, event_kinds
 from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record
 
@@ -17,29 +16,17 @@ if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
 _NAME = 0.11
 """The width of a phase's name, which is vertical, in inches along the time axis."""
 
-OPEN = "contact open"
-"""The legend label of the time spans in which a contact was open."""
+
+def mark_labels(events: Sequence[RunEvent] = ()) -> tuple[str, ...]:
+    """Returns the legend labels of the marks of events."""
+    return tuple(kind.label for kind in event_kinds(events))
 
 
-def mark_labels(record: Record, events: Sequence[RunEvent] = ()) -> tuple[str, ...]:
-    """Returns the legend labels of the marks of a record."""
-    labels = [OPEN] if open_spans(record) else []
-    return (*labels, *(kind.label for kind in event_kinds(events)))
-
-
-def mark_events(axes: Sequence[Axes], record: Record, events: Sequence[RunEvent] = ()) -> None:
-    """Shades the time spans with open contacts, and marks the events on the time axis.
-
-    An impact also has a vertical line over the whole height of the plot.
-    """
+def mark_events(axes: Sequence[Axes], events: Sequence[RunEvent] = ()) -> None:
+    """Marks events on the time axis."""
     for axis in axes:
-        for number, span in enumerate(open_spans(record)):
-            label = "" if number else OPEN
-            axis.axvspan(*span, color="0.9", linewidth=0.0, zorder=0.4, label=label)
         for kind in event_kinds(events):
             times = [event.time for event in events if event.kind is kind]
-            for time in times if kind is RunEventKind.IMPACT else ():
-                axis.axvline(time, color=kind.color, linewidth=0.8, alpha=0.7, zorder=0.6)
             axis.plot(
                 times,
                 [0.0] * len(times),
@@ -82,5 +69,5 @@ def mark_phases(figure: Figure, record: Record) -> None:
                 fontsize=6,
                 color="0.45",
                 path_effects=[halo],
-                zorder=0.7,  # Above the lines of impacts, below the curves.
+                zorder=0.7,  # Below the curves.
             )

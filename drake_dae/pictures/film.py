@@ -77,8 +77,8 @@ _FFMPEG_OPTIONS = ["-pix_fmt", "yuv420p", "-preset", "veryfast"]
 _LETTER = 7.0  # The width of a letter of a label, in pixels.
 _LEAST_FORCE = 0.02  # Forces below this fraction of the run's largest force have no arrow.
 
-ACTUAL, DESIRED, FORCE, IMPACT = "#1f3fbf", "#2e9d4a", "#d12b1f", "#ffb000"
-"""Colors of the actual path, the desired path, forces, and impacts."""
+ACTUAL, DESIRED, FORCE = "#1f3fbf", "#2e9d4a", "#d12b1f"
+"""Colors of the actual path, the desired path, and forces."""
 
 _TOP = 56.0 / _HEIGHT
 """The fraction of a picture's height that is reserved for the texts at the top."""
@@ -101,7 +101,7 @@ Pixels = NDArray[np.uint8]
 def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Path) -> None:
     """Writes a film of a recorded run, with the paths and the forces of the contacts.
 
-    The actual path is blue, the desired path green. A star is an impact. A contact with friction
+    The actual path is blue, the desired path green. A contact with friction
     has a friction cone. A moment is an arrow with two heads. A time bar at the bottom has marks for
     phases and events.
 
@@ -284,9 +284,6 @@ class _Scene:
         for row in range(len(ends)):
             for points, color in ((self._desired, DESIRED), (self._points[: number + 1], ACTUAL)):
                 axis.plot(*self._camera.project(points[:, row]).T, color=color, linewidth=1.6)
-            if brightness := course.flashes[number, row]:
-                x, y = ends[row][0]
-                axis.scatter(x, y, s=900.0 * brightness, marker="*", color=IMPACT, zorder=3)
         within = (0.0, _TOP * _HEIGHT, _WIDTH, _HEIGHT)
         for row in with_arrow:
             head, tail = ends[row]

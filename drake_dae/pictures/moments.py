@@ -1,4 +1,4 @@
-"""The events of a run that pictures mark: impacts, contact changes, limits, sliding."""
+"""The events of a run that pictures mark: contact changes, limits, sliding."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -7,20 +7,17 @@ from enum import Enum
 import numpy as np
 
 from drake_dae.arrays import Booleans
-from drake_dae.simulation.records.events import impacts
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.summary import Limits
-from drake_dae.systems.plants.contact_events import ContactChange
 
 APART = 0.01
 """Events with the same text that follow each other within this fraction of the run are shown as
-one; impacts are all shown."""
+one."""
 
 
 class RunEventKind(Enum):
     """The kind of an event: its label in a legend, and its color."""
 
-    IMPACT = "impact", "#ffbf1a"
     TOUCH = "touch", "#2ca02c"
     OPENING = "contact opens", "#7f7f7f"
     SLIDE = "begins to slide", "#9467bd"
@@ -38,7 +35,7 @@ class RunEvent:
     Attributes:
         time: The time in s.
         kind: Its kind.
-        text: A description, as "wall: impact".
+        text: A description, as "wall: touch".
     """
 
     time: float
@@ -57,14 +54,14 @@ def events_of(record: Record, limits: Limits | None = None) -> list[RunEvent]:
 
 
 def sorted_events(record: Record, events: Sequence[RunEvent]) -> list[RunEvent]:
-    """Returns events sorted by time, without repetitions within `APART`, except impacts."""
+    """Returns events sorted by time, without repetitions within `APART`."""
     if not record.time.size:
         return []
     apart = APART * float(record.time[-1] - record.time[0])
     last_times, shown = dict[tuple[RunEventKind, str], float](), list[RunEvent]()
     for event in sorted(events, key=lambda event: event.time):
         key = event.kind, event.text
-        if event.kind is RunEventKind.IMPACT or event.time - last_times.get(key, -np.inf) > apart:
+        if event.time - last_times.get(key, -np.inf) > apart:
             shown.append(event)
         last_times[key] = event.time
     return shown
@@ -77,29 +74,19 @@ def event_kinds(events: Sequence[RunEvent]) -> list[RunEventKind]:
 
 
 def _contacts(record: Record) -> Iterator[RunEvent]:
-    """Yields when contacts close, open or are struck."""
-    if "mode" in record.signals:
-        hits = {id(event) for event in impacts(record.events)}
-        kinds = {
-            ContactChange.CLOSING: RunEventKind.TOUCH,
-            ContactChange.OPENING: RunEventKind.OPENING,
-        }
-        for event in record.events:
-            kind = RunEventKind.IMPACT if id(event) in hits else kinds.get(event.kind)
-            if kind is not None:
-                names = ", ".join(event.contacts)
-                yield RunEvent(event.time, kind, f"{names}: {kind.label}")
-    elif "contact_force" in record.signals:  # Compliant contact opens and closes without events.
-        forces = record.signals["constraint_force"]
-        for signal, values in zip(forces.signals, forces.values.T, strict=True):
-            is_closed = values > 0.0
-            name = signal.name.removesuffix(".force")
-            for kind, changed in (
-                (RunEventKind.TOUCH, is_closed[1:] & ~is_closed[:-1]),
-                (RunEventKind.OPENING, is_closed[:-1] & ~is_closed[1:]),
-            ):
-                for time in record.time[1:][changed]:
-                    yield RunEvent(float(time), kind, f"{name}: {kind.label}")
+    """Yields when compliant contacts open and close."""
+    if "contact_force" not in record.signals:
+        return
+    forces = record.signals["constraint_force"]
+    for signal, values in zip(forces.signals, forces.values.T, strict=True):
+        is_closed = values > 0.0
+        name = signal.name.removesuffix(".force")
+        for kind, changed in (
+            (RunEventKind.TOUCH, is_closed[1:] & ~is_closed[:-1]),
+            (RunEventKind.OPENING, is_closed[:-1] & ~is_closed[1:]),
+        ):
+            for time in record.time[1:][changed]:
+                yield RunEvent(float(time), kind, f"{name}: {kind.label}")
 
 
 def _limits(record: Record, limits: Limits) -> Iterator[RunEvent]:

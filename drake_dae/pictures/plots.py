@@ -99,7 +99,7 @@ def plot_outputs(record: Record, predicted: FloatArray, events: Sequence[RunEven
     drawn = np.flatnonzero(~is_held)
     figure, axes = grid(
         [labelled(signals[i]) for i in drawn],
-        ("actual", "reference", *mark_labels(record, events)) if len(drawn) else (),
+        ("actual", "reference", *mark_labels(events)) if len(drawn) else (),
         [
             f"{signals[i].name} = {short(desired[0, i])} {signals[i].unit}".rstrip()
             + (f" (within {short(error[i], 1)})" if error[i] > ROUND_OFF * size[i] else "")
@@ -110,7 +110,7 @@ def plot_outputs(record: Record, predicted: FloatArray, events: Sequence[RunEven
     for axis, i in zip(axes, drawn, strict=False):
         axis.plot(record.time, values[:, i], color="C0", label="actual")
         axis.plot(record.time, desired[:, i], color="C1", linestyle="--", label="reference")
-    mark_events(axes, record, events)
+    mark_events(axes, events)
     if len(drawn):
         legend(figure, axes[0])
     return figure
@@ -144,7 +144,7 @@ def plot_errors(
     titles = [labelled(Signal(f"|error of {signals[i].name}|", signals[i].unit)) for i in drawn]
     figure, axes = grid(
         titles,
-        ("predicted", "actual", label, *mark_labels(record, events)) if len(drawn) else (),
+        ("predicted", "actual", label, *mark_labels(events)) if len(drawn) else (),
         [
             f"{signals[i].name} ("
             + (
@@ -173,7 +173,7 @@ def plot_errors(
         else:
             axis.axhspan(floor / 3.0, accurate_to[i], color="0.88", zorder=0.5, label=label)
         decades(axis, floor)
-    mark_events(axes, record, events)
+    mark_events(axes, events)
     if len(drawn):
         legend(figure, axes[0])
     return figure
@@ -184,14 +184,14 @@ def plot_residual(record: Record, events: Sequence[RunEvent] = ()) -> Figure:
     values = np.abs(record["constraint_residual"])
     labels = [labelled(signal) for signal in record.signals["constraint_residual"].signals]
     title = "|constraint residual|, before each step's projection"
-    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(record, events)))
+    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(events)))
     floor = round_off(np.ones(1))
     for i, label in enumerate(labels):
         axis.semilogy(record.time, np.maximum(values[:, i], floor), label=label)
     axis.axhline(floor, color="0.5", linestyle=":", label="round-off")
     axis.set_yscale("log")
     decades(axis, floor)
-    mark_events([axis], record, events)
+    mark_events([axis], events)
     legend(figure, axis)
     return figure
 
@@ -208,9 +208,9 @@ def plot_controls(
             labelled(signal) + (f", limit ±{bound:g}" if np.isfinite(bound) else "")
             for signal, bound in zip(signals, bounds, strict=True)
         ],
-        marks := mark_labels(record, events),
+        marks := mark_labels(events),
     )
-    mark_events(axes, record, events)
+    mark_events(axes, events)
     if axes and marks:
         legend(figure, axes[0])
     for i, axis in enumerate(axes):

@@ -79,7 +79,7 @@ def plot_runs(
                 text = f"the run '{label}' has no {course.group} '{course.signal.name}'"
                 raise ModelError(f"{text} in {course.signal.unit or '1'}")
     events = [] if others else events_of(first)
-    marks = () if others else mark_labels(first, events)
+    marks = () if others else mark_labels(events)
     figure, axes = grid(
         [
             labelled(Signal(f"|error of {course.signal.name}|", course.signal.unit))
@@ -93,7 +93,7 @@ def plot_runs(
     for axis, course in zip(axes, courses, strict=True):
         draw(axis, records, course)
     if not others:
-        mark_events(axes, first, events)
+        mark_events(axes, events)
         mark_phases(figure, first)
     legend(figure, axes[0])
     return figure

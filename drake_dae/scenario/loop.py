@@ -20,10 +20,7 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.controllers.task_controller import (
-    opening_contact,
-    task_controller,
-)
+from drake_dae.scenario.controllers.task_controller import task_controller
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.observed import latency_of, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
@@ -59,7 +56,6 @@ def build_loop(
     """
     # The law, and its exogenous signals.
     task, sampling = scenario.task, scenario.sampling
-    opens = [] if task is None else [c.name for c in opening_contact(scenario, model)]
     observed = observed_structure(scenario, model, structure)
     law = _law(scenario, observed, latency_of(scenario, model))
     references = [] if task is not None else _references(scenario.references, law)
@@ -72,11 +68,11 @@ def build_loop(
     of_plant = own_model(scenario, model.links) if plant is None else None
     plant_exogenous = None
     if of_plant is not None:
-        plant = make_plant(scenario, of_plant.model, of_plant.structure, opens=opens)
+        plant = make_plant(scenario, of_plant.model, of_plant.structure)
         scene_graph = of_plant.scene_graph
         degrees = plant.exogenous_layout.degrees
         plant_exogenous = exogenous_references(of_plant.scenario, plant.dae, degrees)
-    plant = plant or make_plant(scenario, model, structure, opens)
+    plant = plant or make_plant(scenario, model, structure)
 
     # The parts between plant and law; errors get the key of the part.
     with at("force_feedback"):
@@ -118,7 +114,6 @@ def make_plant(
     scenario: Scenario,
     model: RobotModel,
     structure: Structure,
-    opens: Sequence[str] = (),
 ) -> Plant:
     """Makes the plant of a scenario.
 
@@ -126,7 +121,6 @@ def make_plant(
         scenario: The scenario.
         model: The robot, with payloads if the plant does not add them itself.
         structure: The structure of the model's system.
-        opens: The contacts that a task opens and closes; empty without a task.
 
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
@@ -135,7 +129,6 @@ def make_plant(
     robot = RobotToSimulate(
         model,
         structure,
-        opens,
         partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
         scenario.plant_parameters,
         scenario.plant_disturbances,

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from importlib import import_module
 from typing import ClassVar, cast
 
@@ -11,20 +11,17 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
-from drake_dae.arguments import checked
-from drake_dae.arrays import brief, positive
+from drake_dae.arrays import brief
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial, Peg, PointMaterial
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_plant import RobotPlant
-from drake_dae.systems.plants.unilateral.contacts import coefficient
-from drake_dae.systems.plants.unilateral.plant import UnilateralRobotPlant
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +30,6 @@ class RobotToSimulate:
 
     Attributes:
         model, structure: The robot, and the structure of its system.
-        opens: The contacts that a task opens and closes; empty without a task.
         add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
         parameters: Parameter name -> the value in the plant, if it differs from the law's.
         disturbances: Disturbance forces on the plant.
@@ -41,7 +37,6 @@ class RobotToSimulate:
 
     model: RobotModel
     structure: Structure
-    opens: Sequence[str]
     add_robot: Callable[[DrakePlant, SceneGraph], None]
     parameters: Mapping[str, ArrayLike]
     disturbances: Sequence[DisturbanceForce]
@@ -59,24 +54,16 @@ class ScenarioPlant(ABC):
     5. With `adjusts`, the parameters of the plant can be set in a context. `in_context` are the
        keys of numbers that `begin` sets in a context, even if the plant was made with other
        numbers.
-    6. With `has_sides` its contacts include the sides of a body that ends, as those of a hole in a
-       `Plate`, and not only its face. `pegs` are the pegs that enter them.
     """
 
     carries: ClassVar[bool] = False
     adjusts: ClassVar[bool] = True
-    pegs: Sequence[Peg] = ()
     in_context: ClassVar[frozenset[str]] = frozenset()
 
     @property
     def material(self) -> PointMaterial | None:
         """The material of compliant contacts; None for ideal ones."""
         return None
-
-    @property
-    def has_sides(self) -> bool:
-        """Whether a body that ends has sides too, as those of a hole."""
-        return True
 
     @property
     def rolled(self) -> "ScenarioPlant":
@@ -101,86 +88,17 @@ class ScenarioPlant(ABC):
 
 @dataclass(frozen=True)
 class IdealConstraints(ScenarioPlant):
-    """The plant is a `RobotPlant`: its constraints hold exactly.
-
-    In a task its contacts open, without bouncing: it is then a `UnilateralRobotPlant`.
-
-    Attributes:
-        pegs: The pegs with which a task enters holes, as for `!Unilateral`.
-    """
-
-    pegs: Sequence[Peg] = ()
-
-    @property
-    def has_sides(self) -> bool:
-        return bool(self.pegs)
+    """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        if robot.opens:
-            return Unilateral(dict.fromkeys(robot.opens, 0.0), pegs=self.pegs).plant(robot)
-        if self.pegs:
-            text = "a peg is for a contact that opens: give a task, or take !Unilateral"
-            raise ScenarioError(("plant.pegs", text))
         return RobotPlant(robot.model, structure=robot.structure)
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class Unilateral(ScenarioPlant):
-    """The plant is a `UnilateralRobotPlant`: contacts open instead of pulling, and impact.
-
-    The law is that of closed contacts, also while a contact is open. Then phi'' = -A(x) lambda_d
-    with the desired force lambda_d: the robot returns to the surface if lambda_d > 0, and leaves it
-    if lambda_d < 0.
-
-    Attributes:
-        restitution: Constraint -> its coefficient of restitution, 0 (no bounce) to 1 (no loss), a
-            pure number. Other constraints stay closed. If left out, all unilateral contacts open,
-            without bouncing.
-        settling_time: Bouncing that would end within this time, in s, is ended immediately.
-        pegs: The pegs with which it enters holes, each at a contact that opens, with the friction
-            of that contact. Here a peg is round and smooth, so its rings and balls do not count.
-
-    Raises:
-        ModelError: A number makes no sense.
-    """
-
-    restitution: dict[str, float] = field(default_factory=dict)
-    settling_time: float = 1e-3
-    pegs: Sequence[Peg] = ()
-
-    @property
-    def has_sides(self) -> bool:
-        return bool(self.pegs)
-
-    def __post_init__(self) -> None:
-        positive("settling_time", self.settling_time)
-        for name, value in self.restitution.items():
-            coefficient(f"restitution.{name}", value)
-
-    def plant(self, robot: RobotToSimulate) -> Plant:
-        with at("plant or plant_parameters" if robot.opens else "plant.restitution"):
-            pushing = [
-                constraint.name
-                for constraint in robot.model.constraints
-                if any(constraint.is_unilateral)
-            ]
-            if not pushing:
-                raise ModelError("the robot has no unilateral constraint, so no contact can open")
-            return UnilateralRobotPlant(
-                robot.model,
-                self.restitution or dict.fromkeys(pushing, 0.0),
-                settling_time=self.settling_time,
-                structure=robot.structure,
-                pegs=self.pegs,
-            )
 
 
 @dataclass(frozen=True)
 class MultibodyPlant(ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
-    A ball at the tool, or a peg of balls, touches the surfaces of the constraints. With point
+    A ball at the tool touches the surfaces of the constraints. With point
     contact the force is stiffness times depth. With hydroelastic contact the ball is rigid, and the
     pressure of the surface is modulus times depth / thickness.
 

@@ -136,8 +136,8 @@ class Scenario:
             of the largest effort limit, or 1 N m without limits.
         largest_errors: The largest permitted errors for computed gains: those are then the
             smoothest ones within them, and without a bound the ones with the least errors.
-        plant: The plant: ideal constraints, opening contacts, or Drake's own contact in a discrete
-            MultibodyPlant with the surfaces as geometry.
+        plant: The plant: ideal constraints, contact that gives way, or Drake's own contact in a
+            discrete MultibodyPlant with the surfaces as geometry.
         sampling: The period and the delay of the law, in s; continuous if left out.
         encoders: The measurement of positions and velocities for the law, with `sampling`; exact if
             left out.

@@ -12,7 +12,6 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.job import late_rms
-from drake_dae.simulation.open_contacts import contact_notes
 from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
@@ -78,7 +77,7 @@ def summary(
 
     Args:
         record: A record with state, desired_output, tracking_error, constraint_residual,
-            constraint_force and control; and "mode" and "gap" with opening contacts.
+            constraint_force and control.
         predicted: The tracking error by theory, shape (k, p).
         limits: The limits of the robot.
         run: The statistics of the run; None for a failed run.
@@ -98,7 +97,6 @@ def summary(
     is_compliant = "contact_force" in record
     kind = "in compliant contact" if is_compliant else "before each step's projection"
     notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
-    notes += [f"{label:20} {text}" for label, text in contact_notes(record)]
     notes += _identified(record)
     notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
     ended = ""
@@ -250,8 +248,7 @@ def _largest_controls(record: Record, limits: Limits) -> FloatArray:
 def _pulls(record: Record, signal: Signal, values: FloatArray, limits: Limits) -> bool:
     """Whether an ideal contact would have to pull.
 
-    A compliant one, whose whole force is recorded, cannot. In a hole, its force may have a part
-    against the normal of the surface.
+    A compliant one, whose whole force is recorded, cannot.
     """
     is_ideal = "contact_force" not in record
     return is_ideal and bool(np.min(values) < 0.0) and not limits.can_pull(signal)
@@ -265,16 +262,14 @@ def shortfalls(record: Record, limits: Limits) -> list[str]:
         limits: The limits of the robot.
     """
     forces, controls = record.signals["constraint_force"], record.signals["control"]
-    pulling = [
-        signal.name
+    texts = [
+        f"{signal.name} would open at t = {record.time[np.argmax(values < 0.0)]:.4g} s, where its "
+        f"force begins to pull, with up to {-np.min(values):.3g} {signal.unit}"
         for signal, values in zip(forces.signals, forces.values.T, strict=True)
         if _pulls(record, signal, values, limits)
     ]
     over = np.max(np.abs(controls.values), axis=0, initial=0.0) > _largest_controls(record, limits)
     beyond = [signal.name for signal, over in zip(controls.signals, over, strict=True) if over]
-    texts = []
-    if pulling:
-        texts.append(f"{', '.join(pulling)} would have to pull, which a contact cannot")
     if beyond:
         texts.append(f"{', '.join(beyond)} would exceed the limits")
     if joints := [text.split(" goes from ")[0] for text in _beyond(record, limits)]:

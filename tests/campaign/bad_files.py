@@ -372,7 +372,7 @@ SETTINGS = (
     *("constraints.0.surface=!ImplicitSurface {function: 1_0 - x}", "plant=!MultibodyPlant {}"),
     *(
         "constraints.0.surface=!ImplicitSurface {function: sqrt(x**2) - 1.2}",
-        "plant=!Unilateral {}",
+        "plant=!CompliantContact {}",
     ),
     *("references.tool.z=!Csv {file: /dev/zero, columns: [z]}", "references.tool.z=1.0e+300"),
     *("references.tool.z=!Polyline {points: [[0.3], [0.3]], corner: 0, limits: {speed: 1}}",),

@@ -80,17 +80,17 @@ def test_events_and_phases_stand_on_the_time_of_the_run(course):
     assert said == ["", *["wall: touch"] * 4]
 
 
-def test_contacts_that_strike_together_are_told_together():
+def test_contacts_that_touch_together_are_told_together():
     """The last two kinds, the latest at the end; each contact once."""
 
     def event(time, kind, names):
         return RunEvent(time, kind, f"{names}: {kind.label}")
 
-    hits = [event(0.1 * k, RunEventKind.IMPACT, f"pad{1 + k % 3}, pad2") for k in range(5)]
+    hits = [event(0.1 * k, RunEventKind.TOUCH, f"pad{1 + k % 3}, pad2") for k in range(5)]
     opens = event(0.6, RunEventKind.OPENING, "pad1")
     limit = RunEvent(0.05, RunEventKind.LIMIT, "joint1 is at its limit")
-    assert told(hits) == "pad1, pad2, pad3: impact"
-    assert told([limit, *hits]) == "joint1 is at its limit; pad1, pad2, pad3: impact"
-    assert told([limit, *hits, opens]) == "pad1, pad2, pad3: impact; pad1: contact opens"
-    assert told([opens, hits[0]]) == "pad1: contact opens; pad1, pad2: impact"
+    assert told(hits) == "pad1, pad2, pad3: touch"
+    assert told([limit, *hits]) == "joint1 is at its limit; pad1, pad2, pad3: touch"
+    assert told([limit, *hits, opens]) == "pad1, pad2, pad3: touch; pad1: contact opens"
+    assert told([opens, hits[0]]) == "pad1: contact opens; pad1, pad2: touch"
     assert told([]) == ""

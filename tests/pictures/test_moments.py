@@ -16,12 +16,11 @@ from drake_dae.scenario.build import build_scenario
 from drake_dae.simulation.records.record import Record, Recorded
 from drake_dae.simulation.simulate import simulate
 from drake_dae.simulation.summary import Limits
-from drake_dae.systems.plants.contact_events import ContactChange, ContactEvent
 
 TIMES = np.linspace(0.0, 10.0, 101)
 
 
-def record(events=(), **signals):
+def record(**signals):
     given = {"control": np.zeros(101), "state": np.zeros(101), "constraint_force": np.ones(101)}
     found = {
         name: Recorded(
@@ -29,7 +28,7 @@ def record(events=(), **signals):
         )
         for name, values in {**given, **signals}.items()
     }
-    return Record(TIMES, found, events=tuple(events))
+    return Record(TIMES, found)
 
 
 def test_a_control_and_a_joint_at_their_limits_are_marked_where_they_come_there():
@@ -45,20 +44,6 @@ def test_a_control_and_a_joint_at_their_limits_are_marked_where_they_come_there(
     (stop,) = [one for one in found if "state0" in one.text]
     assert stop.time == pytest.approx(4.0)
     assert events_of(record(control=control, state=joint)) == []
-
-
-def test_events_of_contacts_are_marked_by_their_kind():
-    kinds = [ContactChange.OPENING, ContactChange.IMPACT, ContactChange.CLOSING]
-    events = [
-        ContactEvent(t, kind, ("tip",), (), (1.0,) if kind is ContactChange.IMPACT else ())
-        for t, kind in zip((1.0, 2.0, 3.0), kinds, strict=True)
-    ]
-    found = events_of(record(events, mode=np.ones(101), gap=np.zeros(101)))
-    assert [(one.time, one.kind) for one in found] == [
-        (1.0, RunEventKind.OPENING),
-        (2.0, RunEventKind.IMPACT),
-        (3.0, RunEventKind.TOUCH),
-    ]
 
 
 def test_compliant_contact_touches_and_opens_where_its_force_begins_and_ends():
@@ -79,28 +64,24 @@ def test_of_moments_that_follow_each_other_at_once_the_first_is_kept():
 
 def test_marks_stand_at_their_times_with_one_entry_in_the_legend():
     moments = [RunEvent(t, RunEventKind.LIMIT, "x") for t in (1.0, 2.0)] + [
-        RunEvent(3.0, RunEventKind.IMPACT, "y")
+        RunEvent(3.0, RunEventKind.TOUCH, "y")
     ]
     figure = plot_controls(record(), None, moments)
     (axis,) = figure.axes
     marks = [line for line in axis.lines if line.get_marker() == "^"]
     assert [line.get_xdata().tolist() for line in marks] == [[3.0], [1.0, 2.0]]
     (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["impact", "limit reached"]
+    assert [text.get_text() for text in legend.get_texts()] == ["touch", "limit reached"]
 
 
-def test_names_of_short_phases_stand_apart_and_above_impacts():
+def test_names_of_short_phases_stand_apart():
     phase = np.zeros((101, 4))
     for k, begin in enumerate((0, 50, 52, 54)):
         phase[begin:, k], phase[begin:, :k] = 1.0, 0.0
     one = record(phase=phase)
-    figure = plot_controls(one, None, [RunEvent(5.2, RunEventKind.IMPACT, "pad: impact")])
+    figure = plot_controls(one)
     mark_phases(figure, one)
     (axis,) = figure.axes
-    (line,) = (
-        one for one in axis.lines if one.get_linestyle() == "-" and set(one.get_xdata()) == {5.2}
-    )
-    assert all(text.get_zorder() > line.get_zorder() for text in axis.texts)
     figure.draw_without_rendering()
     boxes = [text.get_window_extent() for text in axis.texts]
     assert len(boxes) == 4

@@ -141,8 +141,8 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_plots_of_a_run_are_the_same_later(tmp_path):
-    """With the events of its contact, an impact among them."""
-    short = ["simulate", "wall_bounce", "--set=duration=1", "--set=write.animation=false"]
+    """With the touch of its contact."""
+    short = ["simulate", "wall_guarded", "--set=duration=1.2", "--set=write.animation=false"]
     folders = [tmp_path / name for name in ("at_once", "later")]
     for folder, plots in zip(folders, ("true", "false"), strict=True):
         assert main([*short, f"--set=write.plots={plots}", f"--out={folder}"]) == 0

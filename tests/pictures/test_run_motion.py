@@ -31,10 +31,7 @@ def test_a_path_around_a_sphere_is_seen_from_a_side(turns):
     acting = ConstraintWrenches(model, model.dae.parameter_values)
     wrenches = [acting(x, np.array([10.0]), p) for x, p in zip(states, parameters, strict=True)]
     times, nothing = np.arange(len(places)) * 0.1, np.zeros((0, 6))
-    flashes = np.zeros((len(places), 1))
-    course = RunMotion(
-        None, model, times, 0.0, states, parameters, wrenches, nothing, acting, flashes, {}
-    )
+    course = RunMotion(None, model, times, 0.0, states, parameters, wrenches, nothing, acting, {})
     (path,) = contact_paths(course)
     assert path.name == "ball"
     assert path.desired.shape == (0, 2)

@@ -168,12 +168,6 @@ def test_noise_is_no_touch(file, tmp_path, seed):
     assert abs(distance) < 1e-3
 
 
-def test_noise_without_samples_is_refused(file):
-    settings = ["plant=!Unilateral {restitution: {wall: 0.0}}", "sampling=null", "observer=null"]
-    with pytest.raises(ScenarioError, match=r"sampling: .*0\.3"):
-        build_scenario(load_scenario(file, settings))
-
-
 @pytest.mark.slow
 def test_a_study_varies_the_noise_that_a_task_knows(file, tmp_path):
     """Each run is that of its scenario alone: its low-pass is that of its own noise."""

@@ -37,7 +37,6 @@ SENSING = {
 }
 PLANTS = {
     "ideal": "",
-    "opening": "plant: !Unilateral {restitution: {wall: 0.5}}\n",
     "Drake's contact": "plant: !MultibodyPlant {time_step: 0.001}\n",
     "compliant": "plant: !CompliantContact {time_step: 0.001}\n",
     "continuous": "plant: !CompliantContact {time_step: 0, stiffness: 1.0e+4, "

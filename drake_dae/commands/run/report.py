@@ -152,7 +152,6 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
             _has_unknown_friction(scenario, loop)
         ),
         "the contact is compliant": not loop.plant.is_ideal,
-        "a contact was open": "mode" in record and not record["mode"].all(),
         "the force is measured by a sensor": scenario.force_feedback.is_measured,
         "the state is measured by encoders": scenario.encoders is not None,
         "the law is sampled": scenario.sampling is not None,

@@ -33,8 +33,8 @@ _RIM = 24  # The number of points on the rim of a drawn cone.
 def told(events: Sequence[RunEvent]) -> str:
     """The last two different texts of events, with the contacts of one kind together.
 
-    A face of several points strikes many times in a second: "pad1, pad3: impact" and "pad2:
-    impact" are "pad1, pad2, pad3: impact".
+    Several points touch together: "pad1, pad3: touch" and "pad2: touch" are "pad1, pad2, pad3:
+    touch".
     """
     names: dict[str, set[str]] = {}
     for event in events:

@@ -16,7 +16,6 @@ from drake_dae.pictures.scene.view import FRAME_RATE
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.surface import tangents
-from drake_dae.simulation.records.events import flashes
 from drake_dae.simulation.records.record import Record
 from drake_dae.systems.plants.contract import Plant
 
@@ -56,8 +55,6 @@ class RunMotion:
         desired: Link states at rest (q, 0) with the desired outputs, until these are out of reach,
             shape (j, nq + nv) with j <= k.
         acting: The function of the constraint wrenches, for the parameters at the start.
-        flashes: The brightness of each constraint's flash at an impact, 0 to 1, shape (k,
-            constraints).
         friction: Name of a constraint -> its coefficient of friction in the plant.
     """
 
@@ -70,7 +67,6 @@ class RunMotion:
     wrenches: Sequence[Wrenches]
     desired: FloatArray
     acting: ConstraintWrenches
-    flashes: FloatArray
     friction: Mapping[str, float]
 
     @property
@@ -162,18 +158,16 @@ def follow(
             replace(wrench, forces=force)
             for wrench, force in zip(wrenches, contact_forces, strict=True)
         ]
-    start_time, names = float(record.time[0]), [item.name for item in acting.constraints]
     return RunMotion(
         plant,
         model,
         times,
-        start_time,
+        float(record.time[0]),
         states,
         values,
         wrenches,
         _desired_states(model, states, desired, values),
         acting,
-        flashes(record.events, names, start_time + times),
         plant.friction(plant_context),
     )
 

@@ -130,8 +130,7 @@ class Constraint(ABC):
     14. `solids` and `layer` are the geometry for Drake's own contact: objects in the world that act
         on frame B of its first application at the point there.
     15. `touch` describes the contact point, if there is a free side; `residual` is then the
-        clearance of that point, except beyond the ends of a body that the law does not know. With
-        `ends`, `edges` are the distances of the foot of that point from the edges of the face.
+        clearance of that point.
     16. `add_to` adds it to a MultibodyPlant, if Drake has such a constraint.
 
     Attributes:
@@ -155,7 +154,7 @@ class Constraint(ABC):
     def sliding(self, kinematics: Kinematics) -> ca.SX | None:
         """The sliding velocity relative to the other object, m/s, shape (3, 1).
 
-        None without friction, or with friction of its own that impacts do not include.
+        None without friction.
         """
         return None
 
@@ -229,25 +228,6 @@ class Constraint(ABC):
     def touch(self, frames: Frames) -> Touch | None:
         """The contact point; None without a free side."""
         return None
-
-    @property
-    def ends(self) -> bool:
-        """Whether its surface has edges or holes, which the law does not know."""
-        return False
-
-    @property
-    def whole(self) -> Self:
-        """The same constraint with the surface that laws have, which does not end."""
-        return self
-
-    @property
-    def opening(self) -> tuple[float, float] | None:
-        """The radius and the chamfer of the hole in its surface in m; None without a hole."""
-        return None
-
-    def edges(self, frames: Frames) -> ca.SX:
-        """The distances of its point from the edges of its surface in m; see `Surface.edges`."""
-        return ca.SX(0, 1)
 
     @property
     def remark(self) -> str:

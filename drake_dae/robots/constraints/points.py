@@ -1,8 +1,7 @@
 """Points on a surface, and points at a fixed distance."""
 
-from copy import copy
 from dataclasses import dataclass, field
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -176,7 +175,7 @@ class PointOnSurface(Constraint):
             self.frame,
             self.point,
             self._normal(frames),
-            lambda point: self.surface.clearance(self.offset_of(point)),
+            lambda point: self.surface.distance(self.offset_of(point)),
             self.surface_velocity,
             self.surface.has_exact_distance,
         )
@@ -187,23 +186,6 @@ class PointOnSurface(Constraint):
             push, drag = push + frictional.pull, frictional.drag
         point = kinematics.position(self.frame, self.point)
         return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
-
-    @property
-    def ends(self) -> bool:
-        return self.surface.ends
-
-    @property
-    def whole(self) -> Self:
-        changed = copy(self)
-        object.__setattr__(changed, "surface", self.surface.whole)
-        return changed
-
-    @property
-    def opening(self) -> tuple[float, float] | None:
-        return self.surface.opening
-
-    def edges(self, frames: Frames) -> ca.SX:
-        return self.surface.edges(self.offset(frames))
 
     @property
     def remark(self) -> str:

@@ -46,17 +46,13 @@ class Surface(ABC):
        same surface with other values, numbers or symbols.
     7. `solids` are Drake shapes that together fill the side opposite to the free one, for Drake's
        own contact; convex if there are several. A surface may have none. `layer` is a mesh below a
-       piece of any smooth surface, for hydroelastic contact. `clearance` is the signed distance
-       from the body that compliant plants use. It differs from `distance` where a body ends, which
-       laws do not know; then `ends` is true, and `edges` are the distances of the foot of a point
-       from the edges of its face: smooth, and all positive on the face.
+       piece of any smooth surface, for hydroelastic contact.
     8. `remark` describes its approximations, if any, and `extent` is the range of coordinates in
        which it is defined, if that is bounded.
     """
 
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
     has_exact_distance: ClassVar[bool] = False
-    ends: ClassVar[bool] = False
 
     @property
     @abstractmethod
@@ -148,32 +144,6 @@ class Surface(ABC):
         )
         grid = self._piece(place, size, (along, across))
         return layer_below(grid, self._linear(), depth)
-
-    def clearance(self, offset: ca.SX) -> ca.SX:
-        """The signed distance of a point from the body in m; the `distance` if it does not end.
-
-        Args:
-            offset: As for `distance`.
-        """
-        return self.distance(offset)
-
-    @property
-    def whole(self) -> "Surface":
-        """The surface that laws have in its place, which does not end; itself if it does not."""
-        return self
-
-    @property
-    def opening(self) -> Pair | None:
-        """The radius of its round hole and the width of the chamfer in m; None without a hole."""
-        return None
-
-    def edges(self, offset: ca.SX) -> ca.SX:
-        """The distances of the foot of a point from the edges in m; none without an edge.
-
-        Args:
-            offset: As for `distance`.
-        """
-        return ca.SX(0, 1)
 
     def _lengths(self, size: float) -> Pair:
         """The lengths of the sides of a piece in m: `size`, if the surface is unbounded."""

@@ -91,7 +91,7 @@ def _reason(
         if not isinstance(call.block.system, ParameterizedSystem) or PARAMETERS not in given:
             return error
         inputs = [given["control"]] if "control" in given else []
-        return call.block.system.explained(error, given[PARAMETERS], *inputs, held=given.get(HELD))
+        return call.block.system.explained(error, given[PARAMETERS], *inputs)
     return None
 
 

@@ -43,7 +43,6 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
     if program.compiled.changes and np.isnan(held).any():
         # The initialization of a block need not be an expression.
         begun = context.Clone()
-        begun.SetAccuracy(1e-9)
         program.compiled.diagram.ExecuteInitializationEvents(begun)
         held = np.where(np.isnan(held), program.compiled.start(begun)[1], held)
     held = program.compiled.initialized(context.get_time(), state, held, values)
@@ -236,10 +235,9 @@ def _project(
     held: FloatArray,
 ) -> FloatArray:
     """Returns the projection of a state onto N*, by one thread at a time."""
-    projected, places = state.copy(), dict(compiled.held)
+    projected = state.copy()
     with lock:
         for part, values, block in _plants(compiled, time, state, held, parameters):
             if block.projection is not None:
-                held_by_block = held[places.get(block.system, slice(0, 0))]
-                projected[part] = block.projection.project(state[part], values, held_by_block)
+                projected[part] = block.projection.project(state[part], values)
     return projected

@@ -3,7 +3,7 @@
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from threading import RLock
 from typing import Any, TypeVar
 
@@ -114,7 +114,7 @@ def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
             loop.memory["program"] = RolloutProgram(
                 compile_diagram(loop.diagram, list(loop.signals)),
                 loop.signals,
-                partial(_completed, loop),
+                loop.with_errors,
                 loop.plant.get_name(),
                 loop.plant.dae.compiled,
                 ends_updated=not loop.plant.time_step,
@@ -133,12 +133,3 @@ def _of_diagram(diagram: Diagram) -> RolloutProgram:
         )
     name = diagram.get_name() or "the diagram"
     return RolloutProgram(compiled, compiled.signals, lambda record, context: record, name)
-
-
-def _completed(loop: ClosedLoop, record: Record, context: Context | None) -> Record:
-    """Adds errors, and what happened to contacts."""
-    complete = loop.with_errors(record, context)
-    if context is None or not complete.time.size:
-        return complete
-    events = loop.plant.events(loop.plant.GetMyContextFromRoot(context))
-    return replace(complete, events=tuple(e for e in events if e.time <= complete.time[-1]))

@@ -53,8 +53,8 @@ class Rollout:
     Attributes:
         steps: The number of its steps.
         failure: The reason of an early end, with time and state; None if it reached its end.
-        context: The diagram's context after the run, if it has blocks that change at times to be
-            located: contacts that open, and phases of a task. Otherwise None.
+        context: The diagram's context after the run, if it has blocks with changes at samples, as
+            phases of a task. Otherwise None.
     """
 
     steps: int
@@ -245,7 +245,7 @@ def _runs(
     else:
         run = partial(interpreted.run, functions_of(program), settings)
     if program.compiled.changes:
-        run = partial(run_with_changes, functions_of(program), run, settings.tableau)
+        run = partial(run_with_changes, functions_of(program), run)
     if program.compiled.has_stepped:
         run = partial(run_stepped, functions_of(program), code, settings=settings)
     if code is None or len(problems) == 1 or program.compiled.has_stepped:

@@ -133,7 +133,6 @@ class RunProblem:
         due: The rates that are due at each update, as bits.
         noise: The random numbers of each update, shape (len(events), number of entries).
         project: (time, state, held) -> the state on N*; raises InconsistentStateError.
-        has_reacted: Whether blocks have reacted already to the guards at the start.
         earlier: In a piece of a run, the rows of all pieces before. The first row of the piece is
             then no row of the record.
         context: The Drake context of blocks that react; None without such blocks.
@@ -147,7 +146,6 @@ class RunProblem:
     due: np.ndarray
     noise: FloatArray
     project: Callable[[float, FloatArray, FloatArray], FloatArray]
-    has_reacted: bool = False
     earlier: tuple[FloatArray, ...] = ()
     context: Context | None = None
 
@@ -168,7 +166,7 @@ class Run:
         event: The number of updates made.
         steps: The number of accepted steps.
         mark: The time a thousand steps ago, in s.
-        next: The end of a step that was not accepted, in s; `time` if a guard triggered before it.
+        next: The end of a step that was not accepted, in s.
         trial_time, trial: The earliest trial after `time` that failed; not finite if none did.
         context: A Drake context after the run, if blocks reacted to changes.
         error: An exception that a block raised.

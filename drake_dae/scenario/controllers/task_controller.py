@@ -8,6 +8,7 @@ from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.task.contacts.open_contact import open_contact
 from drake_dae.systems.task.controller import TaskController
@@ -24,6 +25,12 @@ def check_task(scenario: Scenario) -> None:
     if (task := scenario.task) is not None:
         names = [name for name in task.make().signals if name not in task.signals]
         problems += [(f"task.signals.{name}", "needed: a phase watches it") for name in names]
+    if isinstance(scenario.plant, IdealConstraints):
+        text = (
+            "ideal constraints neither open nor strike, as a task needs it: take !CompliantContact "
+            "or !MultibodyPlant"
+        )
+        problems.append(("plant", text))
     if scenario.start.errors:
         problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if problems:
@@ -48,12 +55,6 @@ def task_controller(
     assert task is not None
     assert scenario.gains is not None  # advised.
     noise = float(np.max(np.asarray(getattr(scenario.force_feedback, "noise_deviation", 0.0))))
-    if noise and not period:
-        text = (
-            f"needed: the force sensor has noise of {noise:g} N, which a task without samples "
-            "cannot filter, and would take for a touch"
-        )
-        raise ScenarioError(("sampling", text))
     points = opening_contact(scenario, model)
     forces = [signal.name for point in points for signal in point.force_signals]
     with at("task"):

@@ -12,7 +12,7 @@ from drake_dae.dae import references
 from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
 from drake_dae.robots import constraints as contact
 from drake_dae.robots.constraints import friction
-from drake_dae.robots.surfaces import implicit, measured, plate, surface, surfaces
+from drake_dae.robots.surfaces import implicit, measured, surface, surfaces
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
@@ -21,7 +21,7 @@ from drake_dae.scenario.parts import written
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.robot_file import payloads
 from drake_dae.systems.control import sampling
-from drake_dae.systems.plants.contact import contact_material, disturbance_forces
+from drake_dae.systems.plants.contact import disturbance_forces
 from drake_dae.systems.sensing import encoders
 from drake_dae.systems.task import phases
 
@@ -31,17 +31,15 @@ from drake_dae.systems.task import phases
 _WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, surface.Pair: Pair}
 _LISTED: dict[Any, Any] = {**_WRITTEN, Sequence[str]: list[str]}
 
-_Hole = Annotated[plate.Hole, Form(_WRITTEN)]
 Surface = Annotated[
     surfaces.Plane
-    | plate.Plate
     | surfaces.Sphere
     | surfaces.Cylinder
     | surfaces.Ellipsoid
     | surfaces.Torus
     | implicit.ImplicitSurface
     | measured.MeasuredSurface,
-    Choice({**_WRITTEN, Callable[..., SX] | str: str, plate.Hole: _Hole}),
+    Choice({**_WRITTEN, Callable[..., SX] | str: str}),
 ]
 Constraint = Annotated[
     contact.PointOnSurface
@@ -94,16 +92,9 @@ Payload = Annotated[payloads.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 FrictionCone = Annotated[friction.FrictionCone, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
-_Pegs = Annotated[
-    tuple[Annotated[contact_material.Peg, Form(_WRITTEN)], ...], pydantic.Strict(False)
-]  # In data a tuple is a list.
 Plant = Annotated[
-    plants.IdealConstraints
-    | plants.MultibodyPlant
-    | plants.CompliantContact
-    | plants.Unilateral
-    | plants.OwnPlant,
-    Choice({Sequence[contact_material.Peg]: _Pegs}),
+    plants.IdealConstraints | plants.MultibodyPlant | plants.CompliantContact | plants.OwnPlant,
+    Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
 Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]

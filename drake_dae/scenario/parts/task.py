@@ -20,8 +20,8 @@ class ScenarioTask:
     It starts at rest at start.positions, or in contact near them if the first phase requires
     contact. Without start.positions it starts 20 mm before the surface, with the first reference of
     each output. While the contact is open, its distance, such as "wall.distance", is an output in
-    place of its force, and so is each distance of several points. With ideal constraints in `plant`
-    the contact opens and closes without bouncing.
+    place of its force, and so is each distance of several points. `plant` has a contact that opens,
+    such as `!CompliantContact`.
 
     Attributes:
         phases: The phases in their order; after the last one the robot rests.

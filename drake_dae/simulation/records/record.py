@@ -19,9 +19,7 @@ from drake_dae.errors import ModelError
 from drake_dae.files import MOST_RECORDED, check_file, open_file
 from drake_dae.simulation.records.columns import Recorded as Recorded
 from drake_dae.simulation.records.columns import label, read_csv, write_csv
-from drake_dae.simulation.records.events import event_arrays, event_rows, events_of_arrays
 from drake_dae.simulation.records.versions import versions
-from drake_dae.systems.plants.contact_events import ContactEvent
 
 
 def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:
@@ -34,7 +32,7 @@ def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded
 def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Record":
     """A record that the library itself has computed, made without checks of the arguments."""
     record = object.__new__(Record)
-    vars(record).update(time=time, signals=signals, events=(), about={})
+    vars(record).update(time=time, signals=signals, about={})
     return record
 
 
@@ -44,23 +42,19 @@ class Record:
     """All signals of a run at the ends of the integrator's steps.
 
     The file `record.npz` can be read with NumPy: `numpy.load("record.npz")` has "time" in s, and
-    for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units". Events are
-    in "events.time", "events.kind", "events.impulses" and others. "about" is JSON with the versions
-    of the software and, if the command made the run, the scenario with all seeds.
-
-    Velocities jump at impacts: the sample at the time of an impact has the values before it.
+    for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units". "about"
+    is JSON with the versions of the software and, if the command made the run, the scenario with
+    all seeds.
 
     Attributes:
         time: The times in s, shape (k,), strictly increasing.
         signals: Name of a signal -> its values.
-        events: The events of opening contacts, in the order of time.
         about: The data to repeat the run: "versions" of the library, its dependencies and the
             machine, which `save` adds; and "scenario", if it is known.
     """
 
     time: FloatArray
     signals: Mapping[str, Recorded]
-    events: tuple[ContactEvent, ...] = ()
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -112,8 +106,7 @@ class Record:
     def _extent(self) -> str:
         if not self.time.size:
             return "empty"
-        events = f", {len(self.events)} events" if self.events else ""
-        return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s{events}"
+        return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s"
 
     @checked(ModelError)
     def after(self, time: float | None) -> Self:
@@ -121,30 +114,21 @@ class Record:
         if time is None:
             return self
         first = int(np.searchsorted(self.time, time, side="right"))
-        return self._rows(slice(first, None), [event for event in self.events if event.time > time])
+        return self._rows(slice(first, None))
 
     def while_finite(self) -> Self:
         """The record up to the first time at which some signal is not finite."""
         count = _finite_rows(self.time.size, [r.values for r in self.signals.values()])
         if count == self.time.size:
             return self
-        last = self.time[count - 1] if count else -np.inf
-        return self._rows(slice(count), [event for event in self.events if event.time <= last])
+        return self._rows(slice(count))
 
-    def _rows(self, rows: slice, events: Sequence[ContactEvent]) -> Self:
+    def _rows(self, rows: slice) -> Self:
         signals = {
             name: recorded_values(recorded.values[rows], recorded.signals)
             for name, recorded in self.signals.items()
         }
-        return type(self)(self.time[rows], signals, tuple(events), self.about)
-
-    def event_rows(self) -> list[dict[str, Any]]:
-        """The events as rows of plain values, for `pandas.DataFrame` or a `csv.DictWriter`.
-
-        Each has "time [s]", "event", "contacts" (of the event) and "closed" (after it), separated
-        by commas, "impulse [N s]" (the sum of theirs) and "energy lost [J]".
-        """
-        return event_rows(self.events)
+        return type(self)(self.time[rows], signals, self.about)
 
     @classmethod
     def from_log(
@@ -197,7 +181,6 @@ class Record:
             arrays[name] = recorded.values
             arrays[f"{name}.names"] = np.array([s.name for s in recorded.signals], dtype=str)
             arrays[f"{name}.units"] = np.array([s.unit for s in recorded.signals], dtype=str)
-        arrays |= event_arrays(self.events)
         arrays["about"] = np.array(json.dumps({"versions": versions(), **self.about}))
         np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
@@ -206,7 +189,6 @@ class Record:
         """Writes the record as text: a line of names with units, then one line for each time.
 
         The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
-        Events are not among them; see `event_rows`.
         """
         write_csv(path, self.time, self.signals)
 
@@ -287,7 +269,7 @@ class Record:
                 names = [key for key in file.files if f"{key}.names" in file.files]
                 signals = {name: _read(file, name) for name in names}
                 about = json.loads(str(file["about"])) if "about" in file.files else {}
-                return cls(file["time"], signals, events_of_arrays(file), about)
+                return cls(file["time"], signals, about)
         except Exception as error:  # zip files, NumPy's headers and JSON raise many kinds.
             text = getattr(error, "strerror", None) or f"{error}; it may be cut off or damaged"
             raise ModelError(f"{path} is not a record of a run: {text}") from None
@@ -334,7 +316,7 @@ def _read_rows(file: BinaryIO, kind: type[R]) -> R:
     time, *columns = np.split(rows[:whole], stops, axis=1)[:-1]
     pairs = zip(named.items(), columns, strict=True)
     recorded = {name: Recorded(values, signals) for (name, signals), values in pairs}
-    return kind(time[:, 0], recorded, (), head.get("about", {}))
+    return kind(time[:, 0], recorded, head.get("about", {}))
 
 
 def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:

@@ -186,7 +186,6 @@ class ParameterizedSystem(DifferentiableSystem):
         error: SimulationError,
         parameters: FloatArray,
         *inputs: FloatArray,
-        held: FloatArray | None = None,
     ) -> SimulationError:
         """Returns the error of a function without a value, or a more precise one.
 
@@ -194,7 +193,6 @@ class ParameterizedSystem(DifferentiableSystem):
             error: The error, with time and state.
             parameters: Values of all parameters.
             inputs: The other inputs of the function, such as the control.
-            held: The discrete state; that of the last evaluation if None.
         """
         return error
 

@@ -21,8 +21,8 @@ DERIVATIVE = "$derivative"
 """The time derivative of a block's continuous state, among the outputs of its computations; the
 next discrete state is HELD there."""
 
-MARGINS, GAPS, RATES = "$margins", "$gaps", "$rates"
-"""The outputs of a guard; see `Guard`."""
+MARGINS = "$margins"
+"""The output of a guard; see `Guard`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +87,16 @@ class Projection:
     """The projection of a block's state onto a manifold at the start of each step.
 
     Attributes:
-        newton: (state, start, parameters, held) -> a Newton step in units of `scale`, with the
+        newton: (state, start, parameters) -> a Newton step in units of `scale`, with the
             gradients at the start.
         scale: The sizes of the states, shape (n,).
-        project: (state, parameters, held) -> the state on the manifold, if Newton's steps do not
+        project: (state, parameters) -> the state on the manifold, if Newton's steps do not
             converge; raises InconsistentStateError.
     """
 
     newton: ca.Function
     scale: FloatArray
-    project: Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+    project: Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,22 +114,18 @@ class TracedChanges:
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """A change of a block's states at a time that a run must locate.
+    """A change of a block's states at one of its updates, in place of that update.
 
     Attributes:
-        computation: Its outputs are MARGINS, numbers that are positive until the block changes;
-            GAPS, any number of distances that must not be negative, even within a step; and RATES,
-            their derivatives.
+        computation: Its output is MARGINS, numbers that are positive until the block changes.
         react: (context, state) -> the status of Drake's event. It reads the block's context, and
-            changes a copy of its state. It stores events for a record in the context.
-        in_samples: Whether it is evaluated only at the updates of the block, in place of these.
-        reaction: Returns the changes as functions; None if only `react` knows them.
+            changes a copy of its state.
+        reaction: Returns the changes as functions.
     """
 
     computation: Computation
     react: Callable[[Context, State], EventStatus]
-    in_samples: bool = False
-    reaction: Callable[[], TracedChanges] | None = None
+    reaction: Callable[[], TracedChanges]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +174,7 @@ class Block:
         scale: The sizes of its continuous states, shape (n,); ones if None.
         unwired: Name of an input port -> its value if it has neither a wire nor a fixed value.
         moving: The indices of its parameters that come through an input port "exogenous".
-        guard: Its changes at times that a run must locate; None if there are none.
+        guard: Its changes at some of its updates; None if there are none.
         stepped: The part that Drake steps; None if all of it is traced.
         begins: Whether `initial` gives HELD at the start of each run, whatever the context has.
         draws: Whether its update uses new random numbers.
@@ -210,8 +206,8 @@ class Block:
     ports: Mapping[str, tuple[Signal, ...]] = field(default_factory=dict)
 
     def with_reaction(self) -> "Block":
-        """The same block; its updates make the changes of its guard if it has `TracedChanges`."""
-        if self.guard is None or self.guard.reaction is None:
+        """The same block; its updates make the changes of its guard."""
+        if self.guard is None:
             return self
         reaction = self.guard.reaction()
         begin, update = reaction.begin, reaction.update
@@ -247,8 +243,8 @@ class Traced(Protocol):
        in agreement with Drake's `HasDirectFeedthrough`.
     6. Outputs that cannot be traced are omitted; a block that cannot be traced at all raises a
        ModelError with the reason, in one sentence.
-    7. A block whose states change at other times has a guard, whose margins fall through zero at
-       the times that Drake's Simulator locates.
+    7. A block that changes at some of its updates otherwise has a guard, one of whose margins is
+       not positive at these.
     """
 
     def traced(self) -> Block:

@@ -17,7 +17,6 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.block import check_context
-from drake_dae.systems.plants.contact_events import ContactEvent
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System
@@ -42,39 +41,29 @@ class Plant(System):
        `constraint_force`, `constraint_residual` and `controlled_output` have the entries of
        `dae.state_signals`, `dae.force_signals`, `structure.manifold.residual_signals` and
        `dae.output_signals`.
-    2. System. `dae` is the system, and `structure` its structure with all contacts closed.
-    3. Robots. `model` is the robot of the system `dae`; then the output port `link_state` is (q, v)
-       of its links. It is None for other plants.
-    4. State and steps. `time_step` is the time between its steps in s, 0 for a continuous plant.
-       `state` returns x, shape (n,). A discrete plant uses at each step the control of that
-       instant.
-    5. Records. `further_signals` are the output ports in a record besides those of rule 1, with
-       names and units of their entries.
-    6. Computed afterwards. `functions` names the output ports that `along` computes from the log:
-       "state", "control", "parameters" and the ports of rule 5 that are not among `functions`. For
-       a plant without functions everything is logged at its steps.
-    7. Exogenous signals. Exogenous parameters come through an input port `exogenous`, stacked by
+    2. System. `dae` is the system, and `structure` its structure. `model` is its robot, if it is
+       one; then the output port `link_state` is (q, v) of its links.
+    3. State. `time_step` is the time between its steps in s, 0 for a continuous plant. `state`
+       returns x, shape (n,). A discrete plant uses at each step the control of that instant.
+       `projects` says whether the state is projected onto N* after each step; a record then has the
+       state before the projection.
+    4. Records. `further_signals` are the output ports in a record besides those of rule 1, with
+       names and units of their entries. `functions` names the output ports that `along` computes
+       afterwards from the log: "state", "control", "parameters" and the further ports that are not
+       among `functions`. For a plant without functions everything is logged at its steps.
+    5. Exogenous signals. Exogenous parameters come through an input port `exogenous`, stacked by
        `exogenous_layout`, in place of those at `exogenous_places`. Without a wire they keep their
        values. A plant without such a port has an empty layout and no places.
-    8. Parameters. `parameters` are those of a context in the order of `dae.parameters`,
+    6. Parameters. `parameters` are those of a context in the order of `dae.parameters`,
        `current_parameters` the same with the current exogenous ones, and `parameters_along` those
        at the times of a run. `set_parameter` changes one in a context; a plant with fixed numbers
        refuses. `further_parameters` are those that follow them in numeric parameter 0 and may be
        identified, each with its place there.
-    9. Starts. `set_state` sets x as given. `set_consistent_state` sets the state on N* next to a
-       guess, with all contacts closed, and returns it. Both refuse wrong shapes.
-    10. Opening contacts. `contacts` names the contacts that open and close, in the order of the
-        output port `mode`, whose entries are 1 for closed and 0 for open; `normals` are the indices
-        of their forces in `constraint_force`. While one is open its force is zero, and the integral
-        of its error in a law is not updated. `events` are their events in a run. A plant without
-        such contacts has empty lists.
-    11. Projection. `projects` says whether the state is projected onto N* after each step; a record
-        then has the state before the projection.
-    12. Contact. `is_ideal` says whether the constraints hold exactly while contacts are closed.
-    13. Live view. `add_own_view` adds the plant's own part of the Meshcat view, besides links,
-        surfaces and constraint forces.
-    14. Friction. `friction` are the coefficients of friction of contacts, those of the plant, which
-        the law may not know; not negative.
+    7. Starts. `set_state` sets x as given. `set_consistent_state` sets the state on N* next to a
+       guess, and returns it. Both refuse wrong shapes.
+    8. Contact. `is_ideal` says whether the constraints hold exactly. `friction` are the
+       coefficients of friction of contacts, those of the plant, which the law may not know; not
+       negative. `add_own_view` adds the plant's own part of the Meshcat view.
     """
 
     __slots__ = ()
@@ -86,8 +75,6 @@ class Plant(System):
     functions: Collection[str] = ()
     exogenous_layout: DerivativeLayout = DerivativeLayout(())
     exogenous_places: list[int] = NOWHERE
-    contacts: tuple[str, ...] = ()
-    normals: tuple[int, ...] = ()
     projects: bool = False
     is_ideal: bool = True
 
@@ -173,10 +160,6 @@ class Plant(System):
         state = self.structure.manifold.settle(guess, self.current_parameters(context))
         self.set_state(context, state)
         return state
-
-    def events(self, context: Context) -> tuple[ContactEvent, ...]:
-        """The events of contacts since the start of the run of a context."""
-        return ()
 
     @property
     def port_signals(self) -> dict[str, tuple[Signal, ...]]:

@@ -218,7 +218,6 @@ class DaePlant(ParameterizedSystem, Plant):
         error: SimulationError,
         parameters: FloatArray,
         *inputs: FloatArray,
-        held: FloatArray | None = None,
     ) -> SimulationError:
         """Returns the error with dependent constraints, or in a Painleve paradox its outcome."""
         if not isinstance(error, SingularityError):

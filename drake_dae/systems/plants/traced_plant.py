@@ -1,7 +1,6 @@
 """The computations of the plant of a DaeSystem, as traced functions.            (1)-(3), (25)"""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 
 import casadi as ca
 
@@ -73,7 +72,7 @@ def traced_plant(
     computations.append(Computation(same, (STATE,), ("state",)))
     projection = None
     if projects:
-        projection = Projection(newton_of(manifold), dae.scale, partial(_project, manifold))
+        projection = Projection(newton_of(manifold), dae.scale, manifold.project)
     return Block(
         plant,
         tuple(computations),
@@ -88,13 +87,7 @@ def traced_plant(
 
 
 def newton_of(manifold: Manifold) -> ca.Function:
-    """A Newton step to a manifold, as a `Projection` has it, whatever a block holds."""
+    """A Newton step to a manifold, as a `Projection` has it."""
     step = manifold.newton_step
     inputs = [ca.SX.sym(*item) for item in zip(step.input_names, step.sizes, strict=True)]
-    return ca.Function("newton", [*inputs, ca.SX(0, 1)], step.function.call(inputs)[:1])
-
-
-def _project(
-    manifold: Manifold, state: FloatArray, parameters: FloatArray, held: FloatArray
-) -> FloatArray:
-    return manifold.project(state, parameters)
+    return ca.Function("newton", inputs, step.function.call(inputs)[:1])

@@ -1,6 +1,7 @@
 """A task as a controller: the law in contact, the law of the free robot, and a supervisor."""
 
 from collections.abc import Callable, Mapping, Sequence
+from math import inf
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,20 +14,19 @@ from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.systems.blocks.switch import LawSwitch
-from drake_dae.systems.control.contract import Compared, Controller, Derived
+from drake_dae.systems.control.contract import Compared, Controller, Derived, check_same_sizes
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.task.contacts.fit import check_plant_of_task
 from drake_dae.systems.task.contacts.open_contact import CONTACT, FREE, LAWS, contact_laws
 from drake_dae.systems.task.contacts.outputs import TaskOutputs
 from drake_dae.systems.task.progress import ReferenceSegment, places_at
 from drake_dae.systems.task.supervisor import TaskSupervisor
-from drake_dae.systems.task.task import Task, check_sampled
+from drake_dae.systems.task.task import Task
 
 
 @checked(ModelError)
@@ -52,9 +52,8 @@ class TaskController(Diagram, Controller):
 
     Of a plant it needs only the state x and the measured constraint forces. If the laws are for a
     system with a disturbance, one observer serves both, since its equation contains the measured
-    force and so holds for closed and open contacts. Drake's Simulator finds the guards as zeros of
-    a witness function, which needs a context with an accuracy, as `simulate` sets it; or they are
-    evaluated at samples. The whole history of a run is in its context.
+    force and so holds for closed and open contacts. Guards are evaluated at samples. The whole
+    history of a run is in its context.
 
     Input ports:
         estimated_state: x, shape (n,).
@@ -84,7 +83,7 @@ class TaskController(Diagram, Controller):
             contact may have several points, which open and close together: then as many outputs
             are forces, one of them their sum.
         free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
-        sample_period: The period of guards and integrals of errors, in s; 0 for continuously.
+        sample_period: The period of guards and integrals of errors, in s.
 
     Attributes:
         task, law, free_law, sample_period: The arguments.
@@ -108,10 +107,14 @@ class TaskController(Diagram, Controller):
         law: TrackingLaw,
         free_law: TrackingLaw,
         *,
-        sample_period: float = 0.0,
+        sample_period: float,
     ) -> None:
         super().__init__()
-        check_sampled(task, sample_period)
+        if not 0.0 < sample_period < inf:
+            raise ModelError(
+                f"sample_period must be positive, got {sample_period:g} s: contact may be lost and "
+                "regained at any time, so that a task decides in samples (in a scenario: sampling)"
+            )
         self.task, self.law, self.free_law = task, law, free_law
         self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
         self.sample_period = sample_period
@@ -252,7 +255,12 @@ class TaskController(Diagram, Controller):
         return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
 
     def check_plant(self, plant: Plant) -> None:
-        check_plant_of_task(self.law.system, self.sample_period, plant)
+        check_same_sizes(plant.dae, self.law.system, "task", "the laws for the plant's robot")
+        if plant.is_ideal:
+            raise WiringError(
+                "a task needs a contact that opens, and constraints of this plant hold exactly: "
+                "take a CompliantPlant or a ContactPlant (in a scenario: plant: !CompliantContact)"
+            )
 
     def derived(
         self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
@@ -261,8 +269,7 @@ class TaskController(Diagram, Controller):
 
         The outputs are the positions, the forces and the distances of the contact; in contact the
         desired distances are zero, otherwise the desired forces. "distance" has the distances, then
-        their derivatives, "phase" is 1 for the current phase and 0 for all others,
-        "predicted_error" is that of `predicted_errors`.
+        their derivatives, and "phase" is 1 for the current phase and 0 for all others.
         """
         signals, columns = self.output_signals, self.columns
         every = function_along(self.outputs, {**values, "force": values["constraint_force"]})

@@ -10,9 +10,6 @@ from pydrake.systems.framework import (
     EventStatus,
     LeafSystem,
     State,
-    UnrestrictedUpdateEvent,
-    WitnessFunction,
-    WitnessFunctionDirection,
 )
 
 from drake_dae.arrays import FloatArray
@@ -30,7 +27,7 @@ from drake_dae.systems.task.phases.phase import FAIL, LEAVE, STOP
 from drake_dae.systems.task.planner import ModelMoment, PhaseCause, TaskPlanner
 from drake_dae.systems.task.progress import ReferenceSegment, TaskProgress
 from drake_dae.systems.task.task import Task
-from drake_dae.systems.task.traced import EARLY, NAMES
+from drake_dae.systems.task.traced import NAMES
 from drake_dae.systems.task.transition import SampledTask
 
 
@@ -58,7 +55,7 @@ class TaskSupervisor(LeafSystem):
         pair: The laws of the robot with and without its contact.
         columns: The places of their outputs in a record.
         num_forces: The number of all measured forces.
-        sample_period: The period at which guards are evaluated, in s; 0 for continuously.
+        sample_period: The period at which guards are evaluated, in s.
 
     Attributes:
         signal_ports: Name of a signal -> its input port.
@@ -99,19 +96,7 @@ class TaskSupervisor(LeafSystem):
         self._index = self.DeclareAbstractState(AbstractValue.Make(TaskProgress()))
         self._held = self.DeclareDiscreteState(self._traced.size)
         self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
-        self._witnesses: list[WitnessFunction] = []
-        if sample_period > 0.0:
-            self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._advance))
-        else:
-            self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._advance))
-            self._witnesses.append(
-                self.MakeWitnessFunction(
-                    "the end of the phase",
-                    WitnessFunctionDirection.kPositiveThenNonPositive,
-                    weakly(self._guard),
-                    UnrestrictedUpdateEvent(weakly(self._at_guard)),
-                )
-            )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._advance))
         self._declare_outputs()
 
     def _declare_outputs(self) -> None:
@@ -151,9 +136,6 @@ class TaskSupervisor(LeafSystem):
         progress: TaskProgress = context.get_abstract_state(self._index).get_value()
         return progress
 
-    def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
-        return self._witnesses
-
     def _now(self, context: Context) -> ModelMoment:
         parameters = context.get_numeric_parameter(0).CopyToVector()
         if self._moving and self.GetInputPort("exogenous").HasValue(context):
@@ -191,18 +173,6 @@ class TaskSupervisor(LeafSystem):
         held = context.get_discrete_state(self._held).value()
         return PhaseDecision.of(self._traced, progress, moment, context.get_time(), held)
 
-    def _guard(self, context: Context) -> float:
-        """A number that is positive until the phase ends: Drake locates its zero."""
-        progress = self.progress(context)
-        if not progress.segments:
-            return 1.0
-        # A little early: Drake's Simulator ends the process if it finds a zero at the very end of
-        # a step at which a sample is due.
-        least = float(np.min(self._decision(context, progress).margins)) - EARLY
-        # Drake sees a value that jumped with an event, such as the force of an impact, only if its
-        # sign was different at the start of the step.
-        return 1.0 if least <= 0.0 and context.get_time() == progress.step else least
-
     def _is_over(self, segment: ReferenceSegment) -> bool:
         return segment.change.place >= len(self._phases)
 
@@ -221,14 +191,9 @@ class TaskSupervisor(LeafSystem):
         self._put(state, progress, np.zeros(self._traced.filter.size))
         return EventStatus.Succeeded()
 
-    def _at_guard(
-        self, context: Context, event: UnrestrictedUpdateEvent, state: State
-    ) -> EventStatus:
-        return self._advance(context, state)
-
     def _advance(self, context: Context, state: State) -> EventStatus:
         progress, time = self.progress(context), context.get_time()
-        if self._sample_period and time == progress.step:
+        if time == progress.step:
             return EventStatus.DidNothing()  # A continued run begins with the last sample.
         force, decision = self._filtered(context), self._decision(context, progress)
         status, segments = EventStatus.Succeeded(), progress.segments
@@ -315,14 +280,12 @@ class TaskSupervisor(LeafSystem):
 
     def traced(self) -> Block:
         period, traced = self._sample_period, self._traced
-        updates = (Update(traced.unchanged(), period, 0.0, True),) if period else ()
-        reaction = partial(traced.reaction, period) if period else None
         unwired = ["hold", *(port.get_name() for port in self.signal_ports.values())]
         return Block(
             self,
             traced.computations(),
-            updates,
-            guard=Guard(traced.guard(), self._advance, bool(period), reaction),
+            (Update(traced.unchanged(), period, 0.0, True),),
+            guard=Guard(traced.guard(), self._advance, partial(traced.reaction, period)),
             unwired={name: zero(name) for name in unwired},
             moving=tuple(self._moving),
             ports={name: (Signal(name),) for name in ("phase", "ending")},

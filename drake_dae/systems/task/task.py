@@ -140,29 +140,3 @@ class Task:
             f"{index + 1}. {phase.name}, until {phase.awaits(self.contact_force)}"
             for index, phase in enumerate(self.phases)
         )
-
-
-def check_sampled(task: Task, sample_period: float) -> None:
-    """Refuses a continuous task that needs samples.
-
-    Args:
-        task: The task.
-        sample_period: The sample period, in s; 0 for none.
-
-    Raises:
-        ModelError: The period is not valid, or it is 0 and the task needs samples.
-    """
-    if not 0.0 <= sample_period < inf:
-        raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
-    if sample_period:
-        return
-    needs = {
-        "force_noise": (task.force_noise, "noise and bias of a force are found in samples"),
-        "tare_time": (task.tare_time, "noise and bias of a force are found in samples"),
-    }
-    for name, (is_needed, why) in needs.items():
-        if is_needed:
-            raise ModelError(
-                f"{name}: {why}, and this task acts continuously; leave it out, or give a "
-                "sample_period (in a scenario: sampling)"
-            )

@@ -9,11 +9,9 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.traced import (
-    GAPS,
     HELD,
     MARGINS,
     PARAMETERS,
-    RATES,
     TIME,
     Computation,
 )
@@ -58,7 +56,7 @@ class TracedTask:
         task, pair, columns: Those of the supervisor.
         plan: The planner of its references.
         num_forces: The number of measured constraint forces.
-        sample_period: The period at which guards are evaluated, in s; 0 for continuously.
+        sample_period: The period of its samples, in s.
 
     Attributes:
         task: The argument.
@@ -261,9 +259,8 @@ class TracedTask:
             ModelError: The margin of a phase cannot be traced.
         """
         margins, inputs, sources = self._margins()
-        none = ca.SX(0, 1)
-        function = ca.Function("guard", inputs, [ca.densify(margins - EARLY), none, none])
-        return Computation(function, sources, (MARGINS, GAPS, RATES))
+        function = ca.Function("guard", inputs, [ca.densify(margins - EARLY)])
+        return Computation(function, sources, (MARGINS,))
 
     def _margins(self) -> tuple[ca.SX, list[ca.SX], tuple[str, ...]]:
         """The margins of `PhaseDecision`, and the symbols and sources of their inputs."""

@@ -17,7 +17,6 @@ from drake_dae import PointOnSurface
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.implicit import ImplicitSurface
 from drake_dae.robots.surfaces.measured import MeasuredSurface
-from drake_dae.robots.surfaces.plate import Hole, Plate
 from drake_dae.robots.surfaces.surface import Surface, tangents
 from drake_dae.robots.surfaces.surfaces import Cylinder, Ellipsoid, Plane, Sphere, Torus
 from drake_dae.trace.functions import TracedFunction
@@ -30,7 +29,6 @@ BELL = 0.3 * np.exp(-2.0 * (SIDE**2 + SIDE[:, None] ** 2))
 
 SURFACES = {
     "plane": Plane((0.3, -0.2, 0.5), (1.0, -2.0, 0.5)),
-    "plate": Plate((0.3, -0.2, 0.5), (1.0, -2.0, 0.5), (9.0, 9.0), thickness=2.0),
     "sphere": Sphere((0.1, 0.2, 0.3), 0.7),
     "inside sphere": Sphere((0.1, 0.2, 0.3), 0.7, inside=True),
     "cylinder": Cylinder((0.4, 0.0, 0.1), (1.0, 1.0, 0.3), 0.5),
@@ -127,69 +125,6 @@ def test_a_solid_has_the_distance_of_its_surface(name):
     for p, d in zip(points, np.linspace(-0.1, 0.1, len(points)), strict=True):
         near = p + d * function(p)[1]
         assert by_drake(near) == pytest.approx(function(near)[0][0], abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    "hole", [None, Hole(0.005), Hole(0.005, (0.01, 0.004), chamfer=0.001)], ids=str
-)
-def test_the_pieces_of_a_plate_have_its_clearance(hole):
-    """Above it, beside it and in its hole, whose flat sides are wider by 0.2 % of its radius.
-
-    The gradient is the unit normal, as balls need it; round-off alone. Nearer than 0.4 mm to the
-    face the steps of its strips would show.
-    """
-    plate = Plate((0, 0, 0), (-1, 0, 0.3), (0.03, 0.02), thickness=0.02, hole=hole)
-    by_drake, offset = distance_by_drake(plate), ca.SX.sym("offset", 3)
-    clearance = plate.clearance(offset)
-    outputs = {"clearance": clearance, "normal": ca.gradient(clearance, offset)}
-    function = TracedFunction("plate", {"offset": offset}, outputs)
-    axes, random = np.vstack([*tangents(plate.normal), plate.normal]), np.random.default_rng(1)
-    places = random.uniform([-0.04, -0.03, -0.018], [0.04, 0.03, 0.01], (400, 3))
-    if hole is not None:
-        places[::2, :2] = hole.center + random.uniform(-0.006, 0.006, (200, 2))
-    wider, outside = 1e-12 if hole is None else 0.0022 * hole.radius, 0
-    for place in places @ axes:
-        value, normal = function(place)
-        if value[0] > 4e-4:
-            outside += 1
-            assert -1e-12 <= by_drake(place) - value[0] <= wider
-            assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-9)
-        else:
-            assert by_drake(place) < 5e-4
-    assert outside > 200
-
-
-@pytest.mark.parametrize("hole", [None, Hole(0.005, (0.01, 0.004), chamfer=0.001)], ids=str)
-def test_the_face_of_a_plate_is_where_it_has_no_clearance(hole):
-    """In the plane of the face the body is below the feet that are on the inner side of all edges.
-
-    Beyond an edge the least distance is that of the clearance, to first order at a rim.
-    """
-    plate = Plate((0, 0, 0), (-1, 0, 0.3), (0.03, 0.02), thickness=0.02, hole=hole)
-    offset, random = ca.SX.sym("offset", 3), np.random.default_rng(2)
-    outputs = {"clearance": plate.clearance(offset), "edges": plate.edges(offset)}
-    function = TracedFunction("plate", {"offset": offset}, outputs)
-    places, on = random.uniform([-0.04, -0.03], [0.04, 0.03], (400, 2)), 0
-    for place in places @ np.vstack(tangents(plate.normal)):
-        clearance, edges = function(place)
-        is_on = bool((edges > 0.0).all())
-        on += is_on
-        # The length of a vector is 1e-12 m at least.
-        assert bool(clearance[0] < 2e-12) is is_on
-        if not is_on and (edges < 0.0).sum() == 1 and np.argmin(edges) < 4:
-            assert clearance[0] == pytest.approx(-edges.min(), abs=1e-12)
-    assert 100 < on < 300
-
-
-def test_surfaces_that_do_not_end_have_no_edges():
-    for name, surface in SURFACES.items():
-        assert bool(surface.edges(ca.SX.sym("p", 3)).numel()) is surface.ends is (name == "plate")
-
-
-def test_a_hole_that_does_not_fit_its_plate_is_refused():
-    for hole in (Hole(0.02), Hole(0.005, (0.016, 0.0)), Hole(0.005, chamfer=0.03)):
-        with pytest.raises(ModelError, match="does not fit a plate with the half_widths"):
-            Plate((0, 0, 0), (0, 0, 1), (0.02, 0.02), thickness=0.02, hole=hole)
 
 
 @pytest.mark.parametrize("name", [n for n in SURFACES if SURFACES[n].coordinate_signals])

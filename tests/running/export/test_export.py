@@ -256,11 +256,3 @@ def test_an_observer_is_among_what_holds_between_samples(tmp_path, capsys):
     assert "int two_link_wall_loop_update_0(" in (tmp_path / "two_link_wall.h").read_text()
     done = outcome(tmp_path, "two_link_wall", "-O0")
     assert done.returncode == 0, done.stdout
-
-
-def test_the_command_reports_what_a_loop_of_ones_own_lacks(tmp_path, capsys):
-    words = ["export", "wall_bounce", "--set", "saturation=true", "--out", str(tmp_path)]
-    assert main(words) == 0
-    told = capsys.readouterr().out.splitlines()[-1]
-    first = "not among them: the limits of the drives, except in the controller; how contacts open"
-    assert told.startswith(first)

@@ -39,18 +39,8 @@ def test_a_rollout_is_drakes_run_or_says_why_not(names, tmp_path):
     (found,) = rollout(*arguments, config=chosen.integrator, compiled=False, seeds=[seeds])
     assert found.failure is None
     record = found.record
-    assert [str(event.kind) for event in record.events] == [
-        str(event.kind) for event in wanted.events
-    ]
-    moments = [event.time for event in wanted.events]
-    if found.context is not None:
-        moments += [change.time for change in loop.changes(context)]
-    away = np.abs(wanted.time[:, None] - np.array([-1.0, *moments])).min(axis=1) > 1e-9
+    away = np.ones(wanted.time.size, dtype=bool)
     away[-2] = False  # Drake adds its steps up, and so may take one of 1e-13 s more.
     for name, recorded in wanted.signals.items():
-        if name == "predicted_error":  # It begins anew at a row that is on either side of a change.
-            continue
         off = np.abs(record[name] - recorded.values)[away]
-        if name == "mode":  # What touches without a force is in either.
-            off[np.abs(wanted["constraint_force"] + wanted["gap"])[away] < 1e-9] = 0.0
         assert off.max() < 1e-9 * max(1.0, np.abs(recorded.values).max()), name

@@ -28,7 +28,6 @@ from drake_dae import (
     StateEstimator,
     TrackingController,
     TrackingLaw,
-    UnilateralRobotPlant,
     poles,
     with_disturbance,
 )
@@ -38,7 +37,6 @@ from drake_dae.systems.blocks.switch import LawSwitch
 from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
-from drake_dae.systems.plants.unilateral.modes import ROUND_OFF
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 
@@ -78,11 +76,6 @@ def references_with_parameters():
 def robot(kind):
     found = arm("two_link") if kind is None else actuated("two_link", kind)
     return RobotPlant(found.model, structure=found.structure)
-
-
-def opening(kind):
-    found = arm("two_link") if kind is None else actuated("two_link", kind)
-    return UnilateralRobotPlant(found.model, {"wall": 0.5})
 
 
 def found_friction(is_measured=True):
@@ -160,8 +153,6 @@ BLOCKS = {
     "StateEstimator of a contact that sticks": lambda: estimator(
         0.5, least_speed=1e3, least_force=1e-3
     ),
-    "UnilateralRobotPlant": lambda: opening(None),
-    "UnilateralRobotPlant with springs": lambda: opening("flexible"),
     "StateSensor": lambda: StateSensor(5, 2, Encoders(resolution=[0.1, 0.0]), 0.01),
     "StateSensor with differences": lambda: StateSensor(
         4, 2, Encoders(resolution=1e-3, velocity_bandwidth=200.0, position_bias=0.1), 0.01
@@ -179,11 +170,7 @@ def in_context(name):
     system = BLOCKS[name]()
     diagram, context = alone(system)
     own = system.GetMyMutableContextFromRoot(context)
-    if isinstance(system, UnilateralRobotPlant):
-        mode = context.get_discrete_state(0).CopyToVector()
-        system.set_consistent_state(own, system.structure.states[1])
-        context.SetDiscreteState(np.abs(np.round(mode)))
-    elif isinstance(system, DaePlant):
+    if isinstance(system, DaePlant):
         state = system.structure.states[1]
         system.set_consistent_state(own, state)
     elif isinstance(system, TrackingController):
@@ -243,34 +230,6 @@ def test_a_block_reports_the_same_each_time_and_all_of_it(name):
     updated = [HELD in update.computation.outputs for update in one.updates]
     assert all(updated)
     assert bool(updated or one.guard) == bool(context.num_discrete_state_groups())
-
-
-@pytest.mark.parametrize("kind", [None, "flexible"])
-def test_margins_of_contacts_are_their_forces_and_gaps(kind):
-    """Rule 7: the force of a contact that is closed, the gap of one that is open and approaches.
-
-    The round-off of the force's terms is added: without a control they are the force itself.
-    """
-    system = opening(kind)
-    diagram, context = alone(system)
-    own = system.GetMyMutableContextFromRoot(context)
-    state = system.set_consistent_state(own, system.structure.states[1])
-    # The wall is at x = 1.2, and the arm reaches to 2: both joints turn towards it.
-    for mode, given in ((1.0, state), (0.0, [1.2, -1.6, -0.5, 0.5, *state[4:]])):
-        system.set_state(own, given)
-        context.SetDiscreteState(np.array([mode]))
-        compiled = compile_diagram(diagram, context=context)
-        values = compiled.values(context)
-        found = compiled.guard(0.0, *compiled.start(context), values)
-        margin, gap, rate, valid = map(float, found)
-        assert np.isfinite(valid)
-        if mode:
-            force = system.GetOutputPort("constraint_force").Eval(own)
-            np.testing.assert_allclose(max(margin, 0.0), (1.0 + ROUND_OFF) * force[0], rtol=1e-14)
-            assert rate == 0.0
-        else:
-            assert rate < 0.0
-            np.testing.assert_allclose([margin, gap], system.gaps(own)[0], rtol=1e-14)
 
 
 @pytest.mark.parametrize("name", some(BLOCKS, of=3))

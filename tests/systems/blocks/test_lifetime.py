@@ -47,7 +47,9 @@ def loop() -> ClosedLoop:
 SYSTEMS = {
     "plant": plant,
     "controller": lambda: TrackingController(arms.law("two_link")),
-    "task": lambda: TaskController(Task([Approach()]), *polishing.laws()),
+    "task": lambda: TaskController(
+        Task([Approach()]), *polishing.laws(), sample_period=polishing.PERIOD
+    ),
     "references": lambda: ReferenceGenerator([ConstantReference([0.3, 15.0])], (2, 0)),
     "sensor": lambda: ForceSensor(1, 0.01, 0.001, noise_deviation=0.1),
     "realization": lambda: StateRealization(NormalForm(arms.arm("two_link").model.dae)),

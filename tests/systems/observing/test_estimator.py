@@ -293,7 +293,7 @@ SENSED = (
 @pytest.mark.parametrize("delay", some([0.001, 0.0015]))
 @pytest.mark.parametrize(
     "plant",
-    some(["!IdealConstraints {}", "!Unilateral {}", "!CompliantContact {time_step: 0.001}"]),
+    some(["!IdealConstraints {}", "!CompliantContact {time_step: 0.001}"]),
 )
 def test_a_rollout_with_an_estimator_is_drakes_run(plant, delay):
     """The same functions at the same samples, to 1e-9 of the largest value."""

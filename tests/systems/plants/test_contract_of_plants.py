@@ -21,7 +21,6 @@ from drake_dae import (
     PointMaterial,
     RobotPlant,
     TrackingLaw,
-    UnilateralRobotPlant,
     build_scenario,
     load_scenario,
     make_animation,
@@ -57,9 +56,6 @@ def contact():
 MEMBERS = {
     "dae": lambda: DaePlant(arm("two_link").model.dae, structure=arm("two_link").structure),
     "robot": lambda: RobotPlant(arm("two_link").model, structure=arm("two_link").structure),
-    "unilateral": lambda: UnilateralRobotPlant(
-        arm("two_link").model, {"wall": 0.0}, structure=arm("two_link").structure
-    ),
     "contact": contact,
     "compliant": lambda: CompliantPlant(
         arm("two_link").model, PointMaterial(), structure=arm("two_link").structure
@@ -72,7 +68,7 @@ MEMBERS = {
 
 
 def test_no_member_is_left_out():
-    """Bases of one member alone, as what shows the modes of a plant, are none."""
+    """Bases of one member alone are none."""
 
     def leaves(cls):
         own = cls.__subclasses__()
@@ -126,7 +122,7 @@ def test_rule_1_ports(plant):
         assert plant.GetOutputPort(name).size() == len(signals), name
 
 
-def test_rules_2_and_3_system_and_robot(plant):
+def test_rule_2_system_and_robot(plant):
     assert plant.structure.system is plant.dae
     if plant.model is None:
         with pytest.raises(ModelError, match="RobotPlant"):
@@ -138,7 +134,7 @@ def test_rules_2_and_3_system_and_robot(plant):
     assert plant.GetOutputPort("link_state").size() == links.q.numel() + links.v.numel()
 
 
-def test_rule_4_state_and_steps(plant):
+def test_rule_3_state_and_steps(plant):
     """A plant logs a sample at each step of 1 ms, its own or the integrator's, and at the end."""
     own, record = run_of(plant)
     assert plant.time_step >= 0.0
@@ -146,7 +142,7 @@ def test_rule_4_state_and_steps(plant):
     np.testing.assert_array_equal(plant.GetOutputPort("state").Eval(own), plant.state(own))
 
 
-def test_rules_5_and_6_what_is_computed_afterwards_is_what_the_ports_showed(plant):
+def test_rule_4_what_is_computed_afterwards_is_what_the_ports_showed(plant):
     own, record = run_of(plant)
     given = {name: record[name] for name in record.signals if name not in plant.functions}
     given["parameters"] = plant.parameters_along(own, record.time)
@@ -157,13 +153,13 @@ def test_rules_5_and_6_what_is_computed_afterwards_is_what_the_ports_showed(plan
         plant.along("nothing", given)
 
 
-def test_rule_7_exogenous_signals(plant):
+def test_rule_5_exogenous_signals(plant):
     assert not plant.exogenous_layout.degrees  # Of this robot nothing moves.
     assert list(plant.exogenous_places) == []
     assert not plant.HasInputPort("exogenous")
 
 
-def test_rule_8_parameters(plant):
+def test_rule_6_parameters(plant):
     context = plant.CreateDefaultContext()
     before = plant.parameters(context)
     np.testing.assert_array_equal(before, plant.dae.parameter_values)
@@ -181,7 +177,7 @@ def test_rule_8_parameters(plant):
         assert plant.parameters(context)[place] == 6.0
 
 
-def test_rule_9_starts(plant):
+def test_rule_7_starts(plant):
     context, nominal = plant.CreateDefaultContext(), plant.dae.nominal_state
     plant.set_state(context, nominal)
     np.testing.assert_array_equal(plant.state(context), nominal)
@@ -192,19 +188,7 @@ def test_rule_9_starts(plant):
         plant.set_state(context, nominal[:-1])
 
 
-def test_rule_10_opening_contacts(plant):
-    own, record = run_of(plant)
-    assert len(plant.contacts) == len(plant.normals)
-    if plant.contacts:
-        names = [plant.dae.force_signals[i].name.split(".")[0] for i in plant.normals]
-        assert tuple(names) == plant.contacts
-        is_open = record["mode"] == 0.0
-        assert not record["constraint_force"][:, list(plant.normals)][is_open].any()
-    for event in plant.events(own):
-        assert set(event.contacts) <= set(plant.contacts)
-
-
-def test_rules_11_and_13_projection_and_contact(plant):
+def test_rules_3_and_8_projection_and_contact(plant):
     """Fixed steps of 1 ms leave N* by less than 1e-9, and by no more than round-off with it."""
     _, record = run_of(plant)
     assert plant.projects in (True, False)
@@ -265,7 +249,7 @@ def test_a_plant_from_outside_springs_back_as_its_equation_says():
     np.testing.assert_allclose(k, k[0] * (1.0 + at) * np.exp(-at), atol=1e-6 * abs(k[0]))
 
 
-def test_rule_15_friction(plant):
+def test_rule_8_friction(plant):
     context = plant.CreateDefaultContext()
     names = [] if plant.model is None else [one.name for one in plant.model.constraints]
     found = plant.friction(context)

@@ -120,7 +120,9 @@ def test_plans_that_make_no_sense_are_refused(phases, message):
         (lambda: Approach(on_failure="approach"), "'approach'"),
         (
             lambda: TaskController(
-                Task([Approach(guards=[Condition("control", above=1.0, name="elbow")])]), *laws()
+                Task([Approach(guards=[Condition("control", above=1.0, name="elbow")])]),
+                *laws(),
+                sample_period=1e-3,
             ),
             "'elbow'",
         ),

@@ -184,11 +184,10 @@ def check_events(compiled: CompiledDiagram, what: str) -> None:
     Raises:
         ModelError: The part has one of them.
     """
-    if changing := [*compiled.guards, *compiled.watched]:
+    if compiled.watched:
         raise ModelError(
-            f"{what} changes at moments that a run has to find, as where a contact opens or a "
-            f"phase ends between samples ('{changing[0].system.get_name()}'): no export knows it, "
-            "and a rollout does"
+            f"{what} has phases of a task ('{compiled.watched[0].system.get_name()}'), which its "
+            "own samples end: no export of it as one system knows them, and a rollout does"
         )
     if compiled.has_stepped:
         raise ModelError(
@@ -213,17 +212,11 @@ def _check_steps(compiled: CompiledDiagram) -> None:
     Raises:
         ModelError: A block of the controller has a continuous state, phases or random numbers.
     """
-    phases = (*compiled.guards, *compiled.watched)
     for places, reason in (
         (
             compiled.states,
             "has a continuous state, as integrals of a law without samples: give the loop a "
             "sampling, in a scenario `sampling: {period: 0.001}`",
-        ),
-        (
-            phases,
-            "ends phases between samples, which no C does: give the loop a sampling, in a scenario "
-            "`sampling: {period: 0.001}`",
         ),
         (
             compiled.noise,

@@ -106,7 +106,6 @@ def defaults(part: ExportedPart, context: Context) -> tuple[FloatArray, FloatArr
         return values, np.zeros(0)
     # A discrete control, which the plant reads, is nan before a run is initialized.
     own = context.Clone()
-    own.SetAccuracy(1e-9)
     part.compiled.diagram.ExecuteInitializationEvents(own)
     count = part.compiled.inputs[0][1].start
     return values[:count], part.compiled.values(own)[count:]

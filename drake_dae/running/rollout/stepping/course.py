@@ -10,7 +10,7 @@ from scipy.integrate import DOP853
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Tableau
-from drake_dae.running.rollout.stepping.functions import DiagramFunctions, GuardInputs
+from drake_dae.running.rollout.stepping.functions import DiagramFunctions
 from drake_dae.systems.blocks.trials import LEAST_PROGRESS, PACE_STEPS
 
 DOP = Tableau(DOP853.A, DOP853.B, DOP853.C)
@@ -108,7 +108,6 @@ class RunStepper:
         self.trial_time, self.trial = np.inf, np.full(1, np.nan)
         self.rows = list[RecordRows]()
         self._computed = [np.zeros((0, functions.program.width))]
-        self._guards: GuardInputs | None = None
 
     def rate(self, time: float, state: FloatArray) -> FloatArray:
         """Returns the derivative; nan where it has no value, and notes the earliest such trial."""
@@ -168,7 +167,7 @@ class RunStepper:
             due, noise = int(problem.due[self.event]), problem.noise[self.event]
             if due & self.functions.watched_rates:
                 inputs = self.time, state_before, self.held, problem.parameters
-                if self.functions.sampled_guards(*inputs).is_due:
+                if (self.functions.margins(*inputs) <= 0.0).any():
                     self.state, self.next = state_before, self.time
                     raise RunEnded(RunEnding.CHANGE)
             # Unrestricted updates see the state before the projection, which is one of them.
@@ -214,24 +213,6 @@ class RunStepper:
         for j in reversed(range(len(parts))):
             values = (values + parts[j]) * (1.0 - share if j % 2 else share)
         self.rows.append(RecordRows(times, self.state + values, self.held, True))
-
-    def look(self) -> None:
-        """Evaluates the guards where a step begins; ends the run where a block has to react."""
-        if self.functions.program.compiled.guards:
-            inputs = self.time, self.state, self.held, self.problem.parameters
-            self._guards = self.functions.guards(*inputs)
-            is_begin = self.problem.has_reacted and self.time == self.problem.times[0]
-            if self._guards.is_due and not is_begin:
-                self.next = self.time
-                raise RunEnded(RunEnding.CHANGE)
-
-    def check(self, time: float, state: FloatArray) -> None:
-        """Ends the run where a step that leads to a state passes a change."""
-        if self._guards is not None:
-            after = self.functions.guards(time, state, self.held, self.problem.parameters)
-            if after.follows_change(self._guards):
-                self.next = time
-                raise RunEnded(RunEnding.CHANGE)
 
     def boundary(self) -> float:
         """The time of the next event or of the end, in s."""

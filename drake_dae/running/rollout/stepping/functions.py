@@ -1,6 +1,5 @@
 """The functions of a diagram for CasADi's interpreter: its derivative, its updates, its record."""
 
-from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
 
@@ -13,37 +12,9 @@ from drake_dae.compiler.compiled import ARGUMENTS
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Tableau
 from drake_dae.running.rollout.stepping.many import VectorizedFunction
-from drake_dae.systems.blocks.dips import TOUCHING, lowest
 
 REACHED = 1e-11
 """N* is reached if the second of two Newton steps is not longer than this."""
-
-
-@dataclass(frozen=True, eq=False)
-class GuardInputs:
-    """The values of all guards at a moment, see `Guard`.
-
-    Attributes:
-        time: In s.
-        margins, gaps, rates: As `Guard` defines them.
-    """
-
-    time: float
-    margins: FloatArray
-    gaps: FloatArray
-    rates: FloatArray
-
-    @property
-    def is_due(self) -> bool:
-        """Whether a block has to react."""
-        return bool((self.margins <= 0.0).any())
-
-    def follows_change(self, before: "GuardInputs") -> bool:
-        """Whether a guard has triggered between an earlier moment and this one."""
-        if ((self.margins <= 0.0) & (before.margins > 0.0)).any():
-            return True
-        gaps = before.gaps, before.rates, self.gaps, self.rates
-        return bool((lowest(self.time - before.time, *gaps) < -TOUCHING).any())
 
 
 class DiagramFunctions:
@@ -70,7 +41,6 @@ class DiagramFunctions:
             if rate.stepped is None
         ]
         self._stages: dict[bytes, BufferedFunction] = {}
-        self._guard = BufferedFunction(compiled.guard) if compiled.guards else None
         self._watch = BufferedFunction(compiled.watch) if compiled.watched else None
         self.watched_rates = compiled.watched_rates
 
@@ -120,17 +90,13 @@ class DiagramFunctions:
         projected, left = self._newton(time, state, held, parameters)
         return projected.copy() if left[0] <= REACHED else None
 
-    def guards(
+    def margins(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
-    ) -> GuardInputs:
-        """Evaluates the guards of a diagram that has some."""
-        return _evaluated(self._guard, time, state, held, parameters)
-
-    def sampled_guards(
-        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
-    ) -> GuardInputs:
-        """Evaluates the guards that are checked at samples, of a diagram that has some."""
-        return _evaluated(self._watch, time, state, held, parameters)
+    ) -> FloatArray:
+        """Evaluates the guards of a diagram that has some; infinite where they have no value."""
+        assert self._watch is not None
+        margins, valid = self._watch(time, state, held, parameters)
+        return margins.copy() if isfinite(valid[0]) else np.full_like(margins, np.inf)
 
     def update(
         self,
@@ -184,17 +150,3 @@ class DiagramFunctions:
 def functions_of(program: RolloutProgram) -> DiagramFunctions:
     """Returns the functions of a diagram, which are made once."""
     return program.kept("functions", lambda: DiagramFunctions(program))
-
-
-def _evaluated(
-    guard: BufferedFunction | None,
-    time: float,
-    state: FloatArray,
-    held: FloatArray,
-    parameters: FloatArray,
-) -> GuardInputs:
-    assert guard is not None
-    margins, gaps, rates, valid = (values.copy() for values in guard(time, state, held, parameters))
-    if not isfinite(valid[0]):  # No change: the step reports why there is no value.
-        margins[:] = np.inf
-    return GuardInputs(time, margins, gaps, rates)

@@ -50,10 +50,8 @@ def _run_controlled(course: RunStepper, settings: Settings) -> None:
             rate = None
         if rate is None:
             rate = course.accepted_rate()
-        course.look()
         tried = tried or _first_step(course, rate, settings)
         step = _controlled_step(course, settings, rate, min(tried, settings.longest))
-        course.check(step.end, step.reached)
         stop = min(bisect_left(moments, step.end, row), times.size - 1)
         if row < stop:
             course.write_between(step, times[row:stop])
@@ -158,13 +156,11 @@ def _run_fixed(course: RunStepper, settings: Settings, tableau: Tableau) -> None
         if course.steps % LOOKED == 0 and settings.look(course.so_far, course.problem.context):
             raise RunEnded(RunEnding.PAUSED)
         course.update()
-        course.look()
         rates = course.stages(end - start, course.accepted_rate())
         state = course.state + (end - start) * (tableau.b @ rates)
         course.next = end
         if not np.isfinite(state).all():
             raise RunEnded(RunEnding.SPOILT)
-        course.check(end, state)
         course.accept(end, state)
         if is_row and end < times[-1]:
             course.write()

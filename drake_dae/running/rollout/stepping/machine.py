@@ -14,7 +14,6 @@ from drake_dae.compiler.rates import UpdateRate
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Settings
-from drake_dae.systems.blocks.dips import TOUCHING
 from drake_dae.trace.compiled import Compiled, generate, library, renamed, without_branches
 
 SOURCE = Path(__file__).parent / "stepper.c"
@@ -38,7 +37,7 @@ class RunState(ctypes.Structure):
         *((name, ctypes.c_double) for name in ("time", "step", "start", "mark", "before")),
         *((name, ctypes.c_double) for name in ("begin", "next", "trial")),
         *((name, ctypes.c_longlong) for name in ("row", "event", "steps", "number", "index")),
-        *((name, ctypes.c_longlong) for name in ("failures", "pending", "reacted")),
+        *((name, ctypes.c_longlong) for name in ("failures", "pending")),
     )
 
 
@@ -80,9 +79,7 @@ def run(code: Library, program: RolloutProgram, problem: RunProblem, settings: S
         settings: How to step.
     """
     start = float(problem.times[0])
-    run_state = RunState(
-        time=start, start=start, mark=start, pending=_ALL, reacted=int(problem.has_reacted)
-    )
+    run_state = RunState(time=start, start=start, mark=start, pending=_ALL)
     state, held = problem.state.copy(), problem.held.copy()
     rows = np.empty((problem.times.size, program.width))
     return go_on(code, problem, settings, run_state, state, held, rows)
@@ -160,10 +157,8 @@ def _source(program: RolloutProgram) -> str:
         "WIDTH": program.width,
         "GIVEN": calls["given"].numel_out(0),
         "PROJECTS": int(compiled.projects),
-        "MARGINS": compiled.guard.numel_out(0) if compiled.guards else 0,
         "WATCHED": compiled.watch.numel_out(0) if compiled.watched else 0,
         "WATCHED_RATES": compiled.watched_rates,
-        "GAPS": compiled.guard.numel_out(1) if compiled.guards else 0,
     }
     for name, function in calls.items():
         # At least as many as the initializers in stepper.c.
@@ -172,7 +167,6 @@ def _source(program: RolloutProgram) -> str:
     lines = [f"enum {{ {name} = {size} }};" for name, size in sizes.items()]
     for number, rate in enumerate(compiled.rates):
         lines.append(c_places(number, rate))
-    lines.append(f"static const double TOUCHING = {TOUCHING!r};")
     lines += [c_table(name, np.asarray(values)) for name, values in DOP_TABLES.items()]
     words = {
         "run": RUN.read_text(encoding="utf-8"),
@@ -185,7 +179,6 @@ def _source(program: RolloutProgram) -> str:
         ),
         "sample": _sampled(len(compiled.rates) - 1) if compiled.has_stepped else "",
         "watch": _WATCH if compiled.watched else "  (void)time, (void)x, (void)g;",
-        "guards": _GUARDS if compiled.guards else "  (void)x, (void)g;",
     }
     return Template(SOURCE.read_text(encoding="utf-8")).substitute(words)
 
@@ -226,23 +219,14 @@ __attribute__((visibility("default"))) int sample(
 """
 
 
-_GUARDS = """\
-  double valid;
-  const double *arg[GUARD_ARG] = {&time, x, g->held, g->parameters, g->given};
-  double *res[GUARD_RES] = {seen->margins, seen->gaps, seen->rates, &valid};
-  set_time(time, g);
-  dae_guard(arg, res, 0, 0, 0);
-  for (i = 0; !isfinite(valid) && i < MARGINS; i++) seen->margins[i] = INFINITY;"""
-"""The C that evaluates the guards."""
-
 _WATCH = """\
   double margins[WATCHED], valid;
   const double *arg[WATCH_ARG] = {&time, x, g->held, g->parameters, g->given};
-  double *res[WATCH_RES] = {margins, 0, 0, &valid};
+  double *res[WATCH_RES] = {margins, &valid};
   set_time(time, g);
   dae_watch(arg, res, 0, 0, 0);
   for (i = 0; isfinite(valid) && i < WATCHED; i++) due |= margins[i] <= 0.0;"""
-"""The C that evaluates the guards which are checked at samples."""
+"""The C that evaluates the guards."""
 
 
 def c_places(number: int, rate: UpdateRate) -> str:

@@ -11,7 +11,6 @@ typedef struct {
   long long number, index; /* of fixed steps in this row, and which comes next */
   long long failures;      /* of trials since the accepted state */
   long long pending;       /* what is to come before the next step, as below */
-  long long reacted;       /* whether blocks have reacted to how the run begins */
 } Run;
 
 /* Unrestricted updates, the projection, discrete updates: in this order. */

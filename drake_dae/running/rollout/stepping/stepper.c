@@ -86,43 +86,12 @@ static int project(double time, double *x, Given *g) {
   return 0;
 }
 
-/* The values of the guards at a time. */
-typedef struct {
-  double time, margins[MARGINS + 1], gaps[GAPS + 1], rates[GAPS + 1];
-} Seen;
-
-/* Evaluates the guards; returns whether a block has to react. Guards without a value do not trigger. */
-static int look(double time, const double *x, Given *g, Seen *seen) {
-  int i, due = 0;
-  seen->time = time;
-$guards
-  for (i = 0; i < MARGINS; i++) due |= seen->margins[i] <= 0.0;
-  return due;
-}
-
-/* Evaluates the guards that are checked at samples; returns whether a block has to react. */
+/* Evaluates the guards; returns whether a block has to react. */
 static int watch(double time, const double *x, Given *g) {
   int i, due = 0;
   (void)i;
 $watch
   return due;
-}
-
-/* Whether a guard triggered between two times; in between as in dips.py. */
-static int changed(const Seen *before, const Seen *now) {
-  double step = now->time - before->time;
-  int i, found = 0;
-  for (i = 0; i < MARGINS; i++) found |= now->margins[i] <= 0.0 && before->margins[i] > 0.0;
-  for (i = 0; i < GAPS; i++) {
-    double b = step * before->rates[i], rise = now->gaps[i] - before->gaps[i], c, d, root, s;
-    if (!(b < 0.0 && now->rates[i] > 0.0 && now->gaps[i] > 0.0)) continue;
-    c = 3.0 * rise - step * (2.0 * before->rates[i] + now->rates[i]);
-    d = step * (before->rates[i] + now->rates[i]) - 2.0 * rise;
-    root = c + sqrt(fmax(c * c - 3.0 * b * d, 0.0));
-    s = root > -b ? -b / root : 0.0;
-    found |= before->gaps[i] + s * (b + s * (c + s * d)) < -TOUCHING;
-  }
-  return found;
 }
 
 /* Makes the updates of one kind that are due, all at once; returns 0 if one has no value. */
@@ -211,7 +180,6 @@ __attribute__((visibility("default"))) int run_fixed(
     const long long *due, const double *noise, double longest, int stages, const double *a,
     const double *b, const double *c, long long budget) {
   Given g;
-  Seen before, now;
   double k[16][SIZE], reached[SIZE];
   int s, status;
   g.held = held;
@@ -243,20 +211,11 @@ __attribute__((visibility("default"))) int run_fixed(
       end = run->from + (end - run->from) * ((double)run->index / (double)run->number);
     }
     step = end - run->time;
-    if (look(run->time, x, &g, &before) && !run->reacted) {
-      run->next = run->time;
-      return CHANGE;
-    }
-    run->reacted = 0;
     if (!rates(run->time, x, &g, k[0])) return INVALID;
     for (s = 1; s < stages; s++) stage(run, run->time, step, s, a + s * stages, c[s], x, &g, k, trial);
     weigh(step, stages, b, x, k, reached);
     run->next = end;
     if (!is_finite(reached, SIZE)) return SPOILT;
-    if (MARGINS) {
-      look(end, reached, &g, &now);
-      if (changed(&before, &now)) return CHANGE;
-    }
     status = accept(run, end, x, reached);
     if (status != DONE) return status;
   }
@@ -311,7 +270,6 @@ __attribute__((visibility("default"))) int run_controlled(
     const long long *due, const double *noise, double longest, const double *absolute,
     double relative, long long budget) {
   Given g;
-  Seen before, now;
   double k[16][SIZE], reached[SIZE], f[7][SIZE], between[SIZE];
   int i, j, s, status, valid, known = 0, is_on = 0;
   g.held = held;
@@ -338,11 +296,6 @@ __attribute__((visibility("default"))) int run_controlled(
     } else if (!rates(run->time, x, &g, k[0])) {
       return INVALID;
     }
-    if (look(run->time, x, &g, &before) && !run->reacted) {
-      run->next = run->time;
-      return CHANGE;
-    }
-    run->reacted = 0;
     limit = times[num_rows - 1];
     if (run->event < num_events && events[run->event] < limit) limit = events[run->event];
     if (run->step == 0.0) {
@@ -374,11 +327,7 @@ __attribute__((visibility("default"))) int run_controlled(
       rejected = 1;
       size *= valid ? factor : 0.2;
     }
-    if (MARGINS) {
-      look(limit, reached, &g, &now);
-      run->next = limit;
-      if (changed(&before, &now)) return CHANGE;
-    }
+    run->next = limit;
     if (times[run->row] <= limit) {
       for (s = 13; s < 16; s++) {
         stage(run, run->time, size, s, dop_a_more[s - 13], dop_c_more[s - 13], x, &g, k, trial);

@@ -58,11 +58,10 @@ class CompliantEquations:
         normals = ca.SX.sym("normals", 3 * len(model.constraints))
         self._compliance = Compliance(numbers[0], numbers[1], material.stiction_tolerance)
         friction = None if material.friction is None else numbers[2]
-        self._groups = point_contacts(model, normals, numbers[3], friction, material.pegs)
-        self._contacts = [contact for group in self._groups for contact in group]
-        control, force = ca.SX.sym("u", dae.num_controls), ca.SX.sym("F", 3 * len(self._groups))
+        self._contacts = point_contacts(model, normals, numbers[3], friction)
+        control, force = ca.SX.sym("u", dae.num_controls), ca.SX.sym("F", 3 * len(self._contacts))
         advanced, slack = (self._step if self._h else self._rate)(control)
-        outputs = self._outputs(structure, force if self._h else self._sums(self._forces()))
+        outputs = self._outputs(structure, force if self._h else self._forces())
         self.expressions = [advanced, slack, *outputs.values()]
         state = ca.vertcat(dae.state, force) if self._h else dae.state
         parameters = ca.vertcat(dae.parameter_symbol, numbers, normals)
@@ -80,7 +79,7 @@ class CompliantEquations:
             for name, value in outputs.items()
         }
         self._normals = dae.trace("normals", {"normals": ball_normals(model)}, often=False)
-        depths = ca.vertcat(*(group[0].depth for group in self._groups if len(group) == 1))
+        depths = ca.vertcat(*(contact.depth for contact in self._contacts))
         self._depths = TracedFunction("depths", inputs, {"depths": depths}, often=False)
 
     def own_parameters(self, values: FloatArray, material: PointMaterial) -> FloatArray:
@@ -100,12 +99,8 @@ class CompliantEquations:
         with_forces = np.zeros(self._depths.sizes[0])
         with_forces[: state.size] = state
         depths = self._depths(with_forces, parameters)[0]
-        pegs = [peg.constraint for peg in material.pegs]
-        balls = [
-            constraint for constraint in self._model.constraints if constraint.name not in pegs
-        ]
-        for constraint, depth in zip(balls, depths.tolist(), strict=True):
-            if not depth <= FITS * material.radius:  # Beyond an edge there is a gap.
+        for constraint, depth in zip(self._model.constraints, depths.tolist(), strict=True):
+            if not depth <= FITS * material.radius:
                 raise ModelError(
                     f"a ball with a radius of {material.radius:g} m does not fit "
                     f"'{constraint.name}' where it shall touch, since the surface bends toward it "
@@ -143,14 +138,6 @@ class CompliantEquations:
             *(contact_force(contact, v, self._compliance) for contact in self._contacts)
         )
 
-    def _sums(self, forces: ca.SX) -> ca.SX:
-        """The force at each constraint: the sum over its balls."""
-        sums, first = list[ca.SX](), 0
-        for group in self._groups:
-            own = ca.reshape(forces[first : first + 3 * len(group)], 3, -1)
-            sums, first = [*sums, ca.sum2(own)], first + 3 * len(group)
-        return ca.vertcat(*sums)
-
     def _rate(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
         """x' of a continuous plant, and a number that is negative where it is not valid."""
         model, links = self._model, self._model.links
@@ -173,7 +160,7 @@ class CompliantEquations:
         # Drake's stops push if a joint would pass its limit within two steps.
         ahead = self._within_limits(links.q + 2.0 * h * velocity)
         stages = stages_after(model, h, control) if model.stages else ca.SX(0, 1)
-        after = ca.vertcat(links.q + h * velocity, step.velocities, stages, self._sums(step.forces))
+        after = ca.vertcat(links.q + h * velocity, step.velocities, stages, step.forces)
         return after, ca.fmin(step.slack, ahead)
 
     def _within_limits(self, q: ca.SX) -> ca.SX:

@@ -34,7 +34,7 @@ from drake_dae.systems.blocks.traced import (
 )
 from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contact.compliance import CompliantEquations
-from drake_dae.systems.plants.contact.contact_checks import changed_parameters, check_pegs
+from drake_dae.systems.plants.contact.contact_checks import changed_parameters
 from drake_dae.systems.plants.contact.contact_forces import contact_force_signals
 from drake_dae.systems.plants.contact.contact_material import FRICTION, PointMaterial
 from drake_dae.systems.plants.contact.stage_steps import check_step
@@ -48,7 +48,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
 
     It is like a `ContactPlant` without a MultibodyPlant: its equations are traced, so that it works
     in rollouts, exports and linear models, surfaces may have any shape and move, and studies change
-    its parameters in a context. Each `PointOnSurface` touches with a ball or a peg of balls;
+    its parameters in a context. Each `PointOnSurface` touches with a ball;
     nothing else of the robot collides.
 
     With `time_step` > 0 it is discrete: at t_n = n time_step, with the control of that instant,
@@ -113,7 +113,6 @@ class CompliantPlant(ParameterizedSystem, Plant):
     ) -> None:
         dae = model.dae
         structure = constraint_structure_of(type(self).__name__, dae, structure)
-        check_pegs(model, material)
         values = dae.parameter_vector(changed_parameters(model, parameters or {}))
         self.model: RobotModel = model
         self.time_step, self._stepped = material.time_step, np.zeros(0)
@@ -200,7 +199,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
 
         Args:
             context: The context of the plant.
-            material: The material, with the time_step, stiction_tolerance and pegs of the plant,
+            material: The material, with the time_step and stiction_tolerance of the plant,
                 and a friction if and only if that of the plant has one.
 
         Raises:
@@ -208,7 +207,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
                 stages with the parameters of the context.
         """
         fixed, others = (
-            (given.time_step, given.stiction_tolerance, given.friction is None, given.pegs)
+            (given.time_step, given.stiction_tolerance, given.friction is None)
             for given in (self.material, material)
         )
         if fixed != others:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
-from pydrake.geometry import Box, HalfSpace, Sphere
+from pydrake.geometry import HalfSpace, Sphere
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Context
@@ -14,7 +14,7 @@ from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.surfaces.picture import PosedShape
-from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 
 
 def check_model(model: RobotModel, material: ContactMaterial) -> None:
@@ -41,33 +41,13 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
     for constraint in model.constraints:
         values = own_values(constraint, model.dae, model.dae.parameter_values)
         solids = constraint.solids(values)
-        if material.contact_model == "hydroelastic":
-            # A ball meets the edges of a box, and a mesh is smooth.
-            if any(isinstance(solid.form, Box) for solid in solids):
-                raise ModelError(
-                    f"hydroelastic contact has no edges, as '{constraint.name}' has; use point "
-                    "contact (contact_model: point)"
-                )
-        elif not solids:
+        if material.contact_model != "hydroelastic" and not solids:
             raise ModelError(
                 f"'{constraint.name}' has no solid for Drake's point contact, as a "
-                "PointOnSurface has on a Plane or Plate, or on the outside of a Sphere or a "
+                "PointOnSurface has on a Plane, or on the outside of a Sphere or a "
                 "Cylinder. Use hydroelastic contact (contact_model: hydroelastic), which meshes "
                 "any smooth surface, or `plant: !CompliantContact`"
             )
-    check_pegs(model, material)
-
-
-def check_pegs(model: RobotModel, material: PointMaterial) -> None:
-    """Refuses a peg whose constraint the robot does not have.
-
-    Raises:
-        ModelError: It has none; the message has the name.
-    """
-    names = [constraint.name for constraint in model.constraints]
-    for peg in material.pegs:
-        if peg.constraint not in names:
-            raise ModelError(f"pegs: {unknown_name('constraint', peg.constraint, names)}")
 
 
 def solids_of(

@@ -1,6 +1,5 @@
 """The compliance and friction of Drake's own contact."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,78 +20,9 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraint_wrenches import own_values
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.surfaces.surface import Vector, axes_along, unit_vector
 
 FRICTION = Signal("plant.friction")
 """The coefficient of friction of all contacts, among `PointMaterial.signals`."""
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class Peg:
-    """A round peg at a contact: rings of balls around an axis of the frame of its constraint.
-
-    The middle of its end is the point of the constraint. The first ring is its end, and the last
-    one is `length` behind it. The radius of the balls, `PointMaterial.radius`, rounds its edges.
-    Each ball has the stiffness of the material, so a peg that touches with k balls is k times as
-    stiff.
-
-    Attributes:
-        constraint: The name of the constraint at which it touches.
-        radius: Its radius, m.
-        length: The distance from its end to the far side of its last ring, m.
-        axis: The direction from its last ring to its end in the frame, of any length, shape (3,).
-        rings: The number of rings, 2 or more.
-        balls: The number of balls in each ring, 3 or more.
-
-    Raises:
-        ModelError: A number is not valid.
-    """
-
-    constraint: str
-    radius: float
-    length: float
-    axis: Vector = (0.0, 0.0, 1.0)
-    rings: int = 3
-    balls: int = 8
-
-    def __post_init__(self) -> None:
-        positive("peg: radius", self.radius)
-        positive("peg: length", self.length)
-        object.__setattr__(self, "axis", unit_vector("peg: axis", self.axis))
-        if self.rings < 2 or self.balls < 3:
-            raise ModelError(
-                "a peg has 2 or more rings of 3 or more balls, got "
-                f"{self.rings} rings of {self.balls}"
-            )
-
-    def centers(self, radius: float) -> FloatArray:
-        """The centers of its balls in the frame, relative to the middle of its end, shape (k, 3).
-
-        Args:
-            radius: The radius of the balls, m.
-
-        Raises:
-            ModelError: The balls are too large for it.
-        """
-        if not radius < min(self.radius, self.length / 2.0):
-            raise ModelError(
-                f"a peg with a radius of {self.radius:g} m and a length of {self.length:g} m has "
-                f"no room for balls with a radius of {radius:g} m"
-            )
-        hull, inward = self.shape
-        return hull + radius * inward
-
-    @property
-    def shape(self) -> tuple[FloatArray, FloatArray]:
-        """P and D of its balls, shapes (k, 3): with a radius r they have the centers P + r D."""
-        angles = 2.0 * np.pi * np.arange(self.balls) / self.balls
-        ring = np.column_stack([np.cos(angles), np.sin(angles)])
-        behind = np.linspace(0.0, 1.0, self.rings)
-        hull = [np.insert(self.radius * ring, 2, -self.length * part, axis=1) for part in behind]
-        inward = [np.insert(-ring, 2, 2.0 * part - 1.0, axis=1) for part in behind]
-        axes = axes_along(self.axis).T
-        return np.vstack(hull) @ axes, np.vstack(inward) @ axes
 
 
 @checked(ModelError)
@@ -118,7 +48,6 @@ class PointMaterial:
         radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
             constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
             radius.
-        pegs: The pegs with which the robot touches at some constraints, in place of a ball.
 
     Raises:
         ModelError: A number is not valid.
@@ -130,7 +59,6 @@ class PointMaterial:
     friction: float | None = None
     stiction_tolerance: float = 1e-4
     radius: float = 0.01
-    pegs: Sequence[Peg] = ()
 
     def __post_init__(self) -> None:
         for name in ("stiffness", "stiction_tolerance", "radius"):
@@ -139,9 +67,6 @@ class PointMaterial:
             value = getattr(self, name)
             if value is not None and not value >= 0.0:
                 raise ModelError(f"{name} must be 0 or more, got {value:g}")
-        object.__setattr__(self, "pegs", tuple(self.pegs))
-        for peg in self.pegs:
-            peg.centers(self.radius)
 
     def stiffness_at(self, force: float, sphere: float | None = None) -> float:
         """The slope of the normal force over depth, in N/m.

@@ -68,7 +68,7 @@ class ContactPlant(Diagram, Plant):
     """A robot in Drake's own contact: a discrete MultibodyPlant with the ports of a `RobotPlant`.
 
     Compliant contact with friction satisfies the constraints approximately, and may open. For each
-    constraint there is a ball on the robot at its point, or a peg of balls, and its surface in the
+    constraint there is a ball on the robot at its point, and its surface in the
     world; nothing else of the robot collides.
 
     The plant steps at t_n = n time_step: its ports then have x(t_n), before the step to t_(n+1),
@@ -169,7 +169,7 @@ class ContactPlant(Diagram, Plant):
     ) -> list[tuple[list[GeometryId], list[GeometryId]]]:
         """Balls on the robot and solids in the world for each constraint, and nothing else."""
         pairs = []
-        for constraint, (frame, centers, point) in zip(
+        for constraint, (frame, center, point) in zip(
             self.model.constraints, self._balls(plant, material), strict=True
         ):
             values = own_values(constraint, self.dae, self._values)
@@ -177,16 +177,13 @@ class ContactPlant(Diagram, Plant):
             friction, name = material.friction, constraint.friction_parameter
             if friction is None:
                 friction = self._values[self.dae.parameter_slice(name)].item() if name else 0.0
-            balls = [
-                plant.RegisterCollisionGeometry(
-                    frame.body(),
-                    RigidTransform(frame.GetFixedPoseInBodyFrame() @ center),
-                    Sphere(material.radius),
-                    f"{constraint.name}_ball{number or ''}",
-                    ball_properties(material, friction),
-                )
-                for number, center in enumerate(centers)
-            ]
+            ball = plant.RegisterCollisionGeometry(
+                frame.body(),
+                RigidTransform(frame.GetFixedPoseInBodyFrame() @ center),
+                Sphere(material.radius),
+                f"{constraint.name}_ball",
+                ball_properties(material, friction),
+            )
             touched = [
                 plant.RegisterCollisionGeometry(
                     plant.world_body(),
@@ -197,7 +194,7 @@ class ContactPlant(Diagram, Plant):
                 )
                 for number, solid in enumerate(solids)
             ]
-            pairs.append((balls, touched))
+            pairs.append(([ball], touched))
         # The robot's own shapes do not collide, and a ball collides only with its own surface.
         every = scene_graph.model_inspector().GetAllGeometryIds(Role.kProximity)
         manager = scene_graph.collision_filter_manager()
@@ -208,8 +205,8 @@ class ContactPlant(Diagram, Plant):
 
     def _balls(
         self, plant: MultibodyPlant, material: ContactMaterial
-    ) -> list[tuple[Frame, list[FloatArray], FloatArray]]:
-        """For each constraint its frame, the centers of its balls in it, and its contact point."""
+    ) -> list[tuple[Frame, FloatArray, FloatArray]]:
+        """For each constraint its frame, the center of its ball in it, and its contact point."""
         model, values, drawn = self.model, self._values, self.model.links.plant
         assert drawn is not None  # check_model.
         state = self.structure.manifold.project(self.dae.nominal_state, values)
@@ -219,16 +216,11 @@ class ContactPlant(Diagram, Plant):
         # A unit force without sliding gives the normal.
         state[model.links.q.numel() :] = 0.0
         wrenches = loads(state, np.ones(self.dae.num_constraints))
-        pegs = {peg.constraint: peg for peg in material.pegs}
         balls = []
-        for constraint, name, point, normal in zip(
-            model.constraints, loads.frames, wrenches.points, wrenches.forces, strict=True
-        ):
+        for name, point, normal in zip(loads.frames, wrenches.points, wrenches.forces, strict=True):
             pose = GetScopedFrameByName(drawn, name).CalcPoseInWorld(context)
-            centers = [pose.inverse() @ (point + material.radius * normal)]
-            if peg := pegs.get(constraint.name):
-                centers = list(pose.inverse() @ point + peg.centers(material.radius))
-            balls.append((GetScopedFrameByName(plant, name), centers, point))
+            center = pose.inverse() @ (point + material.radius * normal)
+            balls.append((GetScopedFrameByName(plant, name), center, point))
         return balls
 
     def parameters(self, context: Context) -> FloatArray:

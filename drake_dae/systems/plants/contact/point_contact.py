@@ -1,6 +1,5 @@
 """Contacts of balls with surfaces as expressions, as Drake's point contact defines them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -8,7 +7,6 @@ import casadi as ca
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Constraint, Touch
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.plants.contact.contact_material import Peg
 from drake_dae.trace.smoothness import length_of
 
 TURNS = 4
@@ -76,20 +74,17 @@ def point_contacts(
     normals: ca.SX,
     radius: ca.SX,
     friction: ca.SX | None,
-    pegs: Sequence[Peg] = (),
-) -> list[list[PointContact]]:
-    """The contacts of a robot's balls with the surface of each constraint.
+) -> list[PointContact]:
+    """The contact of a robot's ball with the surface of each constraint.
 
     Args:
         model: The robot.
         normals: Symbols for the values of `ball_normals` in the nominal configuration.
         radius: The radius of the balls, in m.
         friction: The coefficient of all contacts; None for those of the constraints.
-        pegs: The pegs of balls; each other constraint has one ball.
     """
     kinematics, links = model.links.kinematics(), model.links
-    shapes = {peg.constraint: peg.shape for peg in pegs}
-    groups = []
+    contacts = []
     for i, (constraint, touch) in enumerate(touching(model)):
         point = ca.SX.sym("point", 3)
         lever = point - kinematics.position(touch.frame, touch.point)
@@ -102,20 +97,15 @@ def point_contacts(
         }
         coefficient = parameters.get("friction", ca.SX(0)) if friction is None else friction
         viscous = parameters.get("viscous_friction", ca.SX(0))
-        arms, contacts = [radius * normals[3 * i : 3 * i + 3]], list[PointContact]()
-        if constraint.name in shapes:
-            arms = [
-                ca.DM(p) + radius * ca.DM(d) for p, d in zip(*shapes[constraint.name], strict=True)
-            ]
-        for arm in arms:
-            turned = ca.mtimes(links.rotation(touch.frame), arm)
-            ball = links.position(touch.frame, touch.point) + turned
-            normal, depth = _overlap(touch, ball, radius)
-            contact = ball - normal * (radius - depth / 2)
-            moves, drags = ca.substitute([jacobian, velocity], [point], [contact])
-            contacts.append(PointContact(depth, normal, moves, drags, coefficient, viscous))
-        groups.append(contacts)
-    return groups
+        arm = radius * normals[3 * i : 3 * i + 3]
+        ball = links.position(touch.frame, touch.point) + ca.mtimes(
+            links.rotation(touch.frame), arm
+        )
+        normal, depth = _overlap(touch, ball, radius)
+        contact = ball - normal * (radius - depth / 2)
+        moves, drags = ca.substitute([jacobian, velocity], [point], [contact])
+        contacts.append(PointContact(depth, normal, moves, drags, coefficient, viscous))
+    return contacts
 
 
 def _overlap(touch: Touch, ball: ca.SX, radius: ca.SX) -> tuple[ca.SX, ca.SX]:

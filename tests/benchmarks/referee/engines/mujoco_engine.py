@@ -190,8 +190,6 @@ def forces(
     """The force of each closure in the components of `force_names`, after a while."""
     if any(any(closure.road) for closure in mechanism.closures):
         raise NotImplementedError("no constraint that moves with time")
-    if mechanism.restitution is not None:
-        raise NotImplementedError("contacts are soft: an impact takes time and has no impulse")
     if any(closure.kind == "hinge" for closure in mechanism.closures):
         raise NotImplementedError("no hinge among the equality constraints")
     model, data = solved(mechanism, q, v, contact_geoms(mechanism, q, v), duration)

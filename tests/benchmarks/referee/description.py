@@ -106,9 +106,6 @@ class Mechanism:
         gravity: m/s^2.
         torques: Number of a joint -> the torque or force in it, N m or N.
         springs: The springs.
-        restitution: e of an impact at the closures, which `v` leads into: the forces are then
-            impulses, N s, and the motion ends with the rates v+ with J v+ = -e J v. None without.
-        approach: With an impact, all rates before it, rad/s or m/s.
         split: How redundant forces are split, as text; empty if they are not redundant.
         duration: How long the motion lasts after which the forces are compared again, s; 0 for
             none.
@@ -124,8 +121,6 @@ class Mechanism:
     gravity: Vector = (0.0, 0.0, -9.81)
     torques: Mapping[int, float] = field(default_factory=dict)
     springs: tuple[Spring, ...] = ()
-    restitution: float | None = None
-    approach: tuple[float, ...] = ()
     split: str = ""
     duration: float = 0.0
 

@@ -212,8 +212,6 @@ def forces(
     """The force of each closure in the components of `force_names`, after a while."""
     if any(any(closure.road) for closure in mechanism.closures):
         raise NotImplementedError("constraints move with time by functions in Python alone")
-    if mechanism.restitution is not None:
-        raise NotImplementedError("contacts are penalties: no impulse")
     for closure in mechanism.closures:
         if closure.kind in REFUSED:
             raise NotImplementedError(REFUSED[closure.kind])

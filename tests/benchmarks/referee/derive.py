@@ -15,7 +15,6 @@ Independent of drake_dae and of any engine; mpmath alone. In words:
    and the forces f. With sliding friction, G has the friction beside the normal force.
 5. If rows are redundant, only G f is determined. Of all f with this sum the one with the least sum
    of squares (in N and N m) is stated: f = G^T y.
-6. In an impact M (v+ - v-) = G f with the impulses f, and J v+ = -e J v-.
 7. After a motion: v_free' and q' are integrated in the fewest coordinates, see `motion.py`.
 """
 
@@ -157,21 +156,13 @@ def state(mechanism: Mechanism, q: Sequence | None = None, rates: Sequence | Non
     still = [ZERO] * mechanism.size
     rows = all_rows(mechanism, frames(mechanism, q, still), q)
     reduction = Reduction(mechanism, rows)
-    if mechanism.restitution is not None:
-        v = exact(mechanism.approach)
-        bodies = frames(mechanism, q, v)
-        restored = mpf(repr(mechanism.restitution))
-        rest = [restored * total(row.gradient, v) for row in rows]
-        M, _ = balance(mechanism, bodies)
-        h = [-total(line, v) for line in M]
-    else:
-        if rates is None:
-            rates = [mpf(repr(mechanism.v.get(i, 0.0))) for i in mechanism.free]
-        v = reduction.combined(reduction.completed(still, [-row.drive for row in rows]), rates)
-        bodies = frames(mechanism, q, v)
-        rows = all_rows(mechanism, bodies, q)
-        rest = [row.bias for row in rows]
-        M, h = balance(mechanism, bodies)
+    if rates is None:
+        rates = [mpf(repr(mechanism.v.get(i, 0.0))) for i in mechanism.free]
+    v = reduction.combined(reduction.completed(still, [-row.drive for row in rows]), rates)
+    bodies = frames(mechanism, q, v)
+    rows = all_rows(mechanism, bodies, q)
+    rest = [row.bias for row in rows]
+    M, h = balance(mechanism, bodies)
     gamma = reduction.completed(still, rest)
     # M T a - G f = -h - M gamma, with the forces of the chosen rows alone.
     MT = [[total(line, column) for line in M] for column in reduction.T]

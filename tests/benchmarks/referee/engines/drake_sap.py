@@ -182,8 +182,6 @@ def forces(
     """The force of each closure in the components of `force_names`, after a while."""
     if any(any(closure.road) for closure in mechanism.closures):
         raise NotImplementedError("no constraint or contact that moves with time")
-    if mechanism.restitution is not None:
-        raise NotImplementedError("compliant contact: no restitution and no impulse")
     if any(closure.kind == "hinge" for closure in mechanism.closures):
         raise NotImplementedError("no hinge among its constraints")
     touching = any(closure.kind in ("plane", "ball") for closure in mechanism.closures)

@@ -74,8 +74,6 @@ def mass_matrix(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> np.ndarra
 
 def forces(mechanism: Mechanism, q: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
     """The force of each closure in the components of `force_names`."""
-    if mechanism.restitution is not None:
-        return impulses(mechanism, q)
     plant = dd.RobotPlant(model_of(mechanism))
     context = context_of(plant, mechanism, q, v)
     return read(mechanism, plant, context)
@@ -125,18 +123,3 @@ def read(mechanism: Mechanism, plant: dd.RobotPlant, context: object) -> dict[st
         whole = wrench[start : start + 6]
         found[closure.name] = whole if closure.kind in ("weld", "hinge") else whole[3:]
     return found
-
-
-def impulses(mechanism: Mechanism, q: np.ndarray) -> dict[str, np.ndarray]:
-    """The impulses of contacts that close with the rates of approach."""
-    contacts = {closure.name: mechanism.restitution for closure in mechanism.closures}
-    plant = dd.UnilateralRobotPlant(model_of(mechanism), contacts)
-    context = plant.CreateDefaultContext()
-    plant.set_state(context, np.concatenate([q, mechanism.approach]))
-    dd.simulate(plant, context, 1e-9, SimulatorConfig(accuracy=1e-9))
-    (impact,) = plant.events(context)
-    given = dict(zip(impact.contacts, impact.impulses, strict=True))
-    return {
-        closure.name: given[closure.name] * np.array(closure.direction)
-        for closure in mechanism.closures
-    }

@@ -186,23 +186,6 @@ SLIDING_ROD = Mechanism(
     duration=0.04,
 )  # fmt: skip
 
-STRUCK_ARM = Mechanism(
-    "struck_arm",
-    (
-        rod("upper", 0.5, 2.0),
-        rod("lower", 0.4, 1.5, parent="upper", at=(0.5, 0.0, 0.0)),
-    ),
-    (
-        Closure("wall", "plane", "world", (0.7, 0.0, 0.0), "lower", (0.4, 0.0, 0.0),
-                direction=(-1.0, 0.0, 0.0)),
-    ),
-    q=(0.5, -1.2),
-    free=(0,),
-    gravity=DOWN,
-    restitution=0.5,
-    approach=(0.3, 0.9),
-)  # fmt: skip
-
 # The car axis of the Test Set for IVP Solvers, with other numbers: a road that moves up and down
 # lifts the right end of a bar without mass. Springs carry the chassis; its left end slides along
 # the bar's own y.
@@ -240,6 +223,5 @@ PLANAR_MECHANISMS = (
     CHAIN,
     SLIDING_ARM,
     SLIDING_ROD,
-    STRUCK_ARM,
     CAR_AXIS,
 )

@@ -1,1 +1,0 @@
-"""The contacts of a round peg with a hole in which it has clearance, which only a plant has."""

@@ -1,1 +1,0 @@
-"""Robots with opening and closing contacts: modes, guards, resets, and the plant."""
