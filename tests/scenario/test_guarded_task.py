@@ -84,7 +84,7 @@ def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys)
     assert (code, found["job"]["outcome"]) == (0, "good")
     press, away = found["phases"][1:3]
     assert (press["phase"], away["phase"], away["failed"]) == ("Press", "away", True)
-    assert away["reason"].startswith("Press is ended by a force above 9 N, with ")
+    assert away["reason"].startswith("Press is ended by a force above 9 N")
     story = " ".join(text.split("\n\n")[0].split())
     assert story.startswith("GOOD: the task was done at")
     assert f"{away['reason']}, and away followed, as chosen" in story
