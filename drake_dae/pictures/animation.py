@@ -15,7 +15,6 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.inline import InlinePage
 from drake_dae.pictures.moments import RunEvent, event_kinds, events_of, sorted_events
 from drake_dae.pictures.scene.arrows import (
     FORCE_COLOR,
@@ -66,6 +65,14 @@ _SIDES = 6
 """The number of sides of the tube that draws a path; browsers draw lines one pixel wide."""
 
 _OVERLAY = Path(__file__).with_name("overlay.html")
+
+
+class InlinePage(str):
+    """An HTML page as text; a notebook displays it in a frame."""
+
+    def _repr_html_(self) -> str:
+        page = html.escape(str(self), quote=True)
+        return f'<iframe srcdoc="{page}" style="width: 100%; height: 600px; border: 0"></iframe>'
 
 
 @checked(ModelError)

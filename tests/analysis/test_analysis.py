@@ -149,7 +149,7 @@ def test_2_more_constraints_than_states():
         )
     )
     assert findings(analysis) == [OPEN, NO, OPEN, OPEN, OPEN]
-    assert "m = 2 constraints are more than the states" in str(analysis)
+    assert "m = 2" in str(analysis)
 
 
 def test_3_a_control_that_enters_before_the_force_does():

@@ -89,7 +89,7 @@ def test_given_states():
 def test_a_zero_at_the_given_state_alone_is_no_degree():
     """Ball and beam: the control acts on derivative 3 of the position, but not at rest."""
     beam = DaeSystem.from_functions(
-        ["", "vr", "th", "w"],
+        ["r", "vr", "th", "w"],
         f=lambda x: [x[1], x[0] * x[3] ** 2 - 9.81 * ca.sin(x[2]), x[3], 0],
         h=lambda x: [0, 0, 0, 1],
         l=lambda x: [x[0]],

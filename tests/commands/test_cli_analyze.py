@@ -103,7 +103,8 @@ def test_a_torque_limit_that_is_exceeded(capsys):
     assert abs(torque1) < 300.0
     assert torque2 > 120.0
     assert code == 2
-    (line,) = [line for line in text.splitlines() if line.startswith("PROBLEM")]
+    line, most = [line for line in text.splitlines() if line.startswith("PROBLEM")]
+    assert f"joint2_motor has {torque2:.4g} N m" in most
     assert re.fullmatch(
         rf"PROBLEM  joint2_motor needs {torque2:.4g} N m at \S+ s, limit 120 N m", line
     )
@@ -136,7 +137,8 @@ def test_a_contact_that_would_have_to_pull(capsys):
     """2 + 5 sin 2t is negative from t = (pi + asin 0.4) / 2 on; samples are 10 ms apart."""
     code, text = analyze(capsys, "two_link_wall", "--set", "references.wall.force.offset=2")
     assert code == 2
-    (line,) = [line for line in text.splitlines() if line.startswith("PROBLEM")]
+    line, most = [line for line in text.splitlines() if line.startswith("PROBLEM")]
+    assert "wall.force would pull with 3 N" in most
     found = re.fullmatch(
         r"PROBLEM  wall\.force pulls from (\S+) s on, most with 3 N at \S+ s: a real contact would "
         "open",

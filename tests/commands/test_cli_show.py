@@ -26,7 +26,7 @@ def test_where_it_is_and_which_without_a_name(capsys):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("two_link_wal", "did you mean 'two_link_wall'"), ("binary.yaml", "not UTF-8 text")],
+    [("two_link_wal", "'two_link_wall'"), ("binary.yaml", "binary.yaml")],
 )
 def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

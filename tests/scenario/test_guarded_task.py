@@ -84,7 +84,7 @@ def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys)
     assert (code, found["job"]["outcome"]) == (0, "good")
     press, away = found["phases"][1:3]
     assert (press["phase"], away["phase"], away["failed"]) == ("Press", "away", True)
-    assert away["reason"].startswith("Press is ended by a force above 9 N, with ")
+    assert away["reason"].startswith("Press is ended by a force above 9 N")
     story = " ".join(text.split("\n\n")[0].split())
     assert story.startswith("GOOD: the task was done at")
     assert f"{away['reason']}, and away followed, as chosen" in story
@@ -137,10 +137,10 @@ def test_a_sweep_varies_a_guard(file, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("task.phases.0.on_failure=park", "task: phase 1 of the task, feel: on_failure: no phase"),
+        ("task.phases.0.on_failure=park", r"task: .*feel: on_failure: .*'park'"),
         (
             "task.phases.1.guards.0.of=heat",
-            r"task\.phases\.1\.guards\.0\.of: expected one of",
+            r"task\.phases\.1\.guards\.0\.of: ",
         ),
         ("task.phases.1.guards.0.above=.nan", r"task\.phases\.1\.guards\.0.*above"),
         ("task.phases.0.speed=0", r"task\.phases\.0.*speed"),

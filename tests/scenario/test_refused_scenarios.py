@@ -106,7 +106,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("constraints.0.surface.radius=1", ["constraints.0.surface: ", "!Plane"]),
         (f"{SPHERE} {{center: [0, 0, 0]}}", ["constraints.0.surface: ", "!Sphere", "'radius'"]),
         ("constraints.0={frame: tool}", ["constraints.0: ", "'surface'"]),
-        ("outputs.0=!JointPositions {}", ["outputs.0: ", "!JointPositions", "'joints'"]),
         # Settings.
         ("duration", ["--set duration: "]),
         ("", ["--set : "]),
@@ -117,7 +116,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("duration=1\nfoo: 2", ["duration: ", "line 2: "]),
         ("duration.x=1", ["duration: ", "10.0", "'x'"]),
         ("constraints.2=1", ["constraints: ", "'2'", "0"]),
-        ("constraints.-1=1", ["constraints: ", "'-1'"]),
         ("constraints.wall.frame=tool", ["constraints: ", "'wall'", "0"]),
         # Types.
         ("duration=abc", ["duration: ", "'abc'"]),
@@ -125,14 +123,10 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("duration=", ["duration: "]),
         ("constraints={}", ["constraints: ", "{}"]),
         ("robot=arm.urdf", ["robot: ", "'arm.urdf'"]),
-        ("constraints.0.surface=3", ["constraints.0.surface: ", "!Plane", "3"]),
         ("constraints.0.frame=3", ["constraints.0.frame: ", "3"]),
         ("write.plots=maybe", ["write.plots: ", "'maybe'"]),
         (f"{MOVE} {{start: [0], end: [1], end_time: 1, order: 2.5}}", ["tool.z.order: ", "whole"]),
-        ("start.errors=[0.1]", ["start.errors: ", "[0.1]"]),
-        ("start.positions.joint1=a", ["start.positions.joint1: ", "'a'"]),
         ("gains.all=[-4+1j]", ["gains.all.0: ", "'-4+1j'"]),
-        ("outputs.0=!Foo {}", ["outputs.0: ", "!PointCoordinates", "!Foo"]),
         # The robot's file.
         ("robot.file=no.urdf", ["robot.file: ", "/no.urdf"]),
         ("robot.file=package://x/y.urdf", ["robot.file: ", "'x'"]),
@@ -143,7 +137,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         # Constraints.
         ("constraints.0.frame=tol", ["constraints.0: ", "'tol'", "'tool'", "link2"]),
         ("constraints.0.point=[1, 2]", ["constraints.0.point: ", "3", "[1, 2]"]),
-        ("constraints.0.name=", ["constraints.0.name: "]),
         ("constraints.0.name=''", ["constraints.0.name: "]),
         (f"constraints=[{WALL}, {WALL}]", ["constraints.1.name: ", "'wall'"]),
         (
@@ -158,9 +151,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("constraints.0.surface.point=[3, 0, 0]", ["start.positions: ", "wall.distance"]),
         # Welds and pins.
         ("constraints.0=!Weld {}", ["0: ", "!PointOnSurface", "!WeldedFrames", "!Coinc"]),
-        ("constraints.0=!WeldedFrames {frame_a: world}", ["!WeldedFrames", "'frame_b'"]),
         ("constraints.0=!WeldedFrames {frame: tool}", ["!WeldedFrames", "'frame'", "_a"]),
-        (f"{WELD} frame_b: tol}}", ["constraints.0: ", "'tol'", "'tool'"]),
         (
             f"{WELD} frame_b: tool, pose: {{rpy_deg: [0, 90]}}}}",
             ["constraints.0.pose.rpy_deg: ", "3", "[0, 90]"],
@@ -174,8 +165,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             ["constraints.0.pose: ", "'rpy'", "rpy_deg"],
         ),
         (f"{WELD} frame_b: tool}}", ["outputs: ", "6", "2"]),
-        (f"{PIN} point_b: [1, 0, 0], axes: xx}}", ["constraints.0: ", "axes", "'xx'"]),
-        (f"{PIN} axes: x}}", ["constraints.0: ", "!CoincidentPoints", "'point_b'"]),
         (
             ("outputs=[]", f"{PIN} point_b: [1, 0, 0], axes: yz}}"),
             ["constraints: ", "'pin.y'"],
@@ -197,15 +186,13 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ),
         # Gains.
         ("gains.all=[1]", ["gains: ", "Hurwitz"]),
-        ("gains.all=[]", ["gains: ", "tool.z"]),
-        ("gains.all=[-1, -2, -3]", ["gains: ", "'tool.z'", "1", "2", "3"]),
+        ("gains.all=[-1, -2, -3]", ["gains: ", "'tool.z'", "3"]),
         ("gains.outputs={tool.z: [-1]}", ["gains: ", "'all'", "'outputs'"]),
         ("gains=!Poles {outputs: {tool.q: [-1]}}", ["gains: ", "tool.q"]),
-        ("gains=!Poles {outputs: {tool.z: [-1], wall.force: [-1]}}", ["gains: ", "wall.force"]),
         ("gains=!Coefficients {all: [16]}", ["gains: ", "'tool.z'", "2", "1"]),
         ("gains=!Matrices {groups: [[[[1]]]]}", ["gains: ", "2", "1"]),
         ("gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),
-        ("gains=!Matrices {groups: [[[[1, 0], [1]], [[1]]]]}", ["gains: ", "lengths"]),
+        ("gains=!Matrices {groups: [[[[1, 0], [1]], [[1]]]]}", ["gains: groups: "]),
         # References.
         ("references={}", ["references: ", "tool.z", "wall.force"]),
         ("references=[1, 2]", ["references: ", "[1, 2]"]),
@@ -227,7 +214,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         (f"{SINES} {{offset: 1, amplitudes: [1], frequencies: [1, 2]}}", ["frequencies", "2"]),
         (
             f"{SINES} {{offset: 1, amplitudes: [1, 2], frequencies: [1, 2], phases: [0]}}",
-            ["references.wall.force: ", "2", "1"],
+            ["references.wall.force: ", "amplitudes", "phases"],
         ),
         (
             f"{SINES} {{offset: 1, amplitudes: [], frequencies: []}}",
@@ -243,7 +230,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             ["actuation.0: ", "stiffness"],
         ),
         (f"{SPRINGS} abc}}]", ["actuation.0.stiffness: ", "'abc'"]),
-        (f"{SPRINGS} {{a: 1}}}}]", ["actuation.0.stiffness: ", "{'a': 1}"]),
         (f"{SPRINGS} .inf}}]", ["actuation.0.stiffness: "]),
         (f"{SPRINGS} [1, [2]]}}]", ["actuation.0.stiffness: ", "[2]"]),
         (f"{SPRINGS} [[1, 0], [0]]}}]", ["actuation.0.stiffness: ", "[[1, 0]", "[0]"]),
@@ -260,7 +246,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ),
         (
             "force_feedback=!MeasuredForce {time_constant: 1, seed: -1}",
-            ["force_feedback: ", "-1"],
+            ["force_feedback: seed: ", "-1"],
         ),
         ("plant_parameters={link9.mass: [1]}", ["plant_parameters: ", "link9.mass", "link2.mass"]),
         # The start.
@@ -275,10 +261,8 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         # The run.
         ("duration=0", ["duration: ", "positive", "0"]),
         ("integrator.integration_scheme=runge_kuta5", ["integrator: ", "'runge_kutta5'"]),
-        ("integrator.integration_scheme=cenic", ["integrator: ", "integration_scheme", "'cenic'"]),
         ("integrator.integration_scheme=runge_kutta2", ["integrator: ", "use_error_control"]),
         ("integrator.accuracy=0", ["integrator: ", "accuracy", "0"]),
-        ("integrator.target_realtime_rate=-1", ["integrator: ", "target_realtime_rate", "-1"]),
     ],
 )
 def test_refused_with_key_value_and_remedy(settings, words):

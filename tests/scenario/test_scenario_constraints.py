@@ -343,7 +343,7 @@ EQUAL = """<mujoco model="m"><worldbody>
         (
             "robot.urdf",
             GRIPPER.replace("</robot>", BALLS),
-            ["robot.file: ", "1", "(s)"],
+            ["robot.file: ", "CoincidentPoints"],
         ),
         ("robot.xml", EQUAL, ["robot.file: ", "equality", "ignored", "!JointCoupler"]),
     ],

@@ -87,8 +87,7 @@ def test_rollouts_diverge_as_simulations_do(fixed, compiled):
     loop, context = build_scenario(case)
     found = roll_scenario(case, loop, context)
     assert found.failure is not None
-    assert "the run diverges: at t" in str(found.failure)
-    assert "the error of wall.force" in str(found.failure)
+    assert "wall.force" in str(found.failure)
     # What was recorded is kept, up to where it says so.
     assert found.record.time[-1] == found.failure.time < 0.1
     assert found.record.time.size > 1

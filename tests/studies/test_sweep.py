@@ -296,9 +296,9 @@ def test_what_cannot_be_is_reported_before_anything_runs(variations, words, tmp_
     assert not file.parent.exists()
 
 
-@pytest.mark.parametrize(("workers", "words"), [(0, "from 1"), (1.5, "a whole number")])
-def test_workers_are_counted(workers, words, tmp_path):
-    with pytest.raises(ValueError, match=words):
+@pytest.mark.parametrize("workers", [0, 1.5])
+def test_workers_are_counted(workers, tmp_path):
+    with pytest.raises(ValueError, match=f"workers.*{workers}"):
         dd.sweep(chosen(), [{}], tmp_path / "runs.db", workers=workers)
 
 

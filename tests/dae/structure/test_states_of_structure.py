@@ -45,9 +45,9 @@ def test_constraints_that_contradict_each_other():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"f": lambda x: [ca.sqrt(x[0] - 1), 0]}, r"\bf of "),
-        ({"h": lambda x: [0, 1 / x[0]]}, r"\bh of "),
-        ({"f": lambda x: [x[1], ca.log(x[0])], "l": lambda x: 1 / x[1]}, "f, l of "),
+        ({"f": lambda x: [ca.sqrt(x[0] - 1), 0]}, r"\bf\b"),
+        ({"h": lambda x: [0, 1 / x[0]]}, r"\bh\b"),
+        ({"f": lambda x: [x[1], ca.log(x[0])], "l": lambda x: 1 / x[1]}, r"\bf, l\b"),
         # Finite, but with an infinite derivative.
         ({"l": lambda x: ca.sqrt(x[0])}, r"x = \[0., 0.\]"),
     ],
@@ -90,7 +90,7 @@ def test_branches_of_the_manifold_are_no_singularity():
 
 def test_infinite_matrices_are_no_singularity():
     """B = 1/(x0 - 0.02) changes its sign through infinity."""
-    with pytest.raises(ModelError, match="system: "):
+    with pytest.raises(ModelError, match=r"x = \[0\.\]"):
         find_structure(system_of(1, f=lambda x: 0, h=lambda x: 1 / x, l=lambda x: x))
     structure = find_structure(
         system_of(1, f=lambda x: 0, h=lambda x: 1 / (x - 0.02), l=lambda x: x)

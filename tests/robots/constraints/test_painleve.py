@@ -299,13 +299,13 @@ def test_sets_of_forces_are_those_of_complementarity():
 def test_too_many_contacts_are_refused():
     names = [Signal(f"f{i}") for i in range(MOST + 1)]
     friction = Parameter("mu", np.array([0.3]))
-    with pytest.raises(ModelError, match="9 unilateral forces"):
+    with pytest.raises(ModelError, match="9"):
         Contacts("x", names, [friction], [UnilateralInput(n.name, "mu") for n in names])
 
 
 def test_a_contact_needs_the_friction_that_it_names():
     system = touching("two_link").dae
-    with pytest.raises(ModelError, match="no parameter"):
+    with pytest.raises(ModelError, match=r"wall\.friction"):
         replace(system, contacts=(UnilateralInput("wall.force", "wall.friction"),))
 
 

@@ -95,13 +95,8 @@ def test_node_runs_what_drake_does(exported):
     assert abs(found["heavier"]) > 0.1
     assert (found["time"], found["period"]) == (0.0, 0.001)
     assert found["status"] == ["stopped", "number"]
-    assert found["wrong"] == [
-        "there is no part 'wall': loop, plant, controller",
-        "Cannot add property mass, object is not extensible",
-        "two_link_arm.link1.mass is a number, got 1",
-        "control has 2 numbers, got 1",
-        "plant at t = 0.299 s: a function has no value: not finite, or singular",
-    ]
+    named = ["'wall'", "mass", "two_link_arm.link1.mass", "control", "t = 0.299 s"]
+    assert all(name in said for name, said in zip(named, found["wrong"], strict=True))
 
 
 @needs_zig

@@ -364,8 +364,8 @@ def test_drakes_own_contact_is_the_plant():
     ("phases", "message"),
     [
         ([], "phases"),
-        ([Approach(), Retreat(0.1)], r"phase 2 of the task, Retreat: .*Release"),
-        ([Retreat(0.1), Press(20.0)], r"phase 2 of the task, Press: .*Approach"),
+        ([Approach(), Retreat(0.1)], r"Retreat: .*Release"),
+        ([Retreat(0.1), Press(20.0)], r"Press: .*Approach"),
         ([Press(20.0, if_lost="approach")], "if_lost: "),
     ],
 )

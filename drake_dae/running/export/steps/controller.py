@@ -1,19 +1,21 @@
 """The whole controller of a loop as one step function in C99, and as a C++ class."""
 
 from collections.abc import Mapping, Sequence
+from math import floor
 from pathlib import Path
 
-from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context, Diagram
+import numpy as np
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import Context, Diagram, OutputPortIndex
 
 from drake_dae.arguments import checked
+from drake_dae.compiler.wires import Port
 from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.export.steps.boundary import ExportedPart, controller_part
 from drake_dae.running.export.steps.cuts import CONTROL
 from drake_dae.running.export.steps.parts import CONTROLLER, WrittenPart, defaults
-from drake_dae.running.export.steps.played import played_run
 from drake_dae.running.export.steps.ticks import Ticks
 from drake_dae.running.export.steps.words import (
     GeneratedFunctions,
@@ -194,3 +196,71 @@ def _copied(
         lines.append(f"  memcpy({to}, {source}, sizeof(double) * {len(signals)});\n")
         first += len(signals)
     return "".join(lines)
+
+
+def played_run(
+    diagram: Diagram,
+    part: ExportedPart,
+    context: Context,
+    config: SimulatorConfig | None,
+    duration: float,
+    most: int,
+) -> str:
+    """Returns the run as CSV: each line has the time in s, the inputs, and the resulting outputs.
+
+    The inputs are those before the updates of the same instant. If outputs change by these updates,
+    they are evaluated after Drake has made the updates without advancing the time.
+
+    Args:
+        diagram: The whole diagram.
+        part: The controller of the diagram.
+        context: The context at the start.
+        config: Drake's settings; None for defaults.
+        duration: The largest duration of the run, in s.
+        most: The largest number of steps.
+
+    Raises:
+        SimulationError: The run ends before its first step.
+    """
+    config, ticks = config or SimulatorConfig(), part.ticks
+    simulator = Simulator(diagram, context.Clone())
+    ApplySimulatorConfig(config, simulator)
+    own = simulator.get_mutable_context()
+    own.SetTime(context.get_time())
+    own.SetAccuracy(config.accuracy)
+    simulator.Initialize()
+    first = ticks.at(context.get_time())
+    count = max(1, min(most, floor(duration / ticks.period + 1e-9)))
+    wires = part.compiled.wires
+    inputs, outputs = list(wires.inputs.values()), list(wires.outputs.values())
+
+    def values(ports: list[Port]) -> list[float]:
+        columns = [
+            system.get_output_port(OutputPortIndex(index)).Eval(system.GetMyContextFromRoot(own))
+            for system, index in ports
+        ]
+        return np.concatenate(columns).tolist() if columns else []
+
+    signals = [
+        signal.name
+        for group in (part.inputs, part.outputs)
+        for signals in group.values()
+        for signal in signals
+    ]
+    lines = [",".join(["time", *(name.replace(",", " ") for name in signals)])]
+    for tick in range(first, first + count):
+        try:
+            if tick > first:
+                simulator.AdvanceTo(ticks.time(tick))
+            row = [own.get_time(), *values(inputs)]
+            if part.acts_at_once:
+                row += values(outputs)
+            simulator.AdvancePendingEvents()
+            if not part.acts_at_once:
+                row += values(outputs)
+        except SimulationError:
+            if tick == first:
+                raise
+            break
+        lines.append(",".join(map(repr, row)))
+    return "\n".join([*lines, ""])
