@@ -12,10 +12,6 @@ from drake_dae.analysis.tables import count_of
 from drake_dae.errors import ModelError
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.studies.runs import Outcome
-from drake_dae.studies.study import FILES
-from drake_dae.studies.sweep import sweep
-from drake_dae.studies.variations import parse_variations
 
 JOURNAL = "runs.db"
 """The name of the file with the results, from which the command continues."""
@@ -33,6 +29,12 @@ def run_command(options: argparse.Namespace) -> int:
 
 def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Runs the study; returns the exit code, and the results for JSON."""
+    # They load SciPy's integrators, which no other command needs.
+    from drake_dae.studies.runs import Outcome
+    from drake_dae.studies.study import FILES
+    from drake_dae.studies.sweep import sweep
+    from drake_dae.studies.variations import parse_variations
+
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     variations = parse_variations(options.vary, options.random, options.seed, options.together)

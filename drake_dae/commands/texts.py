@@ -6,11 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from drake_dae.errors import MachineCodeError, ScenarioError
-from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.scenario import scenario_schema
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.trace.cache import cache_folder, clear, contents
-from drake_dae.trace.compiler import find_compiler
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -42,6 +38,9 @@ def _scenario(options: argparse.Namespace) -> str:
 
 def _cache(is_cleared: bool) -> None:
     """Prints the size of the cache of machine code, and the compiler; or empties the cache."""
+    from drake_dae.trace.cache import cache_folder, clear, contents
+    from drake_dae.trace.compiler import find_compiler
+
     files = contents()
     size = sum(path.stat().st_size for path in files if path.is_file())
     what = f"{len(files)} files, {size / 1e6:.1f} MB"
@@ -61,6 +60,8 @@ def editor_schema() -> dict[str, Any]:
 
     An editor passes the value after a tag, so any form fits where a tag chooses.
     """
+    from drake_dae.scenario.scenario import scenario_schema  # `print` needs no Drake.
+
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "$comment": f"Tags, for an editor: {', '.join(custom_tags())}",
@@ -71,6 +72,8 @@ def editor_schema() -> dict[str, Any]:
 
 def custom_tags() -> list[str]:
     """All tags, as the YAML language server takes them: "!Sphere mapping"."""
+    from drake_dae.scenario.scenario import scenario_schema
+
     return [f"{tag} mapping" for tag in dict.fromkeys(_tags(scenario_schema()))]
 
 
@@ -78,6 +81,6 @@ def _tags(schema: Mapping[str, Any]) -> Iterator[str]:
     for value in schema.values():
         for part in value if isinstance(value, list) else [value]:
             if isinstance(part, dict):
-                if TAG in part:
-                    yield part[TAG]["const"]
+                if "_tag" in part:
+                    yield part["_tag"]["const"]
                 yield from _tags(part)

@@ -166,7 +166,7 @@ def test_a_constraint_that_is_there_with_other_numbers_alone(k, cause):
         parameters={"w": 0.0, "c": 1.0},
         exogenous=["w"],
     )
-    with pytest.raises(AssumptionError, match="w") as caught:
+    with pytest.raises(AssumptionError) as caught:
         find_constraint_structure(system)
     assert caught.value.violation.cause is cause
     assert caught.value.violation.deciding.names[0] == "w"

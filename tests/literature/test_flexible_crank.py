@@ -109,6 +109,7 @@ def crank(level: int) -> DaeSystem:
         m=ca.SX(0, 3),
         parameters=(time,),
         nominal_state=START,
+        state_scale=np.where(START == 0.0, 1e-5, np.abs(START)),
         name="flexible slider crank",
     )
 

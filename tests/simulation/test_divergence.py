@@ -52,13 +52,6 @@ LATE = "sampling={period: %g, delay: %g}"
             "dome.force",
             marks=pytest.mark.slow,
         ),
-        # Springs behind Drake's contact, with a load that the law does not know.
-        pytest.param(
-            "wall_flexible_contact",
-            ("plant_payloads=[{frame: tool, mass: 0.5}]", "duration=1.0"),
-            "joint6_motor.velocity",
-            marks=[pytest.mark.slow, pytest.mark.thorough],
-        ),
     ],
 )
 def test_a_loop_that_diverges_ends_with_what_grew_and_since_when(name, settings, grew):

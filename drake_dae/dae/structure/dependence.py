@@ -77,8 +77,8 @@ def find_dependence(
     function = system.trace("dependence", {k: ca.densify(e) for k, e in rows.items()}, often=False)
 
     def matrices(state: FloatArray) -> list[FloatArray]:
-        values = function(state, system.parameter_values)
-        return [value.reshape(len(names), -1) for value in values]
+        a, last = (v.reshape(len(names), -1) for v in function(state, system.parameter_values))
+        return [a, last * system.scale]
 
     def is_singular(state: FloatArray) -> bool:
         scaled = _scaled(matrices(state)[0])[0]
@@ -91,7 +91,7 @@ def find_dependence(
     examined = [where, *states] if everywhere else [where]
     dependent = all(in_gradients(state) for state in examined)
     # Chains may depend on each other below their last derivatives alone.
-    by_gradients = dependent and are_dependent(matrices(where)[1] * system.scale)
+    by_gradients = dependent and are_dependent(matrices(where)[1])
     values = [matrices(state)[1 if by_gradients else 0] for state in examined]
     return Dependence(tuple(combinations_of(names, values)), everywhere, dependent)
 
@@ -103,7 +103,7 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
         return ()
     names = [signal.name for signal in system.constraint_output_signals]
     values = samples.values(gradient=ca.jacobian(system.k, system.state))
-    return tuple(combinations_of(names, [gradient for (gradient,) in values]))
+    return tuple(combinations_of(names, [gradient * system.scale for (gradient,) in values]))
 
 
 def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combination]:
@@ -121,8 +121,9 @@ def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combin
 
 def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
     # A residual alone in its column counts as much as any other entry.
-    sizes = np.abs(gradients * scale)
-    return np.where(sizes < _ON_MANIFOLD * sizes.max(axis=1, keepdims=True), 0, gradients)
+    scaled = gradients * scale
+    sizes = np.abs(scaled)
+    return np.where(sizes < _ON_MANIFOLD * sizes.max(axis=1, keepdims=True), 0, scaled)
 
 
 def combinations_of(

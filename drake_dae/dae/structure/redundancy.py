@@ -132,8 +132,9 @@ def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
 def independent_constraints(samples: Samples) -> list[int]:
     """Selects constraints that are well independent of each other at all sampled states."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
-    remainders = [equilibrated(significant(gradient)) for (gradient,) in values]
-    most = min(rank_of(gradient, DEPENDENT) for (gradient,) in values)
+    scale = samples.system.scale
+    remainders = [equilibrated(significant(gradient * scale)) for (gradient,) in values]
+    most = min(rank_of(gradient * scale, DEPENDENT) for (gradient,) in values)
     remaining: list[int] = []
     while len(remaining) < most:
         independence = np.min([np.linalg.norm(matrix, axis=1) for matrix in remainders], axis=0)
@@ -169,7 +170,8 @@ def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None
     gradients = samples.values(
         gradient=ca.jacobian(system.k, system.state), moved=ca.jacobian(system.k, moving)
     )
-    for (gradient, moved), fields in zip(gradients, samples.fields, strict=True):
+    for (by_state, moved), fields in zip(gradients, samples.fields, strict=True):
+        gradient = by_state * system.scale
         if _is_less(gradient, remaining):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: its gradients are not combinations of "
@@ -181,7 +183,7 @@ def check_same_motion(samples: Samples, remaining: list[int], gone: str) -> None
                 f"{system.name}: {gone} cannot be left out: where the exogenous signals {names} "
                 "move, the constraints left out are no longer implied by the remaining ones"
             )
-        if _is_less(fields["g"].T, remaining):
+        if _is_less(fields["g"].T / system.scale, remaining):
             raise ModelError(
                 f"{system.name}: {gone} cannot be left out: its columns of g are not combinations "
                 "of the remaining columns"

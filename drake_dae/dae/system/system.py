@@ -17,7 +17,7 @@ from drake_dae.dae.system.checks import checked_fields
 from drake_dae.dae.system.contacts import Contacts, UnilateralInput
 from drake_dae.dae.system.exogenous import Exogenous
 from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
-from drake_dae.dae.system.scale import natural_scale, spread_about
+from drake_dae.dae.system.scale import spread_about
 from drake_dae.dae.system.sharing import ForceSharing
 from drake_dae.dae.system.signals import Parameter, Signal, bounded, moving, valued
 from drake_dae.errors import ModelError
@@ -71,7 +71,8 @@ class DaeSystem:
             unit. Made up ("x0", "x1", ...) where not given.
         nominal_state: The initial guess for consistent states, shape (n,); zero if None.
         state_scale: The typical size of each state, positive, shape (n,). Random states, searches
-            and tolerances are relative to it. If None, `scale` is computed from the equations.
+            and tolerances are relative to it. If None, max(|nominal state|, 1), so that give it
+            where a state is measured in a unit that is far from its size.
         name: The name of the system in messages.
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
         implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
@@ -337,16 +338,13 @@ class DaeSystem:
 
     @cached_property
     def scale(self) -> FloatArray:
-        """The typical size of each state, shape (n,): `state_scale`, or from the equations.
+        """The typical size of each state, shape (n,): `state_scale`, or max(|nominal state|, 1).
 
-        The sizes do not depend on the units; see `natural_scale`. Do not change the array.
+        Do not change the array.
         """
         if self.state_scale is not None:
             return self.state_scale
-        keys = ("mass_matrix", "f", "g", "h", "k", "l", "m")
-        functions = {key: getattr(self, key) for key in keys}
-        parameters = (self.parameter_symbol, self._defaults)
-        return natural_scale(functions, self.state, parameters, self.nominal_state)
+        return np.maximum(np.abs(self.nominal_state), 1.0)
 
     @property
     def nominal_spread(self) -> FloatArray:

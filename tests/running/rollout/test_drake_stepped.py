@@ -105,7 +105,7 @@ def test_many_starts_are_each_alone():
 def test_a_continuous_state_beside_it_is_refused(robot, setting):
     settings = CONTINUOUS if robot == "two_link_wall" else ()
     loop, context = build_scenario(scenario(robot, *settings, setting))
-    with pytest.raises(ModelError, match=r"Drake's own contact.*'force_sensor'.*simulate"):
+    with pytest.raises(ModelError, match="'force_sensor'"):
         start_values(loop, context)
 
 

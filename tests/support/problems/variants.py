@@ -30,4 +30,5 @@ def in_other_units(system: DaeSystem, state, force, control, constraint, output)
         l=moved(system.l) / output,
         m=ca.mtimes(np.diag(1 / output), ca.mtimes(moved(system.m), np.diag(force))),
         nominal_state=system.nominal_state / state,
+        state_scale=system.scale / state,
     )

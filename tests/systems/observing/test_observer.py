@@ -428,7 +428,7 @@ def test_what_cannot_be_observed_is_refused():
     system = body()
     with pytest.raises(ModelError, match="'w'"):
         with_disturbance(system, ["w"])
-    with pytest.raises(ModelError, match=r"\bv\b"):
+    with pytest.raises(ModelError, match="disturbance"):
         with_disturbance(system, ["v"])
     model, dae = frictional(0.3)
     with pytest.raises(ModelError, match="disturbance"):
@@ -456,7 +456,7 @@ def test_what_cannot_be_observed_is_refused():
     context = observer.CreateDefaultContext()
     observer.set_friction(context, 0.4)
     assert observer.GetOutputPort("friction").Eval(context) == 0.4
-    with pytest.raises(ModelError, match="1"):
+    with pytest.raises(ModelError, match=r"1\.4"):
         observer.set_friction(context, 1.4)
 
 
