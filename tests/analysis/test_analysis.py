@@ -114,7 +114,7 @@ def test_1_a_degree_that_is_not_defined():
     assert findings(analysis) == [NO, OPEN, OPEN, OPEN, OPEN]
     assert (analysis.constraint_degrees, analysis.index, analysis.structure) == (None, None, None)
     (problem,) = analysis.problems
-    assert problem.startswith(r"Assumption (1): ")
+    assert problem.startswith("Assumption (1): ")
     assert "index ?, N* of dimension ?, zero dynamics of dimension ?" in str(analysis)
     # Beside the nominal state only, and without a change of sign.
     beside = system_of(3, g=lambda x: [0, (x[0] - 0.03) ** 2, 0], state_scale=np.ones(3), **fields)

@@ -247,7 +247,7 @@ def test_the_controller_has_the_gradients_of_the_choice(law):
 
 
 def test_the_report_reports_what_is_left_to_choose(law):
-    assert "2 combinations" in str(analyze(law.system, count=5))
+    assert "leaves 2" in str(analyze(law.system, count=5))
 
 
 def test_units_of_the_controls_change_nothing_but_their_numbers(law):

@@ -1,7 +1,5 @@
 """How far pinned motions go: reach, singular configurations, growth, drift, and how much work."""
 
-import re
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -21,6 +19,7 @@ from scipy.integrate import solve_ivp
 
 import drake_dae.dae.zero_dynamics.pursuit as module
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.errors import NonFiniteError
@@ -33,7 +32,7 @@ def test_a_reference_out_of_reach_ends_the_motion_where_the_arm_is_straight():
     times = np.linspace(0.0, 3.0, 31)
     reference = derivatives(lambda t: [(1.2 + 0.3 * t) * d for d in direction], (2, 2))
     motion = dynamics.motion(reference, times)
-    assert r"t = 2 s: B(x) " in str(motion.ending)
+    assert (motion.ending.cause, motion.ending.matrix) == (EndCause.OUT_OF_REACH, "B")
     # A step below a millionth of the grid's ends the search: twice that is not tried any more.
     assert motion.ending.time == pytest.approx(2.0, abs=2e-6 * 0.1)
     np.testing.assert_allclose(motion.times, times[times < 2.0 - 1e-9])
@@ -72,7 +71,7 @@ def test_a_singular_arm_on_the_way():
     dynamics = zero_dynamics(free_arm())
     reference = derivatives(lambda t: [1.8 - 0.3 * (t - 1.0) ** 2, 0], (2, 2))
     motion = dynamics.motion(reference, np.linspace(0.0, 2.0, 11), [-0.5, 1.0, 0.0, 0.0])
-    assert re.search(r"at t = .* s B\(x\) becomes singular", str(motion.ending))
+    assert (motion.ending.cause, motion.ending.matrix) == (EndCause.SINGULAR, "B")
     # Up to where Newton's method cannot tell the two elbows from each other.
     assert motion.ending.time == pytest.approx(1.0, abs=1e-5)
 
@@ -89,7 +88,7 @@ def test_a_singular_b_under_running_zero_dynamics():
     )
     times = np.linspace(0.0, 2.1, 8)  # 1 is not among them, and a step may pass it.
     motion = zero_dynamics(system).motion(derivatives(lambda t: [ca.sin(t)], (1,)), times)
-    assert "at t = 1 s B(x) becomes singular" in str(motion.ending)
+    assert (motion.ending.cause, motion.ending.matrix) == (EndCause.SINGULAR, "B")
     assert motion.ending.time == pytest.approx(1.0, abs=1e-6)
     np.testing.assert_allclose(motion.control_margins, 1.0 - motion.times, atol=1e-12)
     np.testing.assert_allclose(motion.controls[:, 0], np.cos(motion.times) / (1 - motion.times))
@@ -101,14 +100,12 @@ def test_unstable_zero_dynamics_end_the_motion_in_growth():
     still = derivatives(lambda t: [0], (1,))
     times = np.linspace(0.0, 30.0, 31)
     slow = zero_dynamics(internal(lambda s, z: s)).motion(still, times)
-    assert "the internal states grow without bound while the outputs follow: s = " in str(
-        slow.ending
-    )
+    assert slow.ending.cause is EndCause.UNBOUNDED
     assert slow.times[-1] == pytest.approx(np.floor(8.0 * np.log(10.0)))
     # 1e-8 a step, 500 steps.
     np.testing.assert_allclose(slow.states[:, 1], np.exp(slow.times), rtol=5e-6)
     fast = zero_dynamics(internal(lambda s, z: s**2)).motion(still, np.linspace(0.0, 2.0, 21))
-    assert "grow without bound" in str(fast.ending)
+    assert fast.ending.cause is EndCause.UNBOUNDED
     assert fast.ending.time == pytest.approx(1.0, abs=1e-5)
     np.testing.assert_allclose(fast.states[:, 1], 1 / (1 - fast.times), rtol=1e-6)
 
@@ -176,7 +173,7 @@ def test_the_work_is_bounded(monkeypatch):
     motion = zero_dynamics(system).motion(
         derivatives(lambda t: [0], (2,)), [0.0, 1000.0], [0.0, 1.0, 0.0, 0.0]
     )
-    assert "after 50 steps the motion is at t = " in str(motion.ending)
+    assert motion.ending.cause is EndCause.TOO_FAST
     assert 0.0 < motion.ending.time < 1000.0
 
 
@@ -205,7 +202,7 @@ def test_motions_end_where_domain_and_reference_do():
     )
     dynamics, times = zero_dynamics(tank), np.linspace(0.0, 2.0, 21)
     motion = dynamics.motion(derivatives(lambda t: [1 - 1.003 * t], (1,)), times)
-    assert "t = 0.997" in str(motion.ending)
+    assert motion.ending.cause is EndCause.NO_WAY_ON
     assert motion.ending.time == pytest.approx(1 / 1.003, abs=1e-6)
     assert motion.times.size == 10
 
@@ -213,14 +210,14 @@ def test_motions_end_where_domain_and_reference_do():
         return np.array([1.0 if t < 0.55 else 3.0, 0.0])
 
     motion = dynamics.motion(jumping, times)
-    assert "the reference jumps" in str(motion.ending)
+    assert motion.ending.cause is EndCause.NO_WAY_ON
     assert motion.ending.time == pytest.approx(0.55, abs=1e-6)
 
     def short(t: float) -> Array:
         return np.array([1.0, 0.0]) if t <= 1.0 else np.array([np.nan, 0.0])
 
     motion = dynamics.motion(short, times)
-    assert "t = 1.1 s" in str(motion.ending)
+    assert motion.ending.cause is EndCause.REFERENCE_NOT_FINITE
     assert motion.times[-1] == 1.0
 
     def raising(t: float) -> Array:
@@ -234,7 +231,7 @@ def test_motions_end_where_domain_and_reference_do():
     tanks = zero_dynamics(quadruple_tank(**MINIMUM_PHASE))
     lowered = derivatives(lambda t: [12.4 - 0.5 * t, 12.7 - 0.5 * t], (1, 1))
     motion = tanks.motion(lowered, np.linspace(0.0, 20.0, 41))
-    assert "the domain of the system ends" in str(motion.ending)
+    assert motion.ending.cause is EndCause.NO_WAY_ON
     assert 0 < motion.times.size < 41
     assert np.min(motion.states) > 0.0
 
@@ -242,8 +239,8 @@ def test_motions_end_where_domain_and_reference_do():
 def test_a_motion_that_has_no_start_is_empty():
     dynamics = zero_dynamics(free_arm())
     motion = dynamics.motion(lambda t: np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]), [0.5, 1.0])
-    assert "the outputs x = 2, y = 0 are not reached" in str(motion.ending)
-    assert "(t = 0.5 s)" in str(motion.ending)
+    assert motion.ending.cause is EndCause.NO_START
+    assert "x = 2, y = 0" in str(motion.ending)
     assert motion.ending.time == 0.5
     assert motion.states.shape == (0, 4)
     assert motion.controls.shape == (0, 2)

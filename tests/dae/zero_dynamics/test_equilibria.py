@@ -378,7 +378,7 @@ def test_a_clock_among_the_states_is_reported():
     for outputs in (None, [0.0, 10.0]):
         stability = dynamics.stability(dynamics.structure.states[0], outputs=outputs)
         assert stability.verdict is Verdict.UNDECIDED
-        assert "no state is an equilibrium, since c' = 1" in stability.reason
+        assert "c' = 1" in stability.reason
         assert "z1" not in stability.reason
 
 
