@@ -100,6 +100,7 @@ class Manifold(Residual):
             )
         return found
 
+    @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
         """Whether the residual is large though Newton's step is short.
 
