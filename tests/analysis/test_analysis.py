@@ -7,10 +7,6 @@ import numpy as np
 import pytest
 from problems import (
     PROBLEMS,
-    changed,
-    double_integrator,
-    early_control,
-    redundant,
     system_of,
 )
 from problems.found import NO, OPEN, YES, findings
@@ -124,70 +120,6 @@ def test_1_a_degree_that_is_not_defined():
     assert analysis.assumptions[0].margin.state[0] == pytest.approx(0.03, abs=1e-3)
     assert analysis.constraint_degrees == (1,)
     assert analysis.structure is not None
-
-
-def test_2_redundant_constraints():
-    analysis = analyze(redundant(lambda x: [x[0], x[0]]))
-    assert findings(analysis) == [YES, NO, YES, OPEN, OPEN]
-    assert (analysis.constraint_degrees, analysis.index) == ((2, 2), None)
-    assert (analysis.output_degrees, analysis.structure) == (None, None)
-    assert "y0" in analysis.problems[0]
-    assert analysis.assumptions[1].margin.relative < 1e-12
-    assert analysis.assumptions[3].reason == "Assumption (2) is violated"
-
-
-def test_2_more_constraints_than_states():
-    analysis = analyze(
-        system_of(
-            1,
-            f=lambda x: 0,
-            g=lambda x: [[1, 1]],
-            h=lambda x: 1,
-            k=lambda x: [x[0], x[0] + 1],
-            l=lambda x: x[0],
-            m=lambda x: [[0, 0]],
-        )
-    )
-    assert findings(analysis) == [OPEN, NO, OPEN, OPEN, OPEN]
-    assert "m = 2" in str(analysis)
-
-
-def test_3_a_control_that_enters_before_the_force_does():
-    analysis = analyze(early_control())
-    assert findings(analysis) == [OPEN, OPEN, NO, OPEN, OPEN]
-    assert r"Assumption (3)" in analysis.problems[0]
-
-
-def test_4_a_degree_that_is_not_defined():
-    analysis = analyze(double_integrator(l=lambda x: x[0] + x[1] ** 2))
-    assert findings(analysis) == [YES, YES, YES, NO, OPEN]
-    assert analysis.constraint_degrees == ()
-    assert analysis.index == 0
-    assert "'z0'" in analysis.problems[0]
-
-
-def test_5_an_output_that_no_control_reaches():
-    arm = PROBLEMS["two_link_arm"]().system
-    analysis = analyze(changed(arm, l=ca.vertcat(0, arm.k)))
-    assert findings(analysis) == [YES, YES, YES, OPEN, NO]
-    assert (analysis.constraint_degrees, analysis.output_degrees) == ((2,), None)
-    assert analysis.structure is None
-    assert re.search(r"height +\? +\?", str(analysis))
-
-
-def test_5_outputs_that_repeat_each_other():
-    analysis = analyze(
-        system_of(2, f=lambda x: [0, 0], h=lambda x: [[1, 0], [0, 1]], l=lambda x: [x[0], 2 * x[0]])
-    )
-    assert findings(analysis) == [YES, YES, YES, YES, NO]
-    assert analysis.output_degrees == (1, 1)
-    # Their gradients depend on each other as well, which is nothing new.
-    assert len(analysis.problems) == 1
-    assert analysis.independence.is_singular
-    assert re.search(r"^2\.1 .* does not hold ", str(analysis), re.M)
-    constraints = re.findall(r"^\([123]\) .*: m = 0 +satisfied$", str(analysis), re.M)
-    assert len(constraints) == 3
-    assert (analysis.structure, analysis.zero_dynamics) == (None, None)
 
 
 def nearly_singular(gap: float) -> DaeSystem:

@@ -10,7 +10,6 @@ import resource
 import subprocess
 import sys
 import time
-import timeit
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from drake_dae import build_scenario, load_scenario, simulate
 from drake_dae.scenario.shipped import find_scenario
 
 SCENARIOS = ["two_link_wall", "seven_joint_wall"]
-TARGETS = {"two_link_wall": 20.0, "seven_joint_wall": 60.0}
 
 
 class _EmptyPlant(LeafSystem):
@@ -53,25 +51,6 @@ class _EmptyController(LeafSystem):
         output.SetFromVector(self.value)
 
 
-def microseconds(diagram, context, repeat=5, number=4000):
-    """Least time of one derivative evaluation at a new state, over repeats."""
-    state = context.get_continuous_state_vector().CopyToVector()
-    derivatives = diagram.AllocateTimeDerivatives()
-
-    def touch():
-        context.SetTime(0.5)
-        context.SetContinuousState(state)
-
-    def evaluate():
-        touch()
-        diagram.CalcTimeDerivatives(context, derivatives)
-
-    whole, part = (
-        min(timeit.repeat(f, number=number, repeat=repeat)) / number for f in (evaluate, touch)
-    )
-    return 1e6 * (whole - part)
-
-
 def empty_loop(states, references, controls):
     builder = DiagramBuilder()
     plant = builder.AddSystem(_EmptyPlant(states, controls))
@@ -82,24 +61,6 @@ def empty_loop(states, references, controls):
     builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
     diagram = builder.Build()
     return diagram, diagram.CreateDefaultContext()
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_derivative_evaluation(name, report):
-    loop, context = build_scenario(load_scenario(find_scenario(name)))
-    law = loop.controller.law
-    empty = empty_loop(law.system.num_states, len(law.reference_signals), law.system.num_controls)
-    ours, drake = microseconds(loop.diagram, context), microseconds(*empty)
-    report(
-        name,
-        {
-            "law [operations]": f"{law.function.num_operations}",
-            "plant [operations]": f"{loop.plant.dynamics.num_operations}",
-            "derivative [us]": f"{ours:.1f} (<{TARGETS[name]:.0f})",
-            "of empty blocks [us]": f"{drake:.1f}",
-            "ratio": f"{ours / drake:.1f}",
-        },
-    )
 
 
 def stepping(diagram, context):
@@ -117,38 +78,6 @@ def stepping(diagram, context):
         return 1e6 * (time.perf_counter() - began) / 20
 
     return run
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_a_step(name, report):
-    loop, context = build_scenario(load_scenario(find_scenario(name)))
-    law = loop.controller.law
-    empty = empty_loop(law.system.num_states, len(law.reference_signals), law.system.num_controls)
-    runs = stepping(loop.diagram, context), stepping(*empty)
-    # Turn by turn, so that both meet the same moods of the machine.
-    ours, drake = (min(times) for times in zip(*((a(), b()) for a, b in [runs] * 30), strict=True))
-    began = time.perf_counter()
-    record = loop.record(context)
-    recorded = 1e6 * (time.perf_counter() - began) / record.time.size
-    report(
-        name,
-        {
-            "1 ms step [us]": f"{ours:.0f}",
-            "to that of empty blocks": f"{ours / drake:.1f}",
-            "record [us a step]": f"{recorded:.0f}",
-        },
-    )
-
-
-def test_starting(report):
-    def seconds(*words):
-        began = time.perf_counter()
-        subprocess.run([sys.executable, *words], check=True, capture_output=True)
-        return time.perf_counter() - began
-
-    pairs = [(seconds("-m", "drake_dae", "list"), seconds("-c", "import numpy")) for _ in range(5)]
-    ours, numpy = map(min, zip(*pairs, strict=True))
-    report("drake-dae list", {"[s]": f"{ours:.2f} (<0.3)", "to NumPy alone": f"{ours / numpy:.1f}"})
 
 
 def test_a_short_run(tmp_path, report):

@@ -14,12 +14,13 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
 from runs import scenario
-from test_actuation_speed import MOTORS, SPRINGS
 from test_speed import empty_loop, stepping
 from timing import calls, has_compiler, race, times
 from two_arms import two_arms
 
 from drake_dae import (
+    DcMotors,
+    FlexibleJoints,
     JointPositions,
     Plane,
     PointOnSurface,
@@ -33,6 +34,8 @@ from drake_dae import (
     start_values,
 )
 
+SPRINGS = FlexibleJoints(8000.0, inertia=1.0)
+MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 FIXED = [
     "integrator.integration_scheme=runge_kutta3",
     "integrator.use_error_control=false",

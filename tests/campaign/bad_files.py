@@ -1,4 +1,4 @@
-"""Data, robots, records and command lines with a mistake, read by what users read them with."""
+"""Robots, records and command lines with a mistake, read by what users read them with."""
 
 import contextlib
 import io
@@ -7,26 +7,19 @@ import random
 import struct
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from campaign.outcomes import RAW, REFUSED, Outcome, checked
 
 from drake_dae import (
-    CsvReference,
-    MeasuredSurface,
     Record,
-    build_scenario,
-    load_scenario,
-    simulate,
 )
 from drake_dae.cli import main
 from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.rolled import roll_scenario
-from drake_dae.scenario.shipped import FOLDER, find_scenario
+from drake_dae.scenario.shipped import FOLDER
 
 ROBOTS = Path(__file__).parents[1] / "scenario" / "robots"
 
@@ -56,7 +49,7 @@ KINDS = ("<f8", "<f4", "<i2", "<c16", "|b1", "<U4", "|O", "<M8[s]", "nonsense", 
 def attempt(seed: int, folder: Path) -> Outcome:
     """Reads something bad."""
     choice = random.Random(seed)
-    kind = choice.choices((_data, _special, _robot, _record, _command), (6, 1, 4, 2, 5))[0]
+    kind = choice.choices((_robot, _record, _command), (4, 2, 5))[0]
     return kind(choice, folder)
 
 
@@ -66,36 +59,6 @@ def _outcome(what: str, read: Callable[[], object], excuse: str) -> Outcome:
         outcome.residual = outcome.off = 0.0
         outcome.accepted(excuse)
     return outcome
-
-
-# Data.
-
-
-def _data(choice: random.Random, folder: Path) -> Outcome:
-    """A path, heights or a mesh with one wrong number, or with bytes that are others or missing."""
-    ending = choice.choice(("path.csv", "csv", "npy", "obj"))
-    file = folder / f"data.{ending}"
-    kinds = {"path.csv": _path, "csv": _table, "npy": _npy, "obj": _obj}
-    how, data, excuse = kinds[ending](choice)
-    if choice.random() < 0.4:
-        how, data = _damaged(data, choice)
-        excuse = "what is left is data"
-    file.write_bytes(data)
-
-    def read() -> object:
-        if ending == "path.csv":
-            made = CsvReference(str(file), ["y", "z"], order=choice.randint(2, 6))
-            return made.derivatives([2, 2])(1.0)
-        if ending == "obj":
-            return MeasuredSurface(file=file)
-        return MeasuredSurface((0.4, 0.3), file=file)
-
-    return _outcome(f"{ending}: {how}", read, excuse)
-
-
-def _path(choice: random.Random) -> tuple[str, bytes, str]:
-    rows = [[f"{0.5 * i}", f"{0.1 * i % 0.3:g}", f"{0.01 * i:g}"] for i in range(8)]
-    return _with_cell(rows, choice, ",", "time,y,z\n")
 
 
 def _table(choice: random.Random) -> tuple[str, bytes, str]:
@@ -124,22 +87,6 @@ def _npy(choice: random.Random) -> tuple[str, bytes, str]:
     return f"{kind} of {size}", data, "numbers that fit" if good else ""
 
 
-def _obj(choice: random.Random) -> tuple[str, bytes, str]:
-    lines = [f"v {x} {y} {0.1 * x * y}" for x in range(3) for y in range(3)]
-    faces = [(1, 4, 5, 2), (2, 5, 6, 3), (4, 7, 8, 5), (5, 8, 9, 6)]
-    lines += ["f " + " ".join(map(str, face)) for face in faces]
-    index = choice.randrange(len(lines))
-    words = lines[index].split()
-    new = choice.choice((*CELLS, "0", "-99", "99", "2"))
-    words[choice.randrange(1, len(words))] = new
-    lines[index] = " ".join(words)
-    excuse = "another number" if new in ("2", "0", "1e-320") or new == "99" else ""
-    excuse = excuse if words[0] == "v" or new == "2" else ""
-    if words[0] == "v" and new in ("-99", "99"):
-        excuse = "another number"
-    return f"{lines[index][:40]!r}", "\n".join(lines).encode(), excuse
-
-
 def _damaged(data: bytes, choice: random.Random) -> tuple[str, bytes]:
     """Bytes that end too early, or lack, have or change something in the middle."""
     place = choice.randrange(max(1, len(data)))
@@ -153,30 +100,6 @@ def _damaged(data: bytes, choice: random.Random) -> tuple[str, bytes]:
     some = bytes(choice.randrange(256) for _ in range(choice.randint(1, 4)))
     rest = data[place:] if how == "insert" else data[place + len(some) :]
     return f"{how} {some!r} at {place}", data[:place] + some + rest
-
-
-def _special(choice: random.Random, folder: Path) -> Outcome:
-    """A pipe, a device, a folder, a loop of links, or nothing in the place of a file."""
-    ending = choice.choice(("csv", "npy", "obj", "stl", "yaml", "npz"))
-    file, kind = (
-        folder / f"data.{ending}",
-        choice.choice(("pipe", "zero", "folder", "loop", "none")),
-    )
-    if kind == "pipe":
-        os.mkfifo(file)
-    elif kind == "folder":
-        file.mkdir()
-    elif kind != "none":
-        file.symlink_to(file if kind == "loop" else "/dev/zero")
-    readers: dict[str, Callable[[], object]] = {
-        "csv": lambda: CsvReference(str(file), ["y"]).derivatives([0]),
-        "obj": lambda: MeasuredSurface(file=file),
-        "stl": lambda: MeasuredSurface(file=file),
-        "yaml": lambda: load_scenario(file),
-        "npz": lambda: Record.load(file),
-    }
-    read = readers.get(ending, lambda: MeasuredSurface((0.4, 0.3), file=file))
-    return _outcome(f"{kind} for .{ending}", read, "")
 
 
 # Robots.
@@ -339,92 +262,3 @@ def _command(choice: random.Random, folder: Path) -> Outcome:
         else:
             caught.kind, caught.text = RAW, f"exit code {code}: {text[-200:]}"
     return caught
-
-
-# Several mistakes at once.
-
-SETTINGS = (
-    *("duration=1e300", "duration=1.0e-300", "integrator.max_step_size=1.0e-12", "compiled=maybe"),
-    *(
-        "integrator.accuracy=1.0e-300",
-        "integrator.start_time=1.0e+15",
-        "sampling={period: 1.0e-12}",
-    ),
-    *("sampling={period: 0.001, delay: 1.0e+6}", "sampling={period: 1.0e+300}", "saturation=true"),
-    *(
-        "encoders={resolution: 1.0e+9}",
-        "encoders={velocity_bandwidth: 1.0e-9}",
-        "robot.free=[link1]",
-    ),
-    *(
-        "force_feedback=!MeasuredForce {}",
-        "force_feedback=!MeasuredForce {time_constant: 1.0e-9, gain: [1, 2]}",
-    ),
-    *(
-        "constraints.0.friction=1.0e+9",
-        "constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 0}",
-    ),
-    *(
-        "constraints.0.surface=!ImplicitSurface {function: 1.44 - x**2}",
-        "constraints=[]",
-        "outputs=[]",
-    ),
-    *("constraints.0.surface=!ImplicitSurface {function: 1_0 - x}", "plant=!MultibodyPlant {}"),
-    *(
-        "constraints.0.surface=!ImplicitSurface {function: sqrt(x**2) - 1.2}",
-        "plant=!CompliantContact {}",
-    ),
-    *("references.tool.z=!Csv {file: /dev/zero, columns: [z]}", "references.tool.z=1.0e+300"),
-    *("references.tool.z=!Polyline {points: [[0.3], [0.3]], corner: 0, limits: {speed: 1}}",),
-    *("references.tool.z=!Sinusoids {offset: 0.3, amplitudes: [1.0e+9], frequencies: [1.0e+9]}",),
-    *("gains={all: [-1.0e+300]}", "gains={all: [-1.0e-300]}", "gains={all: [4]}", "gains={}"),
-    *("plant_parameters={link1.mass: 1.0e+300}", "plant_parameters={wall.position: [1, 2]}"),
-    *("start.errors={tool.z: 1.0e+9}", "start.positions={joint1: 1.0e+9}", "start={}", "forces=[]"),
-    *(
-        "actuation=[!FlexibleJoints {stiffness: 1.0e-300, inertia: 1.0e-300}]",
-        "robot.locked={joint1: 0}",
-    ),
-    *("exogenous={wall.position: [1, 2, 3]}", "exogenous={nothing: [0]}", "control_weights=[0, 0]"),
-    *("bounds={link2.mass: [1.0e-300, 1.0e+300]}", "bounds={wall.position: [[], []]}"),
-    *("bounds={link2.mass: [7, 8]}", "may_diverge=true", "integrator.use_error_control=false"),
-    *("integrator.integration_scheme=implicit_euler", "integrator.max_step_size=1.0e+9"),
-    *("gains={all: [-2000]}", "sampling={period: 0.002, delay: 0.003}", "compiled=false"),
-    *("constraints.0.rpy=[1.0e+9, 0, 0]", "constraints.0.name=link1", "robot.base={weld: world}"),
-    *("outputs.0.frame=world", "outputs=[{joints: [joint1, joint1]}]", "tool_axis=free"),
-    *("plant_disturbances=[{frame: tool, force: [1.0e+300, 0, 0], start_time: 2, end_time: 1}]",),
-    *("plant_payloads=[{frame: tool, mass: -1}]", "force=!MeasuredForce {seed: -1}"),
-    *("tolerances={tool.z: 1.0e-300}", "integral=[wall.force]", "compliances={}"),
-    *(
-        "observer={}",
-        "constraint_damping={all: [-1]}",
-        "task={phases: []}",
-        "known_forces=[{frame: tool}]",
-    ),
-)
-"""Each makes no sense, or little, or turns to another kind of run."""
-
-
-def several(seed: int, folder: Path) -> Outcome:
-    """A scenario with several mistakes at once, built and run for some steps."""
-    choice = random.Random(seed)
-    name = choice.choice(("two_link_wall", "two_link_wall", "two_link_motors", "five_bar"))
-    settings = choice.sample(SETTINGS, choice.randint(1, 4))
-    with checked(f"{name}: {'; '.join(settings)}") as outcome:
-        scenario = load_scenario(find_scenario(name), settings)
-        loop, context = build_scenario(scenario)
-        step = scenario.integrator.max_step_size
-        if scenario.sampling is not None:
-            step = min(step, scenario.sampling.period)
-        duration = min(scenario.duration, 0.01, 100 * step)
-        if choice.random() < 0.4 and loop.generator is not None:
-            found = roll_scenario(replace(scenario, duration=duration), loop, context)
-            record = found.record
-            if found.failure is not None:
-                raise found.failure
-        else:
-            simulate(loop.diagram, context, duration, scenario.integrator)
-            record = loop.record(context)
-        outcome.residual = outcome.off = 0.0
-        finite = all(np.isfinite(one.values).all() for one in record.signals.values())
-        outcome.accepted("they fit together" if finite else "")
-    return outcome

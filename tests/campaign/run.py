@@ -24,7 +24,6 @@ from campaign.outcomes import BAD, CLASSES, HANG, RESULT, Outcome
 ATTEMPTS = {
     "input": bad_inputs.attempt,
     "file": bad_files.attempt,
-    "several": bad_files.several,
     "robot": random_robots.attempt,
     "measured": random_robots.measured,
 }
@@ -94,7 +93,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=1500, help="bad inputs")
     parser.add_argument("--files", type=int, default=1000, help="bad files and command lines")
-    parser.add_argument("--several", type=int, default=500, help="several bad settings at once")
     parser.add_argument("--robots", type=int, default=500, help="random robots")
     parser.add_argument("--measured", type=int, default=500, help="the same, with encoders")
     parser.add_argument("--seed", type=int, default=0, help="of the first of each")
@@ -104,7 +102,6 @@ def main() -> int:
     given = parser.parse_args()
     items = [("input", given.seed + i) for i in range(given.count)]
     items += [("file", given.seed + i) for i in range(given.files)]
-    items += [("several", given.seed + i) for i in range(given.several)]
     items += [("robot", given.seed + i) for i in range(given.robots)]
     items += [("measured", given.seed + i) for i in range(given.measured)]
     began = time.monotonic()

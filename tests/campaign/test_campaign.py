@@ -32,12 +32,6 @@ def test_a_bad_file_or_command_is_refused_or_read_with_a_reason(seed: int, tmp_p
     assert outcome.kind not in BAD, outcome
 
 
-@pytest.mark.parametrize("seed", each(range(10), range(10, 25)))
-def test_several_mistakes_at_once_end_as_a_message(seed: int, tmp_path: Path):
-    outcome = bad_files.several(seed, tmp_path)
-    assert outcome.kind not in BAD, outcome
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", each(FEW_ROBOTS, MANY_ROBOTS))
 def test_a_random_robot_is_refused_or_moves_as_predicted(seed: int, tmp_path: Path):
@@ -66,7 +60,6 @@ def test_the_command_prints_counts():
             *command,
             "--count=10",
             "--files=5",
-            "--several=2",
             "--robots=2",
             "--measured=2",
             "--seed=100",

@@ -8,16 +8,10 @@ from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from runs import run_scenario, scenario
 
 from drake_dae import (
-    RevoluteLoopJoint,
-    RobotModel,
-    RobotPlant,
-    TrackingLaw,
     build_scenario,
-    poles,
 )
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.feasibility.feasibility import find_feasibility
-from drake_dae.scenario.model import scenario_model
 
 NAME = "boom"
 HINGE, FOOT, LUG, DAMPING = np.array([0.0, 0.8]), np.array([0.3, 0.0]), 0.7, 40.0
@@ -127,37 +121,3 @@ def test_stages_do_not_reach_a_motor_in_a_loop():
     text = "actuation=[{_tag: '!FlexibleJoints', stiffness: 100.0}]"
     with pytest.raises(ScenarioError, match="actuation"):
         build_scenario(scenario(NAME, text))
-
-
-@pytest.mark.slow
-def test_a_revolute_joint_in_a_plane_does_as_a_pin():
-    """The five-bar linkage, four motors for two outputs, closed by either: 1e-10 of some 5 N m."""
-    given = scenario_model(scenario("five_bar"))
-    pin = given.constraints[0]
-    joint = RevoluteLoopJoint(
-        pin.frame_a, pin.frame_b, "y", pin.point_a, (0, 0, 0), pin.point_b, planar=True
-    )
-    found, state = [], np.zeros(0)
-    for constraint in (pin, joint):
-        model = RobotModel(
-            given.links,
-            [constraint],
-            given.outputs,
-            given.dae.nominal_state[:4],
-            forces=[],
-            control_weights=[1.0, 2.0, 3.0, 4.0],
-        )
-        law = TrackingLaw(model.dae, poles(-5.0))
-        plant = RobotPlant(model, structure=law.structure)
-        context = plant.CreateDefaultContext()
-        if not state.size:
-            state = law.structure.manifold.project(given.dae.nominal_state + 0.1 * np.arange(8.0))
-        plant.set_state(context, state)
-        control = law.control(state, [0.1, 0.2, -0.3, 0.5, 0.1, 0.4])
-        plant.GetInputPort("control").FixValue(context, control)
-        assert [s.name.split(".")[1] for s in plant.wrench_signals[::6]] == ["right2", "left2"]
-        wrenches = plant.GetOutputPort("constraint_wrenches").Eval(context)
-        rate = plant.EvalTimeDerivatives(context).CopyToVector()
-        found.append(np.concatenate([control, wrenches, rate]))
-    assert np.abs(found[0][:4]).max() > 5.0
-    assert_allclose(found[1], found[0], rtol=1e-10, atol=1e-10)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import scipy.linalg
 from arms import (
     arm,
     consistent_states,
@@ -12,16 +11,14 @@ from arms import (
     numbers,
     shipped,
 )
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, Integrator, LogVectorOutput
+from pydrake.systems.framework import LeafSystem
+from pydrake.systems.primitives import Integrator
 from runs import run
 
 from drake_dae import (
     ConstantReference,
     RobotPlant,
     SinusoidReference,
-    gain_matrices,
     make_closed_loop,
 )
 from drake_dae.errors import ReferenceSignalError, WiringError
@@ -89,45 +86,6 @@ def test_error_is_the_closed_form_of_60(scenario, position, force, residual):
     pressed = record["constraint_force"][:, 0]
     np.testing.assert_allclose(pressed, 20.0 + 5.0 * np.sin(2.0 * record.time), atol=force)
     assert np.max(np.abs(record["constraint_residual"])) < residual
-
-
-@pytest.mark.slow
-def test_error_with_full_matrices_is_the_matrix_exponential():
-    """(60) with coupled outputs: (e, e')' = [[0, 1], [-Lambda_1, -Lambda_2]] (e, e')."""
-    random = np.random.default_rng(1)
-    roots = [0.3 * random.standard_normal((6, 6)) for _ in range(2)]
-    stiffness, damping = (
-        root @ root.T + np.diag(diagonal)
-        for root, diagonal in zip(roots, [np.full(6, 16.0), np.full(6, 8.0)], strict=True)
-    )
-    chosen = law("seven_joint", gain_matrices([stiffness, damping]))
-    found = arm("seven_joint")
-    loop = make_closed_loop(
-        RobotPlant(found.model, structure=found.structure),
-        chosen,
-        [
-            SinusoidReference(0.0, 0.1, 1.0),
-            SinusoidReference(0.6, 0.05, 2.0),
-            ConstantReference([0.0, 0.0, 0.0, 0.0]),
-            SinusoidReference(30.0, 10.0, 3.0),
-        ],
-    )
-    context = loop.diagram.CreateDefaultContext()
-    q = found.model.configuration(
-        [0.03, 0.58, 0.02, -0.03, 0.05, -0.1], found.model.dae.nominal_state[:7]
-    )
-    plant_context = loop.plant.GetMyMutableContextFromRoot(context)
-    loop.plant.set_consistent_state(plant_context, np.concatenate([q, np.zeros(7)]))
-    record = run(loop, context, 3.0, fixed_step())
-    error = record["tracking_error"]
-    rate = -record["reference"][0, 1:18:3]
-    companion = np.block([[np.zeros((6, 6)), np.eye(6)], [-stiffness, -damping]])
-    start = np.concatenate([error[0, :6], rate])
-    theory = [(scipy.linalg.expm(companion * t) @ start)[:6] for t in record.time[::100]]
-    # RK5 at 1 ms leaves about 1e-14, expm as much.
-    np.testing.assert_allclose(error[::100, :6], theory, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(loop.predicted_error(record)[::100, :6], theory, atol=1e-12)
-    assert np.max(np.abs(error[:, 6])) < 1e-10
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -220,44 +178,3 @@ def test_residual_stays_at_zero_for_100_s_under_error_control():
     # Without it, it adds up.
     assert largest[False][-1] > 3.0 * largest[False][0]
     assert largest[False][-1] > 1e4 * ends[True]
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_free_constrained_motion_conserves_energy(name):
-    """u = 0, no damping: energy drifts by O(h^5), and the constraint force does no work."""
-    found = arm(name)
-    drift = {}
-    for step in (8e-3, 4e-3):
-        builder = DiagramBuilder()
-        plant = builder.AddSystem(RobotPlant(found.model, structure=found.structure))
-        source = builder.AddSystem(ConstantVectorSource(np.zeros(plant.dae.num_controls)))
-        builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
-        states = LogVectorOutput(plant.GetOutputPort("state"), builder)
-        forces = LogVectorOutput(plant.GetOutputPort("constraint_force"), builder)
-        rates = LogVectorOutput(plant.GetOutputPort("constraint_residual"), builder)
-        diagram = builder.Build()
-        simulator = Simulator(diagram)
-        ApplySimulatorConfig(fixed_step(step), simulator)
-        simulator.AdvanceTo(0.4)
-        log = states.FindLog(simulator.get_context())
-        energy = np.array([_energy(found.plant, x) for x in log.data().T])
-        drift[step] = np.max(np.abs(energy - energy[0]))
-        power = (
-            forces.FindLog(simulator.get_context()).data()
-            * rates.FindLog(simulator.get_context()).data()[1]
-        )
-        moved = np.max(np.abs(log.data()[:, -1] - log.data()[:, 0]))
-        assert moved > 0.1
-        # lambda times J v, where J v is the drift of one step.
-        assert np.max(np.abs(power)) < 1e-4 * step
-    # Halving the step divides an O(h^5) error by 32; 16 leaves room for higher orders.
-    assert drift[4e-3] < drift[8e-3] / 16.0 or drift[8e-3] < 1e-12
-    assert drift[4e-3] < 1e-6
-
-
-def _energy(plant, state):
-    context = plant.CreateDefaultContext()
-    plant.SetPositionsAndVelocities(context, state)
-    v = plant.GetVelocities(context)
-    # M with the rotors, which CalcKineticEnergy leaves out.
-    return 0.5 * v @ plant.CalcMassMatrix(context) @ v + plant.CalcPotentialEnergy(context)

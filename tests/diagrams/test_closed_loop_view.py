@@ -141,22 +141,6 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     assert tip == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.slow
-def test_the_tool_leads_the_arrow():
-    """The contact point is where MultibodyPlant has the tool's frame."""
-    _, record, page = recorded("seven_joint_wall", "duration=1")
-    position = animation(page)["/contact/wall/force", "position"]
-    plant = parse("seven_joint_arm")
-    context = plant.CreateDefaultContext()
-    frame = plant.GetFrameByName("tool")
-    for time, point in zip(position.times, position.values, strict=True):
-        plant.SetPositions(context, at(record, "state", time)[:7])
-        tip = plant.CalcPointsPositions(context, frame, np.zeros(3), plant.world_frame())[:, 0]
-        np.testing.assert_allclose(point, tip, atol=1e-6)
-    outputs = at(record, "controlled_output", position.times)
-    np.testing.assert_allclose(position.values[:, 1:], outputs[:, :2], atol=1e-3)
-
-
 def test_paths_of_the_contact_point(shown):
     loop, record, page = shown
     contact = loop.plant.model.constraints[0]
@@ -274,27 +258,6 @@ def test_a_parameter_moves_the_surface():
     assert stands[0, 3] == pytest.approx(1.1 + thickness / 2)
     arrow = animation(page)["/contact/wall/force", "position"]
     np.testing.assert_allclose(arrow.values[:, 0], 1.1, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_a_parameter_turns_the_arrow():
-    """Of the normal of a dome that stands elsewhere."""
-    scenario = load_scenario(find_scenario("seven_joint_dome"), ["duration=0.1"])
-    loop, context = build_scenario(scenario)
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    state = loop.plant.state(own)
-    center = np.array([0.45, 0.02, 0.2])
-    loop.plant.set_parameter(own, "dome.position", center)
-    loop.plant.set_consistent_state(own, state)
-    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
-    page = make_animation(loop, loop.record(context), context)
-    np.testing.assert_allclose(transforms(page)["/contact/dome/surface"][:3, 3], center)
-    position, turn = (
-        animation(page)["/contact/dome/force", name].values[0]
-        for name in ("position", "quaternion")
-    )
-    # The page holds single precision.
-    np.testing.assert_allclose(rotation(turn)[:, 2], (position - center) / 0.25, atol=1e-5)
 
 
 def test_one_moment_is_an_animation_too():

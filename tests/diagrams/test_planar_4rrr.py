@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from runs import run_scenario, scenario
-from test_planar_3rrr import DISK, DISTAL, PROXIMAL, about_centre, across, along, moment
 
 from drake_dae import FlexibleJoints, RobotModel, TrackingLaw, ZeroDynamics, build_scenario, poles
 from drake_dae.arrays import FloatArray
@@ -13,8 +12,27 @@ from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.model import scenario_model
 
 NAME = "planar_4rrr"
+PROXIMAL, DISTAL = (0.25, 0.8, 0.015), (0.3, 0.5, 0.012)  # length m, mass kg, radius m
+DISK = 1.2, 1.2 * 0.12**2 / 2  # kg, kg m^2
 BASE, CORNER = 0.5, 0.12  # m from the middle
 DIRECTIONS = np.deg2rad([45.0, 135.0, 225.0, 315.0])
+
+
+def along(angle: FloatArray) -> FloatArray:
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def across(angle: FloatArray) -> FloatArray:
+    return np.array([-np.sin(angle), np.cos(angle)])
+
+
+def moment(lever: FloatArray, force: FloatArray) -> float:
+    return float(lever[0] * force[1] - lever[1] * force[0])
+
+
+def about_centre(length: float, mass: float, radius: float) -> float:
+    """Of a round rod, about an axis across it, kg m^2."""
+    return mass * (3 * radius**2 + length**2) / 12
 
 
 def leg(k: int, z: FloatArray, rate: FloatArray, second: FloatArray):

@@ -7,24 +7,20 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.integrate
-from arms import arm, consistent_states, fixed_step, numbers, parse
-from members import FrictionalPoint, Saddle, TorqueLag
+from arms import arm, consistent_states, fixed_step, parse
+from members import Saddle, TorqueLag
 
 from drake_dae import (
     AxisCoordinates,
-    Blade,
     ConstantReference,
-    ExpressionOutput,
     FixedDistance,
     FlexibleJoints,
     JointPositions,
     LinkExpressions,
-    Plane,
     PointCoordinates,
     PointOnSurface,
     RobotModel,
     RobotPlant,
-    Signal,
     SinusoidReference,
     TrackingLaw,
     find_structure,
@@ -119,101 +115,7 @@ def test_an_arm_on_a_rod_tracks_motion_and_thrust():
 # A reaction of its own: friction.
 
 
-def frictional(friction=0.3, speed=0.05):
-    wall = Plane((1.2, 0.0, 0.0), (-1.0, 0.0, 0.0))
-    contact = FrictionalPoint("tool", wall, name="wall", coefficient=friction, speed=speed)
-    outputs = [PointCoordinates("tool", "z")]
-    return RobotModel.from_multibody(parse("two_link_arm"), [contact], outputs, [1.2, -1.6])
-
-
-def test_a_block_that_slides_is_braked_by_its_weight():
-    """g(x) = (0, 0, -mu s, 1) / m with s = 0.3 / 0.5, and x'' = g (sin a - mu s cos a)."""
-    slope, mass = 0.5, 2.0
-    floor = FrictionalPoint("bob", Plane((0, 0, 0), (0, 0, 1)), coefficient=0.25, speed=0.4)
-    model = RobotModel(particle(mass, slope), [floor], [JointPositions(["q0"])], [0.0, 0.0])
-    x = np.array([0.7, 0.0, 0.3, 0.0])
-    explicit = model.dae.explicit
-    g = TracedFunction(
-        "g", {"x": explicit.state, "p": explicit.parameter_symbol}, {"g": explicit.g}
-    )(x, explicit.parameter_values)[0]
-    np.testing.assert_allclose(g, [0.0, 0.0, -0.25 * 0.6 / 2.0, 0.5], rtol=0, atol=1e-15)
-    plant = RobotPlant(model)
-    context = plant.CreateDefaultContext()
-    plant.GetInputPort("control").FixValue(context, np.zeros(2))
-    plant.set_state(context, x)
-    rate = plant.EvalTimeDerivatives(context).CopyToVector()
-    braked = GRAVITY * (np.sin(slope) - 0.25 * 0.6 * np.cos(slope))
-    np.testing.assert_allclose(rate, [0.3, 0.0, braked, 0.0], atol=1e-14)
-    force = plant.GetOutputPort("constraint_force").Eval(context)
-    np.testing.assert_allclose(force, mass * GRAVITY * np.cos(slope), rtol=1e-14)
-
-
-def test_friction_enters_as_the_reaction_says():
-    """g = M^-1 (J_n - mu s J_t)^T, with M and the Jacobians of MultibodyPlant."""
-    friction, speed = 0.3, 0.05
-    explicit = frictional(friction, speed).dae.explicit
-    function = TracedFunction(
-        "g", {"x": explicit.state, "p": explicit.parameter_symbol}, {"g": explicit.g}
-    )
-    for state in consistent_states("two_link", 5):
-        q, v = np.split(state, 2)
-        n = numbers("two_link", q, v)
-        sliding = n.output_jacobian @ v
-        s = sliding / np.hypot(sliding, speed)
-        column = n.constraint_jacobian[0] - friction * s * n.output_jacobian[0]
-        expected = np.concatenate([np.zeros(2), np.linalg.solve(n.mass, column)])
-        found = function(state, explicit.parameter_values)[0]
-        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
-
-
-@pytest.mark.slow
-def test_a_law_that_knows_the_friction_cancels_it():
-    """Errors as without friction; the controls are not those without it."""
-    model = frictional()
-    structure = find_structure(model.dae)
-    assert structure.constraint_degrees == (2,)
-    assert structure.output_degrees == (2, 0)
-    wanted = [SinusoidReference(0.3, 0.1, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
-    q = model.configuration([0.25], [1.2, -1.6])
-    record = follow(model, [*q, 0.0, 0.0], wanted)
-    error = double_pole(-0.05, -0.15, record.time)
-    np.testing.assert_allclose(record["tracking_error"][:, 0], error, atol=1e-9)
-    force = 20.0 + 5.0 * np.sin(2.0 * record.time)
-    np.testing.assert_allclose(record["constraint_force"][:, 0], force, rtol=1e-9)
-    smooth = follow(arm("two_link").model, [*q, 0.0, 0.0], wanted)
-    assert np.max(np.abs(record["control"] - smooth["control"])) > 3.0
-
-
 # A constraint on velocities alone.
-
-
-def test_a_skate_on_a_slope_goes_along_a_cycloid():
-    """x = a sin^2 wt, y = a (wt - sin 2wt / 2), a = g / 2w^2; the side force is 2 m g sin wt.
-
-    Chaplygin's skate (Neimark and Fufaev, 1972): it does not slide down, it goes across.
-    """
-    mass, pull, spin, duration = 1.5, 3.0, 2.0, 2.2
-    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
-    c, s = ca.cos(q[2]), ca.sin(q[2])
-    turned = ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
-    links = LinkExpressions(
-        q,
-        v,
-        ca.diag(ca.SX([mass, mass, 0.2])),
-        ca.SX([-mass * pull, 0.0, 0.0]),
-        frames={"blade": (turned, ca.vertcat(q[0], q[1], 0.0))},
-    )
-    along = ExpressionOutput(lambda links: links.q[0], [Signal("x", "m")])
-    model = RobotModel(links, [Blade("blade")], [along, JointPositions(["q2"])])
-    structure = find_structure(model.dae)
-    assert structure.constraint_degrees == (1,)
-    assert structure.output_degrees == (2, 2, 0)
-    plant = RobotPlant(model, structure=structure)
-    state, force = run(plant, [0.0, 0.0, 0.0, 0.0, 0.0, spin], duration)
-    turn, size = spin * duration, pull / (2.0 * spin**2)
-    place = [size * np.sin(turn) ** 2, size * (turn - np.sin(2.0 * turn) / 2.0), turn]
-    np.testing.assert_allclose(state[:3], place, atol=1e-10)
-    np.testing.assert_allclose(force, 2.0 * mass * pull * np.sin(turn), atol=1e-9)
 
 
 # A surface.

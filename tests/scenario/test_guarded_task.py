@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from arms import numbers
 from numpy.testing import assert_allclose
-from runs import scenario, some
+from runs import scenario
 
 from drake_dae import Record, build_scenario, grid_variations, load_scenario, sweep
 from drake_dae.cli import main
@@ -218,46 +218,3 @@ def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):
     # The mean of the drift while the bias is found is that of its middle.
     assert touch == pytest.approx(0.05 + 2.0 / 10.0, abs=0.02)
     assert not found[0].record["constraint_force"][found[0].record.time < touch].any()
-
-
-HELD_PHASES = {
-    "Press": "!Press {force: 10, over: 1.0, within: 3, if_lost: away, on_failure: fail}",
-    "Dwell": "!Dwell {duration: 1.0, if_lost: away, on_failure: fail}",
-    "Move": "!Move {references: {tool.z: 0.31}, duration: 1.0, if_lost: away, on_failure: fail}",
-}
-JUMP = "wall.force: !PointToPoint {start: [10], end: [-30], start_time: 0.2, end_time: 0.201}"
-PUSH = "plant_disturbances=[{frame: tool, force: [-60, 0, 0], start_time: 0.6, end_time: 1.2}]"
-DELAYED = "sampling={period: 0.002, delay: 0.001}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("phase", "changes"),
-    some(
-        [
-            ("Press", [PUSH, DELAYED]),
-            *(
-                pytest.param(phase, [PUSH], marks=pytest.mark.thorough)
-                for phase in ("Dwell", "Move")
-            ),
-            ("Move", []),
-        ]
-    ),
-)
-def test_a_contact_that_is_lost_on_purpose_leads_to_what_was_chosen(file, phase, changes):
-    """By a push of 60 N away from the wall in each phase; or by a reference that jumps to -30 N."""
-    touch, rest = SHORT.split("  - !Press")[0], SHORT.split("  - !Release {over: 0.1}")[1]
-    held = HELD_PHASES[phase]
-    if PUSH not in changes:
-        held = held.replace("tool.z: 0.31", JUMP)
-    press = "" if phase == "Press" else "  - !Press {force: 10, over: 0.1, tolerance: 3}\n"
-    file.write_text(f"{touch}{press}  - {held}\n  - !Release {{over: 0.1}}{rest}")
-    found, story = rolled(load_scenario(file, [*changes, "duration=3"]))
-    assert found.failure is None
-    (away,) = [change for change in story if change.phase == "away"]
-    assert away.reason == f"the contact of {phase} is lost"
-    assert away.failed
-    assert story[-1].phase == "done"
-    # The task waits for 0.25 s whether the contact comes back.
-    begin = story[[change.phase for change in story].index(phase)].time
-    assert away.time > begin + 0.25

@@ -1,6 +1,5 @@
 """MJCF and SDFormat files as a user has them, with several constraints and meshes, unedited."""
 
-import re
 import warnings
 from pathlib import Path
 
@@ -109,28 +108,6 @@ def test_a_closed_chain_of_sdformat_on_a_wall(chain):
             for side in ("left", "right")
         ]
         np.testing.assert_allclose(*ends, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_it_does_not_matter_where_a_loop_is_cut(chain, tmp_path):
-    """With the damped pin first in the file another joint is cut: the motors do the same."""
-    text = (ROBOTS / "five_bar.sdf").read_text()
-    start = text.index('    <joint name="pin"')
-    end = text.index("</joint>", start) + len("</joint>\n")
-    pin, rest = text[start:end], text[:start] + text[end:]
-    place = rest.index('    <link name="left_crank">')
-    text = re.sub(r"<(visual|collision).*</\1>", "", rest[:place] + pin + rest[place:])
-    (tmp_path / "five_bar.sdf").write_text(text)
-    _, first = chain
-    loop, second = run(tmp_path, FIVE_BAR, "robot.file=five_bar.sdf")
-    names = [signal.name for signal in second.signals["constraint_force"].signals]
-    assert names == ["wall.force", "right_joint.fx", "right_joint.fy"]
-    assert loop.plant.model.constraints[-1].name == "right_joint"
-    for name in ("control", "tracking_error"):
-        np.testing.assert_allclose(first[name], second[name], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(
-        first["constraint_force"][:, 0], second["constraint_force"][:, 0], atol=1e-6
-    )
 
 
 SLIDER = """<sdf version="1.8"><model name="press">

@@ -8,8 +8,8 @@ from typing import Any
 import jsonschema
 import pytest
 from _pytest.mark import ParameterSet
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator, SimulatorConfig
-from pydrake.systems.framework import Context, DiagramBuilder, System
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context
 
 from drake_dae import ClosedLoop, Record, build_scenario, load_scenario, simulate
 from drake_dae.scenario.rolled import roll_scenario
@@ -100,17 +100,6 @@ def some(
 
 def _case(case: Any) -> ParameterSet:
     return pytest.param(*case) if isinstance(case, tuple) else pytest.param(case)
-
-
-def in_equal_steps(
-    builder: DiagramBuilder, plant: System, scheme: str, step: float
-) -> tuple[Simulator, Context, Context]:
-    """A simulator with steps of one length, its context, and that of a plant."""
-    simulator = Simulator(builder.Build())
-    ResetIntegratorFromFlags(simulator, scheme, step)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    root = simulator.get_mutable_context()
-    return simulator, root, plant.GetMyMutableContextFromRoot(root)
 
 
 def first_quick(cases: Iterable[Any]) -> list[ParameterSet]:

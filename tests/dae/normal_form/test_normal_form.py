@@ -6,9 +6,9 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from actuated import actuated, slope, states
+from actuated import actuated, states
 from arms import arm, consistent_states, numbers
-from problems import PROBLEMS, hidden_normal_form, knife_edge, pendulum, pendulum_tension
+from problems import PROBLEMS, knife_edge, pendulum, pendulum_tension
 from runs import some
 from two_arms import two_arms
 
@@ -107,19 +107,6 @@ def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
         np.testing.assert_allclose(coordinates[: residual.size], residual, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", ["pendulum_tension", "knife_edge_force", "two_link damped"])
-def test_the_jacobian_is_the_derivative(name):
-    """Central differences along random directions, with an error of order step^6."""
-    normal_form, random = form(name), np.random.default_rng(3)
-    x = normal_form.structure.states[2]
-    for _ in range(3):
-        along = random.standard_normal(x.size)
-        difference = slope(normal_form.coordinates, x, along, 1e-2)
-        expected = normal_form.jacobian(x) @ along
-        scale = np.abs(normal_form.jacobian(x)).max()
-        np.testing.assert_allclose(difference, expected, rtol=0, atol=1e-9 * scale)
-
-
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])
 @pytest.mark.equation(21, 50, 51, 52, 53)
 def test_robot_coordinates_are_those_of_50_to_53(name):
@@ -173,22 +160,6 @@ def test_the_jacobian_is_singular_exactly_where_b_is():
         x = [0.2, 0.1, 0.3, 0.8 * np.cos(0.3), 0.8 * np.sin(0.3), rate]
         determinant = np.linalg.det(turning.jacobian(x))
         assert abs(determinant) == pytest.approx(3.0 * abs(rate), abs=1e-14)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", some([2, 3, 4, 8, 11]))
-def test_systems_made_from_their_normal_form(seed):
-    """With d > 0 and 4 to 6 coordinates bent by a polynomial: the inverse over a wider range."""
-    hidden = hidden_normal_form(seed)
-    structure = find_structure(hidden.system)
-    normal_form = NormalForm(structure.system, structure=structure)
-    assert normal_form.completion.numel() == hidden.zero_dynamics
-    random = np.random.default_rng(seed)
-    for _ in range(5):
-        guess = 0.3 * random.standard_normal(hidden.system.num_states)
-        x = structure.manifold.project(guess)
-        back = normal_form.state(normal_form.coordinates(x))
-        np.testing.assert_allclose(back, x, rtol=0, atol=1e-12)
 
 
 @pytest.mark.equation(22)
@@ -364,16 +335,6 @@ def test_continuation_arrives_where_newtons_method_alone_does_not(outputs, guess
     np.testing.assert_allclose(normal_form.state(coordinates, guess), x, rtol=0, atol=1e-14)
 
 
-def test_the_way_from_one_configuration_of_an_arm_to_another():
-    """Some 0.5 rad per joint apart, whether by Newton's method or by continuation."""
-    normal_form, random = form("seven_joint"), np.random.default_rng(467)
-    manifold, nominal = normal_form.structure.manifold, normal_form.structure.states[0]
-    for _ in range(5):
-        guess, x = (manifold.project(nominal + 0.5 * random.standard_normal(14)) for _ in range(2))
-        found = normal_form.state(normal_form.coordinates(x), guess)
-        np.testing.assert_allclose(found, x, rtol=0, atol=1e-12)
-
-
 def test_coordinates_out_of_reach_are_named():
     normal_form = form("pendulum")
     with pytest.raises(InconsistentStateError) as info:
@@ -411,13 +372,6 @@ def test_wrong_inputs():
     )
     with pytest.raises(ModelError, match=r"\[-1\.\]"):
         NormalForm(logarithm).state([0.0], [-1.0])
-
-
-def test_what_is_out_of_reach_is_named():
-    """The pendulum's x cannot be 2; its y and their rates stay where they are."""
-    flat = NormalForm(PROBLEMS["pendulum"]().system)
-    with pytest.raises(InconsistentStateError, match=r"0\.799.*2"):
-        flat.state([0.0, 0.0, 2.0, 0.0])
 
 
 def test_something_else_than_a_system_is_refused():

@@ -113,27 +113,6 @@ def test_a_force_that_changes_is_followed_with_the_error_derived():
     assert_allclose(error, exact, atol=2e-5)
 
 
-def test_an_arm_presses_on_a_wall_that_gives_way():
-    """F = lambda (1 - (1 + w t) e^(-w t)) with damping, and a swing of 20 N without.
-
-    A changes by a percent as the arm holds its place.
-    """
-    model, structure = arm("two_link").model, arm("two_link").structure
-    q = model.configuration([0.3], [1.2, -1.6])
-    state = np.concatenate([q, [0.0, 0.0]])
-    A = structure.constraint_matrix(state)[0, 0]
-    frequency, c = np.sqrt(A * STIFFNESS), contact_damping(STIFFNESS, A)
-    times = np.linspace(0.0, 12.0 / frequency, 61)
-    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
-    known = {"structure": structure}
-    law = TrackingLaw(model.dae, poles(-8.0), constraint_damping=poles(-c), **known)
-    damped, _ = press(law, wanted, STIFFNESS, state, times)
-    closed = 20.0 * (1.0 - (1.0 + frequency * times) * np.exp(-frequency * times))
-    assert_allclose(damped[:, 1], closed, atol=0.2)
-    ideal, _ = press(TrackingLaw(model.dae, poles(-8.0), **known), wanted, STIFFNESS, state, times)
-    assert ideal[:, 1].max() > 38.0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "degree"),

@@ -118,27 +118,6 @@ def test_full_gain_matrices():
     np.testing.assert_allclose(errors[:, [0, 2]], 0.0, rtol=0, atol=1e-13)
 
 
-def test_repeated_poles_in_closed_form():
-    """mu = 4 with one pole -5: e = sum w_j t^j/j! exp(-5 t), w_j the derivatives of e exp(5 t)."""
-    problem = PROBLEMS["flexible_pendulum"]()
-    law = TrackingLaw(problem.system, poles(-5.0), structure=problem.structure)
-    start = problem.consistent(np.random.default_rng(6))
-    times = np.linspace(0.0, 2.0, 6)
-    outputs, _ = closed_loop_outputs(problem, law, start, times)
-    errors = (outputs - wanted_outputs(problem, times))[:, 0]
-    e0, e1, e2, e3 = law.error_coordinates(start, reference_at(problem, 0.0))
-    a = 5.0
-    weights = [
-        e0,
-        e1 + a * e0,
-        e2 + 2 * a * e1 + a**2 * e0,
-        e3 + 3 * a * e2 + 3 * a**2 * e1 + a**3 * e0,
-    ]
-    polynomial = sum(w * times**j / scipy.special.factorial(j) for j, w in enumerate(weights))
-    # The integrator's tolerance, as above.
-    np.testing.assert_allclose(errors, polynomial * np.exp(-a * times), rtol=0, atol=2e-10)
-
-
 @pytest.mark.slow
 def test_error_coordinates_are_the_derivatives_of_the_outputs(problem):
     """e_i^(j) = L_f*^j l*_i - r_i^(j), against differences along the closed loop."""

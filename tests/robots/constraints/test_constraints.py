@@ -9,8 +9,6 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-import scipy.integrate
-from arms import fixed_step
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
@@ -22,7 +20,7 @@ from pydrake.multibody.tree import (
     RpyFloatingJoint,
     SpatialInertia,
 )
-from two_arms import APART, GRASP, NOMINAL, REFERENCES, two_arms
+from two_arms import APART, GRASP, NOMINAL, two_arms
 
 from drake_dae import (
     CoincidentPoints,
@@ -34,12 +32,8 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     Sphere,
-    TrackingLaw,
     WeldedFrames,
     find_structure,
-    make_closed_loop,
-    poles,
-    simulate,
 )
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -421,117 +415,9 @@ def linkage(crank):
     return b, c, k2, k3, k2_rate, k3_rate
 
 
-def reduced(crank):
-    """I, I' and V' of the one degree of freedom: T = I(a) a'^2 / 2, V(a)."""
-    first, second, third = LENGTHS.values()
-    b, c, k2, k3, k2_rate, k3_rate = linkage(crank)
-    own = [DENSITY * length**3 / 3.0 for length in (first, second, third)]
-    moved = DENSITY * second * first  # Mass of the coupler times the crank's length.
-    middle = second / 2.0
-    inertia = own[0] + moved * first + own[1] * k2**2 + own[2] * k3**2
-    inertia += 2.0 * moved * middle * np.cos(crank - b) * k2
-    slope = 2.0 * own[1] * k2 * k2_rate + 2.0 * own[2] * k3 * k3_rate
-    slope += 2.0 * moved * middle * np.cos(crank - b) * k2_rate
-    slope -= 2.0 * moved * middle * np.sin(crank - b) * (1.0 - k2) * k2
-    lift = (DENSITY * first**2 / 2.0 + moved) * np.cos(crank)
-    lift += DENSITY * second * middle * np.cos(b) * k2
-    lift += DENSITY * third**2 / 2.0 * np.cos(c) * k3
-    return inertia, slope, 9.81 * lift
-
-
-@pytest.mark.slow
-def test_four_bar_moves_as_its_one_degree_of_freedom():
-    """I a'' + I' a'^2 / 2 + V' = 0 over more than a turn of the crank, without torques.
-
-    The reference is good to 1e-12. RK5 at 1 ms leaves 1e-11 rad, 1e-10 rad/s and 1e-11 J, and
-    halving the step divides that by at least 20 of the 32 of an O(h^5) error.
-    """
-    model = four_bar()
-    structure = find_structure(model.dae)
-    assert structure.constraint_degrees == (2, 2)
-    assert structure.output_degrees == (2, 0, 0)
-    assert structure.index == 3
-    plant, links = RobotPlant(model, structure=structure), model.links
-    angle, rate, duration = 1.0, 5.0, 1.5
-    b, c, k2, k3, _, _ = linkage(angle)
-    start = [angle, b - angle, c, rate, (k2 - 1.0) * rate, k3 * rate]
-
-    def fall(t, y):
-        inertia, slope, lift = reduced(y[0])
-        return [y[1], -(slope * y[1] ** 2 / 2.0 + lift) / inertia]
-
-    truth = scipy.integrate.solve_ivp(
-        fall, (0.0, duration), [angle, rate], method="DOP853", rtol=1e-13, atol=1e-13
-    ).y[:, -1]
-    assert truth[0] > angle + 2.0 * np.pi
-    energy = TracedFunction(
-        "energy",
-        {"q": links.q, "v": links.v, "p": model.dae.parameter_symbol},
-        {"energy": links.kinetic_energy + links.potential_energy},
-    )
-    errors = []
-    for step in (2e-3, 1e-3):
-        context = plant.CreateDefaultContext()
-        plant.GetInputPort("control").FixValue(context, np.zeros(3))
-        plant.set_state(context, start)
-        values = plant.parameters(context)
-        before = energy(start[:3], start[3:], values)[0]
-        simulate(plant, context, duration, fixed_step(step))
-        end = plant.state(context)
-        after = energy(end[:3], end[3:], values)[0]
-        b, c, k2, k3, _, _ = linkage(end[0])
-        np.testing.assert_allclose(end[1:3], [b - end[0], c], atol=1e-10)
-        np.testing.assert_allclose(end[4:], [(k2 - 1.0) * end[3], k3 * end[3]], atol=1e-8)
-        errors.append([*np.abs(end[[0, 3]] - truth), abs(after - before)[0]])
-    assert np.all(np.array(errors[1]) < [1e-10, 1e-9, 1e-10])
-    assert np.all(np.array(errors[1]) < np.array(errors[0]) / 16.0)
-
-
 def test_third_equation_of_a_plane_linkage_is_refused():
     with pytest.raises(AssumptionError, match=r"pin\.y"):
         find_structure(four_bar("xyz").dae)
-
-
-@pytest.mark.slow
-def test_two_arms_track_motion_and_squeeze():
-    """Both poles at -4: e(t) = (e(0) + (e'(0) + 4 e(0)) t) exp(-4 t), and lambda = r_2 at once.
-
-    RK5 at 4 ms leaves 1e-13 m and rad; forces of 40 N from torques of 90 N m have round-off of
-    1e-13 N. The tolerances leave a factor of ten and more.
-    """
-    model, structure = arms()
-    assert structure.constraint_degrees == (2,) * 6
-    assert structure.output_degrees == (2,) * 8 + (0,) * 6
-    assert structure.index == 3
-    assert structure.zero_dynamics_dimension == 0
-    # Far from singular: no output nearly repeats another.
-    assert structure.constraint_margin.relative > 0.3
-    assert structure.control_margin.relative > 0.3
-    law = TrackingLaw(model.dae, poles(-4.0), structure=structure)
-    loop = make_closed_loop(
-        RobotPlant(model, structure=structure),
-        law,
-        REFERENCES,
-    )
-    context = loop.diagram.CreateDefaultContext()
-    away = [APART / 2 + 0.03, -0.04, 0.42, 0.05, -0.04, 0.03, 0.1, -0.15]
-    start = np.concatenate([model.configuration(away, NOMINAL), np.zeros(14)])
-    loop.plant.set_consistent_state(loop.plant.GetMyMutableContextFromRoot(context), start)
-    simulate(loop.diagram, context, 1.0, fixed_step(4e-3))
-    record = loop.record(context)
-    assert record.time[-1] == 1.0
-    error = record["tracking_error"][:, :8]
-    rate = -record["reference"][0, 1:24:3]
-    t = record.time[:, None]
-    theory = (error[0] + (rate + 4.0 * error[0]) * t) * np.exp(-4.0 * t)
-    assert np.min(np.abs(error[0])) > 0.015
-    np.testing.assert_allclose(error, theory, rtol=0, atol=1e-12)
-    wanted = np.zeros((record.time.size, 6))
-    wanted[:, 0] = 40.0 + 15.0 * np.sin(4.0 * record.time)
-    wanted[:, 3] = np.sin(3.0 * record.time)
-    np.testing.assert_allclose(record["constraint_force"], wanted, rtol=0, atol=1e-11)
-    assert np.max(np.abs(record["constraint_residual"])) < 1e-12
-    assert np.all(np.abs(record["control"]) < model.links.effort_limits)
 
 
 def _cross(vector):

@@ -2,17 +2,14 @@
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
-from arms import consistent_states, error_controlled, fixed_step, numbers, parse, touching
+from arms import consistent_states, error_controlled, numbers, parse, touching
 from numpy.testing import assert_allclose
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import some
 
 from drake_dae import (
-    JointPositions,
-    LinkExpressions,
     Plane,
     PointOnSurface,
     RobotModel,
@@ -23,8 +20,6 @@ from drake_dae import (
 )
 from drake_dae.errors import ModelError
 from drake_dae.scenario.shipped import find_scenario
-
-GRAVITY = 9.81
 
 
 def frictional(friction=0.3, stiction_tolerance=0.05, viscous=None, actuation=(), name="two_link"):
@@ -203,85 +198,3 @@ def n_bias(q, v):
     return plant.CalcBiasTranslationalAcceleration(
         context, JacobianWrtVariable.kV, tool, np.zeros(3), world, world
     )[2, 0]
-
-
-def particle(mass=2.0):
-    """A point mass in the x-z plane under gravity, moved by a force along each axis."""
-    q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
-    place = ca.vertcat(q[0], 0.0, q[1])
-    weight = ca.SX([0.0, mass * GRAVITY])
-    return LinkExpressions(q, v, mass * ca.SX.eye(2), weight, frames={"bob": place})
-
-
-@pytest.mark.slow
-def test_energy_only_falls_and_by_the_power_of_friction():
-    """A block on a floor: x'' = -mu g s - d x' / m; E falls at each step."""
-    floor = PointOnSurface(
-        "bob",
-        Plane((0, 0, 0), (0, 0, 1)),
-        name="floor",
-        friction=0.25,
-        stiction_tolerance=0.01,
-        viscous_friction=0.6,
-    )
-    model = RobotModel(particle(), [floor], [JointPositions(["q0"])], [0.0, 0.0])
-    plant = RobotPlant(model)
-    context = plant.CreateDefaultContext()
-    plant.GetInputPort("control").FixValue(context, np.zeros(2))
-    plant.set_state(context, [0.0, 0.0, 2.0, 0.0])
-    rate = plant.EvalTimeDerivatives(context).CopyToVector()[2]
-    s = 2.0 / np.hypot(2.0, 0.01)
-    assert rate == pytest.approx(-0.25 * GRAVITY * s - 0.6 * 2.0 / 2.0, rel=1e-13)
-    speeds = [2.0]
-    for time in np.arange(0.02, 1.0, 0.02):
-        simulate(plant, context, time, fixed_step(2e-3))
-        speeds.append(plant.state(context)[2])
-    speeds = np.array(speeds)
-    assert np.all(np.diff(speeds**2) <= 0.0)
-    assert abs(speeds[-1]) < 1e-6
-
-
-def test_friction_knows_how_the_surface_moves():
-    """A belt under a block: friction is by the velocity relative to it, and drags the block along.
-
-    The belt moves at 1.5 m/s, the block at 0.7; then the belt also turns about y, at a place 2 m
-    beside the block, and takes the place beneath it up. All by hand.
-    """
-    floor = PointOnSurface(
-        "bob",
-        Plane((0, 0, 0), (0, 0, 1)),
-        name="belt",
-        rpy=(0.0, 0.0, 0.0),
-        friction=0.25,
-        stiction_tolerance=0.4,
-        viscous_friction=3.0,
-    )
-    exogenous = ["belt.position", "belt.rpy"]
-    outputs = [JointPositions(["q0"])]
-    model = RobotModel(particle(), [floor], outputs, [0.0, 0.0], exogenous=exogenous)
-    plant = RobotPlant(model)
-    context = plant.CreateDefaultContext()
-    plant.GetInputPort("control").FixValue(context, np.zeros(2))
-    assert plant.exogenous_layout.degrees == (2,) * 6
-    signals = np.zeros((6, 3))
-    signals[0, 1] = 1.5
-    plant.GetInputPort("exogenous").FixValue(context, signals.ravel())
-    plant.set_state(context, [0.3, 0.0, 0.7, 0.0])
-    relative = 0.7 - 1.5
-    s = relative / np.hypot(relative, 0.4)
-    rate = plant.EvalTimeDerivatives(context).CopyToVector()
-    assert rate[2] == pytest.approx(-0.25 * GRAVITY * s - 3.0 * relative / 2.0, rel=1e-12)
-    wrench = plant.GetOutputPort("constraint_wrenches").Eval(context)
-    assert wrench[3] == pytest.approx(2.0 * rate[2], rel=1e-12)
-
-    # The place beneath the block goes up with -turn * 2 m, and not along: the surface is level.
-    turn = -0.3
-    signals[4, 1], signals[0, 0] = turn, -1.7
-    plant.GetInputPort("exogenous").FixValue(context, signals.ravel())
-    plant.set_consistent_state(context, [0.3, 0.0, 0.7, 0.0])
-    state = plant.state(context)
-    assert state[3] == pytest.approx(-turn * 2.0, rel=1e-12)
-    rate = plant.EvalTimeDerivatives(context).CopyToVector()
-    force = plant.GetOutputPort("constraint_force").Eval(context)[0]
-    pull = -0.25 * force * s - 3.0 * relative
-    assert 2.0 * rate[2] == pytest.approx(pull, rel=1e-12)

@@ -270,27 +270,6 @@ def run(model, structure, state, duration, step=1e-3):
     return block.state(context), block.GetOutputPort("constraint_force").Eval(context)
 
 
-@pytest.mark.slow
-def test_a_ball_rolls_down_a_slope_with_five_sevenths():
-    """s = 5/14 g sin a t^2; the friction is 2/7 m g sin a up the slope, the rest carries it."""
-    slope, duration = 0.4, 0.9
-    normal = np.array([0.0, np.sin(slope), np.cos(slope)])
-    down = np.array([0.0, np.cos(slope), -np.sin(slope)])
-    model = rolling(Plane((0.0, 0.0, 0.0), tuple(normal)))
-    structure = find_structure(model.dae)
-    assert structure.constraint_degrees == (2, 1, 1)
-    assert structure.output_degrees == (2, 2, 0)
-    start = np.concatenate([SIZE * normal, np.zeros(9)])
-    state, force = run(model, structure, start, duration)
-    gone = 5 / 14 * GRAVITY * np.sin(slope) * duration**2
-    np.testing.assert_allclose(state[:3], SIZE * normal + gone * down, atol=1e-10)
-    weight = BALL * GRAVITY
-    # t_1 is x, and t_2 = n x t_1 points up the slope or down it.
-    uphill = -down @ np.cross(normal, [1.0, 0.0, 0.0])
-    friction = 2 / 7 * weight * np.sin(slope) * uphill
-    np.testing.assert_allclose(force, [weight * np.cos(slope), 0.0, friction], atol=1e-9)
-
-
 def test_a_ball_swings_in_a_bowl_as_a_slow_pendulum():
     """a'' = -5 g / (7 (R - r)) sin a, against SciPy: RK5 at 1 ms leaves 1e-11."""
     wide, duration, angle = 1.5, 1.2, 0.7

@@ -4,28 +4,21 @@ import casadi as ca
 import numpy as np
 import pytest
 from actuated import actuated, slope, states
-from arms import arm, consistent_states, fixed_step, law, shipped
+from arms import arm, consistent_states, law, shipped
 from problems import PROBLEMS, hanging_pendulum
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.planning import DirectCollocation
-from pydrake.solvers import IpoptSolver, SnoptSolver
-from pydrake.symbolic import Variable, cos, sin
 from pydrake.systems.analysis import (
-    ApplySimulatorConfig,
     ResetIntegratorFromFlags,
     Simulator,
     Simulator_,
 )
 from pydrake.systems.framework import (
-    DiagramBuilder,
     InputPortSelection,
     OutputPortSelection,
 )
 from pydrake.systems.primitives import (
     FirstOrderTaylorApproximation,
     Linearize,
-    SymbolicVectorSystem,
-    TrajectorySource,
 )
 from pydrake.trajectories import PiecewisePolynomial
 from runs import some
@@ -332,20 +325,6 @@ def test_a_closed_loop_keeps_its_zero_dynamics():
     assert_poles(loop, context, [swing, -swing], 2, 1e-12)
 
 
-def test_a_force_loop_has_the_pole_of_its_sensor():
-    """time_constant y' = v - y with v = r - G (y - r): the pole is -(1 + G) / time_constant."""
-    found = arm("two_link")
-    loop, context = resting_loop(
-        found.model,
-        found.structure,
-        poles([-3.0, -4.0]),
-        ForceSensor(1, time_constant=0.05),
-        measured_force=True,
-        force_gain=3.0,
-    )
-    assert_poles(loop, context, [-3.0, -4.0, -80.0], 2, 1e-11)
-
-
 def test_a_loop_from_a_scenario_converts():
     """And stays converted: the rates are those of the diagram, to round-off."""
     loop, context = shipped("seven_joint_wall")
@@ -379,48 +358,6 @@ def test_sensitivity_of_a_simulation():
     for column, direction in zip(found.T, np.eye(2), strict=True):
         expected = slope(lambda at: end(Simulator, plant, *at), point, direction, 1e-3)
         np.testing.assert_allclose(column, expected, rtol=0, atol=GRADIENT)
-
-
-def collocate(system, solver, start, end, fixed):
-    """Least int u^2 dt from rest to rest in 1 s; the end is fixed in some of the states."""
-    context = system.CreateDefaultContext()
-    problem = DirectCollocation(system, context, 21, 0.05, 0.05)
-    program = problem.prog()
-    program.AddBoundingBoxConstraint(start, start, problem.initial_state())
-    program.AddBoundingBoxConstraint(end[fixed], end[fixed], problem.final_state()[fixed])
-    problem.AddRunningCost(problem.input()[0] ** 2)
-    line = PiecewisePolynomial.FirstOrderHold([0.0, 1.0], np.column_stack([start, end]))
-    problem.SetInitialTrajectory(PiecewisePolynomial(), line)
-    result = solver.Solve(program)
-    assert result.is_success()
-    return result.get_optimal_cost(), problem.ReconstructInputTrajectory(result)
-
-
-@pytest.mark.parametrize("solver", [SnoptSolver(), IpoptSolver()], ids=["SNOPT", "IPOPT"])
-def test_direct_collocation(solver):
-    """The pendulum swings by 0.5 rad; against phi'' = -g sin phi + u cos phi, and replayed."""
-    phi, rate, u = Variable("phi"), Variable("rate"), Variable("u")
-    polar = SymbolicVectorSystem(
-        state=[phi, rate], input=[u], dynamics=[rate, -9.81 * sin(phi) + u * cos(phi)], output=[phi]
-    )
-    plant, angle = DaePlant(hanging_pendulum()), 0.5
-    start = np.array([0.0, -1.0, 0.0, 0.0])
-    end = np.array([np.sin(angle), -np.cos(angle), 0.0, 0.0])
-    cost, control = collocate(plant, solver, start, end, [0, 2])
-    wanted, _ = collocate(polar, solver, np.zeros(2), np.array([angle, 0.0]), [0, 1])
-    # Cubics in other coordinates, 0.05 s long: they differ by some 0.05^4.
-    assert cost == pytest.approx(wanted, rel=1e-4)
-
-    builder = DiagramBuilder()
-    builder.AddSystem(plant)
-    source = builder.AddSystem(TrajectorySource(control))
-    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
-    simulator = Simulator(builder.Build())
-    ApplySimulatorConfig(fixed_step(), simulator)
-    simulator.get_mutable_context().SetContinuousState(start)
-    simulator.AdvanceTo(1.0)
-    replayed = plant.state(plant.GetMyContextFromRoot(simulator.get_context()))
-    np.testing.assert_allclose(replayed, end, atol=1e-4)
 
 
 def test_failures_name_time_and_state():

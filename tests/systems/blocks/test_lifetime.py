@@ -12,7 +12,6 @@ import pytest
 from campaign.memory import resident
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import FirstOrderTaylorApproximation
 from runs import scenario, some
 
 from drake_dae import (
@@ -75,18 +74,6 @@ def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], Lea
 
 
 @pytest.mark.slow
-def test_a_loop_that_ran_is_freed_with_its_context_and_logs():
-    made = loop()
-    context = made.diagram.CreateDefaultContext()
-    simulate(made.diagram, context, 0.02, arms.fixed_step())
-    made.record(context)
-    lasts = [ref(each) for each in (made, made.diagram, made.plant, made.controller)]
-    del made, context
-    gc.collect()
-    assert [last() for last in lasts] == [None] * 4
-
-
-@pytest.mark.slow
 def test_a_loop_on_drakes_contact_is_freed_after_it_ran_with_one_call_a_sample(monkeypatch):
     monkeypatch.setattr(sampled, "WORTH", 1)  # Short runs, too.
     chosen = scenario("wall_point_contact", "compiled=false")
@@ -109,17 +96,6 @@ def test_a_drawn_scenario_is_freed_with_its_model_and_its_geometry():
     del made, context, links, forces
     gc.collect()
     assert [last() for last in lasts] == [None] * 4
-
-
-@pytest.mark.slow
-def test_a_linearized_loop_is_freed():
-    made = loop()
-    context = made.diagram.CreateDefaultContext()
-    FirstOrderTaylorApproximation(made.diagram, context)
-    last = ref(made.plant)
-    del made, context
-    gc.collect()
-    assert last() is None
 
 
 def test_a_loop_lives_as_long_as_its_simulator():

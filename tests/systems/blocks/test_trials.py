@@ -12,19 +12,12 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from runs import some
 
 from drake_dae import (
-    ConstantReference,
     DaePlant,
     DaeSystem,
     ForceSensor,
-    NormalForm,
-    StateRealization,
-    TrackingController,
-    TrackingLaw,
-    poles,
     simulate,
 )
 from drake_dae.errors import NonFiniteError, SimulationError, SingularityError
-from drake_dae.systems.control.references import ReferenceGenerator
 
 ERROR_CONTROLLED = (
     "bogacki_shampine3",
@@ -200,30 +193,6 @@ def test_nan_from_a_block_of_someone_else_ends_the_run(name, since):
     assert np.isfinite(logger.FindLog(simulator.get_context()).data()).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [DaePlant, lambda s: StateRealization(NormalForm(s))])
-def test_a_closed_loop_with_both_plants(make):
-    """Of poles at -500 rk3 tries x = -24 at first; the law then cancels the root it lacks there."""
-    system = tank()
-    law = TrackingLaw(system, poles(-500.0))
-    builder = DiagramBuilder()
-    plant = builder.AddSystem(make(system))
-    controller = builder.AddSystem(TrackingController(law))
-    reference = builder.AddSystem(ReferenceGenerator([ConstantReference([0.04])], law.degrees))
-    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
-    builder.Connect(reference.get_output_port(), controller.GetInputPort("reference"))
-    builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
-    logs = [
-        LogVectorOutput(port, builder)
-        for port in (plant.GetOutputPort("state"), controller.GetOutputPort("control"))
-    ]
-    context = by_drake(builder.Build(), 0.03, scheme("runge_kutta3", 1e-8))
-    state, control = (log.FindLog(context) for log in logs)
-    exact = 0.04 + 0.96 * np.exp(-500 * state.sample_times())
-    np.testing.assert_allclose(state.data()[0], exact, atol=1e-6)
-    assert np.isfinite(control.data()).all()
-
-
 def test_a_sensor_feels_what_a_trial_does_not_have():
     """Its state, like that of the plant, is finite at each step; tau f' = -sqrt(x) - f."""
     builder = DiagramBuilder()
@@ -339,13 +308,6 @@ def test_an_overflow_is_not_called_singular():
     with pytest.raises(NonFiniteError, match=r"\bx\b") as caught:
         plant.EvalTimeDerivatives(context)
     assert not isinstance(caught.value, SingularityError)
-
-
-def test_a_simulator_of_drake_ends_a_state_that_grows_without_bound():
-    """x' = x^2 from 1 is 1 / (1 - t): ever shorter steps, each of them accepted."""
-    diagram, _ = alone(DaePlant(tank(lambda x: x**2)))
-    with pytest.raises(SimulationError, match="1000"):
-        by_drake(diagram, 2.0, scheme("runge_kutta5", 1e-6))
 
 
 def test_how_slow_is_endless():

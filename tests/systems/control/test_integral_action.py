@@ -9,8 +9,6 @@ from numpy.testing import assert_allclose
 
 from drake_dae import (
     ConstantReference,
-    DcMotors,
-    FlexibleJoints,
     ForceSensor,
     KnownForce,
     LoopSettings,
@@ -75,30 +73,6 @@ def test_errors_are_those_of_one_more_pole():
     means = (record["tracking_error"][1:] + record["tracking_error"][:-1]) / 2.0
     summed = np.array([0.01, 0.5]) + np.cumsum(steps * means, axis=0)
     assert_allclose(record["integral"][1:], summed, atol=2e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "stage", [DcMotors(0.5, 0.01, 1.0, 100.0), FlexibleJoints(8000.0, inertia=1.0)]
-)
-@pytest.mark.parametrize("measured", [False, True])
-def test_behind_motors_and_springs_too(stage, measured):
-    """With mu of the force 1 and 2 it takes 2 and 3 poles, with its model or a measurement."""
-    model = touching("two_link", [stage])
-    structure = find_structure(model.dae)
-    tracking = TrackingLaw(
-        model.dae,
-        poles(-5.0),
-        structure=structure,
-        measured_force=measured,
-        integral=["wall.force"],
-    )
-    assert tracking.gains.degrees == (structure.output_degrees[0], structure.output_degrees[1] + 1)
-    loop, record = follow(model, tracking, 2.0, start=[0.1])
-    predicted = loop.predicted_error(record)
-    assert np.abs(predicted[:, 1]).max() > 1.0
-    assert_allclose(record["tracking_error"][:, 0], predicted[:, 0], atol=1e-7)
-    assert_allclose(record["tracking_error"][:, 1], predicted[:, 1], atol=1e-4)
 
 
 def test_a_push_that_the_law_does_not_know_is_integrated_away():

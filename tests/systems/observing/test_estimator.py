@@ -5,13 +5,12 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from arms import error_controlled
 from numpy.testing import assert_allclose
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource
-from runs import roll, run_scenario, scenario, some
+from runs import roll, scenario, some
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.stats import chi2
 
@@ -37,7 +36,6 @@ from drake_dae.systems.sensing.encoders import StateSensor
 
 T, MASS, FAST, SLOW = 0.01, 2.5, 20.0, 5.0
 RATES = Observing(SLOW, state_rate=FAST)
-STEPS = error_controlled(1e-12)
 
 
 def body(damping: float = 0.0) -> DaeSystem:
@@ -277,34 +275,3 @@ def test_what_cannot_be_estimated_is_refused():
                 "encoders={resolution: 1.0e-5}",
             )
         )
-
-
-SENSED = (
-    "encoders={position_noise: 1.0e-5}",
-    "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.01}",
-    "observer={rate: 20, force_rate: 10, state_rate: 150, identify_friction: [wall]}",
-    "constraints.0.friction=0.1",
-    "duration=0.05",
-    "integrator={integration_scheme: runge_kutta3, use_error_control: false, max_step_size: 0.001}",
-)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("delay", some([0.001, 0.0015]))
-@pytest.mark.parametrize(
-    "plant",
-    some(["!IdealConstraints {}", "!CompliantContact {time_step: 0.001}"]),
-)
-def test_a_rollout_with_an_estimator_is_drakes_run(plant, delay):
-    """The same functions at the same samples, to 1e-9 of the largest value."""
-    sampling = f"sampling={{period: 0.001, delay: {delay}}}"
-    chosen = scenario("two_link_wall", *SENSED, sampling, f"plant={plant}")
-    record = run_scenario(chosen)[2]
-    fresh, start = build_scenario(chosen)
-    found = roll_scenario(chosen, fresh, start).record
-    shared = np.isin(found.time.round(9), record.time.round(9))
-    rows = np.isin(record.time.round(9), found.time.round(9))
-    for name in ("state", "control", "estimated_state", "disturbance"):
-        values, others = record[name][rows], found[name][shared]
-        assert_allclose(others[-10:], values[-10:], atol=1e-9 * np.abs(values).max())
-    assert rows.sum() > 10

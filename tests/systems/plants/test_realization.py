@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 import pytest
 from actuated import actuated
-from arms import arm, consistent_states, error_controlled, fixed_step, law
-from problems import PROBLEMS, bead, pendulum_tension
+from arms import arm, consistent_states, fixed_step, law
+from problems import PROBLEMS, bead
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Adder, ConstantVectorSource, Sine
@@ -187,25 +187,6 @@ def test_simulation_agrees_with_the_plant(name):
     assert moved > 0.02 or name == "held_point"
 
 
-def test_a_free_fall_of_the_knife_edge_is_a_circle():
-    """Without control it keeps speed and turning rate: a circle of radius V/w, by hand."""
-    minimal = realization("knife_edge")
-    simulator, context = driven(minimal, [0.0, 0.0], [0.0, 0.0])
-    ApplySimulatorConfig(error_controlled(1e-10), simulator)
-    simulator.AdvanceTo(2.0)
-    speed, rate, heading = 0.8, 1.0, 0.3
-    end = heading + rate * 2.0
-    expected = [
-        speed / rate * (np.sin(end) - np.sin(heading)),
-        -speed / rate * (np.cos(end) - np.cos(heading)),
-        end,
-        speed * np.cos(end),
-        speed * np.sin(end),
-        rate,
-    ]
-    np.testing.assert_allclose(minimal.state(context), expected, rtol=0, atol=1e-8)
-
-
 @pytest.mark.slow
 def test_the_tracking_law_closes_the_loop():
     """(28) around the realization leaves (30), (31): errors as predicted, no algebraic loop."""
@@ -313,20 +294,6 @@ def test_outputs_without_feedthrough_need_no_control():
     context = minimal.CreateDefaultContext()
     for name in ("state", "coordinates", "constraint_force", "controlled_output"):
         minimal.GetOutputPort(name).Eval(context)
-
-
-def test_a_given_completion_gives_the_same_motion():
-    """Angle and rate of the pendulum as xi: phi'' = -(g sin phi)/L + u cos phi/(m L)."""
-    system = pendulum_tension().system
-    x, y, vx, vy = ca.vertsplit(system.state)
-    xi = ca.vertcat(ca.atan2(x, -y), (x * vy - y * vx) / (x**2 + y**2))
-    minimal = StateRealization(NormalForm(system, xi))
-    context = minimal.CreateDefaultContext()
-    minimal.GetInputPort("control").FixValue(context, [0.7])
-    context.SetContinuousState([0.6, -0.4])
-    rate = minimal.EvalTimeDerivatives(context).CopyToVector()
-    expected = [-0.4, (-9.81 * np.sin(0.6) + 0.7 * np.cos(0.6) / 2.0) / 0.8]
-    np.testing.assert_allclose(rate, expected, rtol=0, atol=1e-13)
 
 
 def test_the_end_of_the_coordinates_stops_the_run():

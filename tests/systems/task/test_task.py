@@ -24,7 +24,6 @@ from polishing import (
     task_loop,
 )
 from pydrake.systems.analysis import SimulatorConfig
-from runs import some
 
 from drake_dae import (
     Approach,
@@ -160,43 +159,6 @@ def test_another_context_is_another_run(whole):
 
 
 HOLDING = Approach(0.1, over=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reaction", some(["approach", "hold", "stop", "fail"], of=3, first=1))
-def test_lost_contact_leads_to_the_chosen_reaction(reaction):
-    """A hand pulls with 40 N where the arm presses with 10 N."""
-    phases = (HOLDING, Press(10.0, over=0.1), Dwell(5.0, if_lost=reaction))
-    loop = task_loop(phases, patience=0.02)
-    context = started(loop, distance=0.01)
-    run_on(loop, context, 0.4)
-    assert loop.changes(context)[-1].phase == "Dwell"
-    push(loop, context, -40.0)
-    if reaction == "fail":
-        with pytest.raises(SimulationError, match=r"Dwell.*t = 0\.42"):
-            run_on(loop, context, 0.5)
-        return
-    found = run_on(loop, context, 0.5)
-    last = loop.changes(context)[-1]
-    assert_allclose(last.time, 0.42, atol=0.01)  # The wall springs back before.
-    again = ", retry 1 of 10" if reaction == "approach" else ""
-    assert last.reason == f"the contact of Dwell is lost{again}"
-    assert last.distance > 0.0
-    push(loop, context, 0.0)
-    if reaction == "stop":
-        assert_allclose(found.simulated_time, 0.02, atol=0.01)
-        assert last.phase == "held"
-        return
-    run_on(loop, context, 1.0 if reaction == "approach" else 1.5)
-    record = loop.record(context)
-    if reaction == "approach":
-        names = [change.phase for change in loop.changes(context)]
-        assert names == ["Approach", "Press", "Dwell"] * 2
-        assert_allclose(record["constraint_force"][-1], 10.0, atol=0.1)
-    else:
-        assert (last.phase, last.in_contact) == ("held", False)
-        assert record["constraint_force"][-1] == 0.0
-        assert_allclose(record["distance"][-1, 1], 0.0, atol=3e-3)
 
 
 def test_a_task_that_may_not_try_again_ends():
