@@ -42,7 +42,7 @@ help:
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: hours'
 	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
 	@echo 'make peers       our law beside others on the same contact, as a table: half an hour'
-	@echo 'make referee     constraint forces of five engines and the right ones, into tests/benchmarks/referee/table.md'
+	@echo 'make referee     constraint forces of four engines and the right ones, into tests/benchmarks/referee/table.md'
 	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
 	@echo 'make house       draw who imports whom, into $(HOUSE)'
 	@echo 'make equations   from each equation of the paper to its line and its test'

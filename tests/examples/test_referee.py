@@ -215,19 +215,18 @@ def test_an_engine_that_is_missing_is_one_sentence(monkeypatch):
     real = importlib.import_module
 
     def absent(name):
-        if name.endswith("exudyn_engine"):
-            raise ImportError("No module named 'exudyn'")
+        if name.endswith("pinocchio_engine"):
+            raise ImportError("No module named 'pinocchio'")
         return real(name)
 
     monkeypatch.setattr(importlib, "import_module", absent)
-    engines, missing = find_engines(("ours", "exudyn_engine"))
+    engines, missing = find_engines(("ours", "pinocchio_engine"))
     assert engines == [ours]
-    assert missing == ["exudyn_engine: left out, since No module named 'exudyn'."]
+    assert missing == ["pinocchio_engine: left out, since No module named 'pinocchio'."]
     text = page(engines, {"pendulum": {ours.NAME: Cell(None, "it cannot")}}, {}, missing)
     assert "| pendulum | - |" in text
     assert "- drake_dae, pendulum: it cannot." in text
     assert missing[0] in text
-    assert add([mpf(1)], scaled(mpf(2), [mpf(3)])) == [mpf(7)]
 
 
 def test_the_command_prints_and_keeps_the_page_of_all_mechanisms(monkeypatch, capsys):

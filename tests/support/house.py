@@ -8,7 +8,7 @@ import ast
 import re
 import sys
 import tomllib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -63,13 +63,6 @@ PAPER = (
     "governing",
     "extension",
 )
-# One person holds a folder of so many files in mind, and a file of so many lines.
-MOST_FILES, MOST_LINES = 12, 350
-# Longer files, each with the reason why it is one.
-LONG = {
-    "drake_dae.dae.system.system": "one class: the fields of (1)-(3), and the same with others",
-}
-
 # Distributions whose modules bear another name.
 IMPORT_NAMES = {
     "drake": "pydrake",
@@ -175,100 +168,3 @@ def _in_order(module: str, other: str) -> bool:
         # dae/__init__.py may gather; nothing in dae imports it.
         return first != ""
     return PAPER.index(first) <= PAPER.index(second)
-
-
-def circle(found: dict[str, set[str]]) -> list[str]:
-    """Modules of which each imports the next, the last the first; [] if there are none."""
-    done: set[str] = set()
-
-    def visit(module: str, trail: list[str]) -> list[str]:
-        if module in trail:
-            return trail[trail.index(module) :]
-        if module in done:
-            return []
-        for other in sorted(found.get(module, ())):
-            round_trip = visit(other, [*trail, module])
-            if round_trip:
-                return round_trip
-        done.add(module)
-        return []
-
-    return next((trip for module in sorted(found) if (trip := visit(module, []))), [])
-
-
-def folder_imports(found: dict[str, set[str]], folder: str) -> dict[str, set[str]]:
-    """Who imports whom among what stands directly in a folder, with all that is inside of it."""
-
-    def member(module: str) -> str:
-        below = module.removesuffix(".__init__").removeprefix(f"{folder}.")
-        return below.split(".")[0] if module.startswith(f"{folder}.") else ""
-
-    graph: dict[str, set[str]] = {}
-    for module, imported in found.items():
-        if own := member(module):
-            others = {member(other) for other in imported} - {"", own}
-            graph.setdefault(own, set()).update(others)
-    return graph
-
-
-def folders(found: Collection[str]) -> dict[str, list[str]]:
-    """For each folder of the package the modules that stand directly in it, without __init__."""
-    held: dict[str, list[str]] = {}
-    for module in sorted(found):
-        folder, _, name = module.rpartition(".")
-        held.setdefault(folder, [])
-        if name != "__init__":
-            held[folder].append(name)
-    return held
-
-
-def crowded(found: Collection[str]) -> list[str]:
-    """Folders with more files than one person holds in mind, as sentences."""
-    return [
-        f"{folder} has {len(held)} files, {MOST_FILES} are the most: it holds two concepts"
-        for folder, held in folders(found).items()
-        if len(held) > MOST_FILES
-    ]
-
-
-def too_long(lines: Mapping[str, int]) -> list[str]:
-    """Files that are too long without a reason, and reasons that nothing needs, as sentences.
-
-    Args:
-        lines: For each module the number of its lines.
-    """
-    found = [
-        f"{module} has {count} lines, {MOST_LINES} are the most: part it, or say in LONG why not"
-        for module, count in lines.items()
-        if count > MOST_LINES and module not in LONG
-    ]
-    short = [module for module in LONG if lines.get(module, 0) <= MOST_LINES]
-    return found + [f"{module} is not too long: take it out of LONG" for module in short]
-
-
-def shared_names(sources: Mapping[str, str]) -> list[str]:
-    """Classes of one name in two files, as sentences.
-
-    Args:
-        sources: For each module its source.
-    """
-    places: dict[str, list[str]] = {}
-    for module, source in sources.items():
-        for name in re.findall(r"^class (\w+)", source, flags=re.MULTILINE):
-            places.setdefault(name, []).append(module)
-    return [
-        f"class {name} is in {' and '.join(held)}: two things have two names"
-        for name, held in places.items()
-        if len(held) > 1
-    ]
-
-
-def borrowed(tests: Path) -> list[str]:
-    """Imports from test files of other folders, which are found only if those were read before."""
-    every = {path.stem: path for path in tests.rglob("test_*.py")}
-    return [
-        f"{path.relative_to(tests)} imports {name} of another folder: move it to tests/support"
-        for path in every.values()
-        for name in imported_modules(path.stem, path.read_text(), set())
-        if name in every and every[name].parent != path.parent
-    ]

@@ -14,8 +14,7 @@ from referee.kinematics import frames
 from referee.reference import Lines
 from referee.vectors import exact
 
-ENGINES = ("ours", "drake_joints", "drake_sap", "mujoco_engine", "pinocchio_engine",
-           "exudyn_engine")  # fmt: skip
+ENGINES = ("ours", "drake_joints", "mujoco_engine", "pinocchio_engine")
 """The modules of `engines`: NAME, NOTE, `forces`, and where it has one `mass_matrix`, `after`."""
 
 MOST = 16
