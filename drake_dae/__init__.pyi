@@ -63,7 +63,6 @@ from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
 from .robots.actuation.hydraulics import ElectrohydraulicServos as ElectrohydraulicServos
 from .robots.constraints.alignment import AxisNormalToSurface as AxisNormalToSurface
 from .robots.constraints.couplers import JointCoupler as JointCoupler
-from .robots.constraints.friction import FrictionCone as FrictionCone
 from .robots.constraints.loop_joints import PrismaticLoopJoint as PrismaticLoopJoint
 from .robots.constraints.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
 from .robots.constraints.points import FixedDistance as FixedDistance
@@ -124,7 +123,6 @@ from .systems.control.controller import TrackingController as TrackingController
 from .systems.control.drake_references import SystemReference as SystemReference
 from .systems.control.drake_references import TrajectoryReference as TrajectoryReference
 from .systems.control.limits import ControlLimits as ControlLimits
-from .systems.control.phase_change import PhaseChange as PhaseChange
 from .systems.control.references import ReferenceGenerator as ReferenceGenerator
 from .systems.control.sampling import ControlHold as ControlHold
 from .systems.control.sampling import Sampling as Sampling

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_dae.cli import main
+from drake_dae.commands.options import program
 
 BOOK = Path(__file__).parent
 
@@ -182,7 +183,7 @@ def _run_command(command: str) -> tuple[int, str]:
     if words[0] == "drake-dae" and not set("|<>&;*$") & set(command):
         with _printed() as printed, warnings.catch_warnings():
             warnings.simplefilter("default")  # A page may show warnings, as on a command line.
-            return main(words[1:]), printed.getvalue()
+            return main(words[1:]), printed.getvalue().replace(program(), "drake-dae")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     finished = subprocess.run(
         ["bash", "-c", command],

@@ -248,8 +248,9 @@ def _read_table(file: Path) -> FloatArray:
         else:
             data = np.load(file, mmap_mode="r", allow_pickle=False)
             if isinstance(data, np.lib.npyio.NpzFile):
-                (name,) = data.files
-                data = data[name]
+                with data:
+                    (name,) = data.files
+                    data = data[name]
     except Exception as error:  # NumPy, whose headers are Python, raises many kinds.
         text = f"'{file.name}' is no table of heights (.csv, .npy, .npz) and no mesh"
         raise ModelError(f"{text} ({', '.join(MESHES)}): {brief(str(error))}") from None

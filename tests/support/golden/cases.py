@@ -121,6 +121,12 @@ CASES = {
     "wall_point_contact": Case("wall_point_contact", GAINS, contact=True, is_slow=False),
     "wall_hydroelastic": Case("wall_hydroelastic", GAINS, contact=True),
     "polish_unknown_part": Case("polish_unknown_part", duration=2.0, contact=True),
+    # Tasks, completed with the gains of their day.
+    **{
+        name: Case(str(FIXTURE.with_name(f"{name}.yaml")), duration=3.5, amplifies=True)
+        for name in ("wall_polish", "wall_guarded")
+    },
+    "wall_flexible_contact": Case("wall_flexible_contact", rolls=True),
     # What no scenario covers, on contact that is traced.
     "compliant": Case("wall_point_contact", (*GAINS, SOFT), rolls=True, is_slow=False),
     "encoders": Case(

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arms import arm, error_controlled, fixed_step, law
+from arms import arm, fixed_step, law
 from members import RestingController
 from polishing import PERIOD, laws, soft_wall, task_loop
 
@@ -147,7 +147,7 @@ def test_a_sensor_that_nothing_reads_is_refused(controller):
 def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
     """At rest at its goals a law has no error: round-off, and that of steps of 1 ms."""
     loop, context = wired(controller)
-    config = error_controlled(1e-8) if controller.takes_over else fixed_step()
+    config = fixed_step()
     simulate(loop.diagram, context, 0.05, config)
     record = loop.record(context)
     assert {"desired_output", "tracking_error", "control"} <= {*record.signals}
@@ -160,8 +160,10 @@ def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
     plant = loop.plant.GetMyContextFromRoot(context)
     compared = controller.compared(own, lambda name: loop.plant.GetOutputPort(name).Eval(plant))
     assert (compared is None) is not ("reference" in loop.signals or controller.takes_over)
+    # A log has the values at the begin of a step; a sampled plant moves by 1.5 um in one.
+    near = 2e-6 if controller.takes_over else 1e-6
     for found, wanted in zip(compared or (), (outputs, desired), strict=False):
-        np.testing.assert_allclose(found, wanted[-1], atol=1e-6)
+        np.testing.assert_allclose(found, wanted[-1], atol=near)
     assert ("control" in loop.logged) is not controller.follows
     assert len(controller.changes(own)) == (1 if controller.takes_over else 0)
 
@@ -170,7 +172,7 @@ def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
 def test_a_controller_that_is_sampled_is_logged(controller):
     if controller.takes_over:
         controller = TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=SAMPLE)
-    loop, context = wired(controller, sampling=Sampling(SAMPLE))
+    loop, context = wired(controller, sampling=Sampling(SAMPLE, delay=SAMPLE))
     simulate(loop.diagram, context, 0.02, fixed_step())
     assert "control" in loop.logged
     assert np.isfinite(loop.record(context)["control"]).all()
