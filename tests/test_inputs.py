@@ -11,9 +11,16 @@ from pydrake.systems.analysis import SimulatorConfig
 from runs import scenario
 
 from drake_dae import (
+    ConstantReference,
+    ForceSensor,
+    JointPositions,
+    MultibodyExpressions,
     NormalForm,
+    PointToPointReference,
     Record,
+    RobotModel,
     RobotPlant,
+    Torus,
     build_scenario,
     dynamic_extension,
     find_structure,
@@ -223,6 +230,9 @@ def test_a_lag_that_is_none_ends_the_run_and_leaves_a_finite_record():
 
 
 ARGUMENTS = {
+    "constant(nan)": lambda: ConstantReference(np.nan),
+    "point_to_point(nan)": lambda: PointToPointReference(0.0, 1.0, np.nan, 1.0),
+    "Torus(inf)": lambda: Torus((0, 0, 0), (0, 0, 1), np.inf, 1.0),
     "max_integrators=-1": lambda: dynamic_extension(arm("two_link").model.dae, max_integrators=-1),
     "spread=-1": lambda: find_structure(arm("two_link").model.dae, spread=-1.0),
     "a row as a state": lambda: law("two_link").control(
@@ -236,6 +246,8 @@ ARGUMENTS = {
     ).coordinates([np.nan] * 4),
     "masked entries": lambda: numbers("numbers", np.ma.masked_array([1.0, 2.0], [True, False])),
     "text as a number": lambda: numbers("numbers", "1.5"),
+    "a sensor of text": lambda: ForceSensor("one", 0.1),
+    "no list": lambda: RobotModel(MultibodyExpressions(arm("two_link").plant), 3, JointPositions),
 }
 
 
