@@ -59,8 +59,6 @@ PAPER = (
     "linearization",
     "beyond",
     "zero_dynamics",
-    "timing",
-    "governing",
     "extension",
 )
 # Distributions whose modules bear another name.
