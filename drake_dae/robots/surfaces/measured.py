@@ -246,11 +246,13 @@ def _read_table(file: Path) -> FloatArray:
             mark = next((mark for mark in ";\t," if mark in text), None)
             data: Any = np.loadtxt(text.splitlines(), delimiter=mark, ndmin=2)
         else:
-            data = np.load(file, mmap_mode="r", allow_pickle=False)
-            if isinstance(data, np.lib.npyio.NpzFile):
-                with data:
-                    (name,) = data.files
-                    data = data[name]
+            with file.open("rb") as stream:  # NumPy leaves a damaged archive open.
+                if stream.peek(2)[:2] == b"PK":
+                    with np.load(stream, allow_pickle=False) as archive:
+                        (name,) = archive.files
+                        data = archive[name]
+                else:
+                    data = np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # NumPy, whose headers are Python, raises many kinds.
         text = f"'{file.name}' is no table of heights (.csv, .npy, .npz) and no mesh"
         raise ModelError(f"{text} ({', '.join(MESHES)}): {brief(str(error))}") from None
