@@ -63,9 +63,11 @@ def test_the_camera_goes_where_nothing_hides_the_contact():
     turned = direction_of(np.vstack([corners, link]), contact, none)
     assert turned @ usual < 0.95
     assert turned[2] == pytest.approx(usual[2])
-    # A wall is looked at from its free side, or along it: the turn is then a right angle exactly.
-    free = -np.array([[usual[0], usual[1], 0.0]])
-    assert direction_of(corners, contact, free) @ free[0] > -1e-12
+    # A wall is looked at from its free side; at a right angle, which is a turn, round-off decides.
+    c, s = np.cos(0.2), np.sin(0.2)
+    free = -np.array([[c * usual[0] - s * usual[1], s * usual[0] + c * usual[1], 0.0]])
+    assert usual @ free[0] < 0.0
+    assert direction_of(corners, contact, free) @ free[0] > 0.0
     # What is flat is looked at more from above.
     assert direction_of(corners * [1.0, 1.0, 0.1], contact * 0, none)[2] > usual[2] + 0.2
 
