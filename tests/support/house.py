@@ -26,6 +26,7 @@ FLOORS = (
     ("trace",),
     ("dae",),
     ("analysis", "symbolic", "robots"),
+    ("blocks",),
     ("systems",),
     ("compiler",),
     ("simulation",),
