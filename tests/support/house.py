@@ -27,6 +27,7 @@ FLOORS = (
     ("dae",),
     ("references",),
     ("analysis", "symbolic", "robots"),
+    ("blocks",),
     ("systems",),
     ("compiler",),
     ("simulation",),
