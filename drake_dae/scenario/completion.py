@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.references import Reference
-from drake_dae.dae.references.by_name import meant
+from drake_dae.references import Reference
+from drake_dae.references.by_name import denoted
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ReferenceSignalError, ScenarioError
 from drake_dae.robots.constraints import Constraint
@@ -488,14 +488,14 @@ def _meaning(
     signals = [signal.name for signal in rows.signals]
     outputs = [*signals[: rows.given], *forces]
     with suppress(ReferenceSignalError):
-        places = meant(name, outputs, [2] * rows.given + [0] * len(forces))
+        places = denoted(name, outputs, [2] * rows.given + [0] * len(forces))
         return [place if place < rows.given else None for place in places]
     if missing:  # Of a point the rows along its surface first.
         along = [signals[row] for row in rows.points(near)]
         others = [*along, *(signal for signal in signals[rows.given :] if signal not in along)]
         of_point = [signal for signal in along if signal.rpartition(".")[0] == name]
         with suppress(ReferenceSignalError):
-            chosen = of_point or [others[k] for k in meant(name, others, [2] * len(others))]
+            chosen = of_point or [others[k] for k in denoted(name, others, [2] * len(others))]
             return [signals.index(signal) for signal in chosen]
         outputs += others
     raise ScenarioError((key, unknown_name("output", name, outputs)))

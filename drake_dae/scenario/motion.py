@@ -6,9 +6,9 @@ import numpy as np
 
 from drake_dae.analysis.limits import SignalLimits
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import ConstantReference, Reference
-from drake_dae.dae.references.by_name import assigned, in_order
-from drake_dae.dae.references.reference import stack_references
+from drake_dae.references import ConstantReference, Reference
+from drake_dae.references.by_name import assign, in_order
+from drake_dae.references.reference import stack_references
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
@@ -42,7 +42,7 @@ def references_of(
     smooth = []
     for name, reference in scenario.references.items():
         with at(f"references.{name}"):
-            smooth.append(assigned(name, reference, outputs, degrees))
+            smooth.append(assign(name, reference, outputs, degrees))
     with at("references"):
         return in_order(smooth, outputs)
 

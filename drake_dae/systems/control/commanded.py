@@ -8,9 +8,9 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState, Dep
 
 from drake_dae.arguments import checked
 from drake_dae.blocks.computations import DERIVATIVE, PARAMETERS, STATE, TIME, Block, Computation
-from drake_dae.dae.references import Reference
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references import Reference
 from drake_dae.systems.control.references import ReferenceGenerator, traced_references
 from drake_dae.trace.functions import TracedFunction
 
