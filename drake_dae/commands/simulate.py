@@ -36,7 +36,7 @@ from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario

@@ -1,6 +1,6 @@
 """The outputs and the start that a scenario leaves out."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -11,10 +11,10 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.references import Reference
-from drake_dae.references.by_name import denoted
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ReferenceSignalError, ScenarioError
+from drake_dae.references import Reference
+from drake_dae.references.by_name import denoted
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
@@ -101,7 +101,7 @@ def completions(
     if missing:
         _check_forces(forces, near)
     goals = _Goals(scenario, rows, forces, missing, near)
-    named, begin = goals.rows, goals.values(scenario.integrator.start_time)[0]
+    named, begin = goals.rows, goals.path[0][0]
     errors = scenario.start.errors
     begin = begin + [errors.get(rows.signals[row].name, 0.0) for row in named]
     if missing == 0 and task is None:
@@ -117,7 +117,7 @@ def completions(
     for posture in starts[: 1 if start else _POSTURES]:
         for added in _added(rows, named, posture, missing):
             held = [*named, *added]
-            worst = sorted((entry[0] for entry in found), reverse=True)[: MOST][-1:]
+            worst = sorted((entry[0] for entry in found), reverse=True)[:MOST][-1:]
             enough = worst[0] if len(found) >= MOST else 0.0
             quality = _least(postures, goals, posture, held, enough)
             found.append((quality, posture, held, added))
@@ -221,8 +221,8 @@ def _least(
     """
     wanted, count = posture.rows[list(rows)], len(goals.rows)
     q, least = posture.q, postures.quality(posture, rows)
-    for time in goals.times:
-        wanted[:count], rates = goals.values(time)
+    for values, rates in goals.path:
+        wanted[:count] = values
         found = postures.solve(rows, wanted, q)
         if found is None:
             return 0.0
@@ -265,7 +265,7 @@ def _written(
     if rows.is_task and scenario.start.positions:
         return Completed(scenario, tuple(notes))
     q = posture.q
-    if rows.is_task and not scenario.task.phases[0].begins_in_contact:
+    if scenario.task is not None and not scenario.task.phases[0].begins_in_contact:
         q = rows.off_surface(scenario, posture)
     joints_at = _rounded(q).tolist()
     positions = dict(zip((s.name for s in rows.links.position_signals), joints_at, strict=True))
@@ -374,7 +374,10 @@ class _Rows:
         begin = scenario.integrator.start_time
         values = {name: np.atleast_1d(value) for name, value in scenario.plant_parameters.items()}
         for name, references in scenario.exogenous.items():
-            values[name] = np.concatenate([np.zeros(0), *(_value(r, 1, begin)[0] for r in references)])
+            sizes = [getattr(r, "size", 1) for r in references]
+            pairs = zip(references, sizes, strict=True)
+            at_start = [_values_of(r, size)(begin)[:, 0] for r, size in pairs]
+            values[name] = np.concatenate([np.zeros(0), *at_start])
         rows = ca.vertcat(ca.SX(0, 1), *self._expressions)
         touches = list(zip(self.touches.values(), self.outward, strict=True))
         with at("plant_parameters or exogenous"):
@@ -408,7 +411,7 @@ class _Goals:
 
     Attributes:
         rows: The rows of the scenario's outputs, then those that references name beside them.
-        times: Times along the references, in s.
+        path: Their values and rates at some times, the first one at the start.
     """
 
     def __init__(
@@ -421,7 +424,7 @@ class _Goals:
             key = "task.phases"
             distances = {signal.name for signal in rows._bound.residual_signals}
             references = _of_phases(scenario, distances)
-        self._references: list[tuple[Any, list[int | None]]] = []
+        self._references: list[tuple[_Values, list[int | None]]] = []
         for name, reference in references.items():
             at_key, meaning = f"{key}.{name}", list[int | None]()
             for part in map(str.strip, name.split(",")):
@@ -429,7 +432,7 @@ class _Goals:
             if isinstance(reference, Reference) and reference.size != len(meaning):
                 text = f"{reference.size} values for {len(meaning)} outputs"
                 raise ScenarioError((at_key, text))
-            self._references.append((reference, meaning))
+            self._references.append((_values_of(reference, len(meaning)), meaning))
         every = dict.fromkeys(row for _, meaning in self._references for row in meaning)
         beside = [row for row in every if row is not None and row >= rows.given]
         if len(beside) > missing:
@@ -442,15 +445,14 @@ class _Goals:
         self.rows = [*range(rows.given), *beside]
         begin = scenario.integrator.start_time
         end = begin if scenario.task else begin + scenario.duration
-        self.times = np.unique(np.linspace(begin, end, _TIMES))
+        self.path = [self._values(time) for time in np.unique(np.linspace(begin, end, _TIMES))]
 
-    def values(self, time: float) -> tuple[FloatArray, FloatArray]:
+    def _values(self, time: float) -> tuple[FloatArray, FloatArray]:
         """The values of the rows and their rates at a time in s, shape (len(rows),) each."""
         found = {row: (self._held[row], 0.0) for row in self.rows}
         for reference, meaning in self._references:
-            value, rate = _value(reference, len(meaning), time)
-            pairs = zip(meaning, zip(value, rate, strict=True), strict=True)
-            found |= {row: pair for row, pair in pairs if row is not None}
+            pairs = zip(meaning, reference(time), strict=True)
+            found |= {row: (pair[0], pair[1]) for row, pair in pairs if row is not None}
         values, rates = np.array([found[row] for row in self.rows]).reshape(-1, 2).T
         return values, rates
 
@@ -469,16 +471,20 @@ def _of_phases(scenario: Scenario, distances: set[str]) -> dict[str, Any]:
     return references
 
 
-def _value(reference: Any, size: int, time: float) -> tuple[FloatArray, FloatArray]:
-    """The values of a reference and their rates at a time in s."""
+_Values = Callable[[float], FloatArray]
+
+
+def _values_of(reference: Any, size: int) -> _Values:
+    """The values of a reference and their rates as a function of time in s, shape (size, 2)."""
     if not isinstance(reference, Reference):
-        return np.full(size, float(reference)), np.zeros(size)
-    degrees = [1] * reference.size
+        constant = np.array([[float(reference), 0.0]] * size)
+        return lambda time: constant
     try:
-        values = reference.derivatives(degrees)(time).reshape(-1, 2)
+        function = reference.derivatives([1] * size)
+        return lambda time: function(time).reshape(-1, 2)
     except ReferenceSignalError:  # One of a force may jump.
-        values = reference.derivatives([0] * reference.size)(time)[:, None] * [1.0, 0.0]
-    return values[:, 0], values[:, 1]
+        values = reference.derivatives([0] * size)
+        return lambda time: values(time)[:, None] * [1.0, 0.0]
 
 
 def _meaning(
@@ -530,7 +536,9 @@ def _why_none(
     lacking = rows.given + missing - ways
     if lacking <= 0:
         names = ", ".join(rows.signals[row].name for row in named) or "the constraints"
-        text = f"{missing} are missing, and no positions of joints beside {names} leave B(x) regular"
+        text = (
+            f"{missing} are missing, and no positions of joints beside {names} leave B(x) regular"
+        )
         return "outputs", f"{text}; name others under outputs"
     held = [*named, *posture.independent(named, rows.points(posture), ways - len(named))]
     held += posture.independent(held, rows.joints, ways - len(held))

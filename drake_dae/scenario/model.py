@@ -1,9 +1,8 @@
 """The robot model of a scenario, completed."""
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from drake_dae.arrays import unknown_name
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.errors import (
     AssumptionError,
-    DrakeDaeError,
     GeometryWarning,
     InconsistentStateError,
     ModelError,

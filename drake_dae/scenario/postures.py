@@ -200,7 +200,7 @@ class Postures:
     def nearest(
         self, rows: Sequence[int], wanted: FloatArray, guesses: Iterable[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """The configuration within limits that is nearest to given values of rows, and what is left.
+        """The configuration within limits nearest to given values of rows, and what is left.
 
         Of the constraints a hundredth is left of what is left of rows.
         """

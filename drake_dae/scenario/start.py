@@ -189,9 +189,7 @@ def _in_motion(
 
 
 @at("start.errors")
-def _outputs_at_start(
-    errors: Mapping[str, float], loop: ClosedLoop, time: float
-) -> FloatArray:
+def _outputs_at_start(errors: Mapping[str, float], loop: ClosedLoop, time: float) -> FloatArray:
     """z at the start: the references plus the errors, shape (p,)."""
     degrees = loop.controller.law.degrees
     outputs = loop.controller.law.layout.values(loop.reference.reference(time))
@@ -290,9 +288,7 @@ def _unwound(
 
 
 @at("start.positions")
-def start_guess(
-    scenario: Scenario, links: Links, others: FloatArray | None = None
-) -> FloatArray:
+def start_guess(scenario: Scenario, links: Links, others: FloatArray | None = None) -> FloatArray:
     """The initial guess of q: start.positions, and other joints at `others` or their defaults."""
     guess = (links.default_positions if others is None else others).copy()
     for name, value in scenario.start.positions.items():

@@ -1,7 +1,6 @@
 """Feasibility of a scenario, before it is simulated."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -10,26 +9,24 @@ from pydrake.geometry import SceneGraph
 from drake_dae.analysis.analyze import along, analyze, examine
 from drake_dae.analysis.limits import limits_along
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError, ScenarioError
-from drake_dae.references.reference import common_period
+from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots.links_behind import links_behind
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
+from drake_dae.scenario.build import tracking_law
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.feasibility.limits import robot_limits
 from drake_dae.scenario.feasibility.report import Feasibility, SignalRange
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.loop import build_loop, exogenous_references
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
-from drake_dae.scenario.plants import IdealConstraints
+from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
 from drake_dae.scenario.robot_file.links import RobotLinks
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.summary import Limits
 from drake_dae.trace.functions import TracedFunction
 
@@ -83,7 +80,7 @@ def complete_and_examine(
     """
     if scenario.task is not None:
         check_task(scenario)
-    completed, model = completed_model(scenario, scene_graph, drawn=False, robot=robot)
+    completed, model, _ = completed_model(scenario, scene_graph, drawn=False, robot=robot)
     return completed.scenario, _feasibility(completed.scenario, model)
 
 
@@ -99,33 +96,28 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
             structure = examined.structure
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    gains = _without_gains(scenario, model, structure)
+    gains, law = "", None
+    try:
+        law = tracking_law(advised(scenario, model, structure).scenario, model, structure)
+    except ScenarioError as error:
+        if not scenario.is_advised:
+            raise
+        gains = str(error)
     if scenario.task is not None:
         return Feasibility(analyze(model.dae), scenario.duration, gains=gains)
-    # The law's model, without differences of the plant.
-    ideal = replace(
-        scenario,
-        plant=IdealConstraints(),
-        plant_payloads=[],
-        plant_disturbances=[],
-        encoders=None,
-        observer=None,
-        identified=[],
-    )
-    loop = build_loop(ideal, model, structure)
-    context = start_scenario(ideal, loop)
-    reference, begin = loop.reference.reference, scenario.integrator.start_time
+    reference, start = reference_and_start(scenario, model, structure)
+    degrees = None if law is None or scenario.observer is not None else law.exogenous_degrees
+    exogenous = exogenous_references(scenario, model.dae, degrees)
+    names = [signal.name for signal in model.dae.output_signals]
+    outputs = references_of(scenario, names, structure.layout.reference_degrees)
+    period = common_period([r.repeats for r in (*outputs, *exogenous)])
+    moving = stack_references(exogenous, [1] * sum(r.size for r in exogenous))
 
     def signals(time: float) -> FloatArray:
-        moving = [] if loop.exogenous is None else [loop.exogenous.reference(time)]
-        return np.concatenate([reference(time), *moving])
+        return np.concatenate([reference(time), moving(time)] if exogenous else [reference(time)])
 
+    begin = scenario.integrator.start_time
     times, is_resolved = sample_times(signals, begin, begin + scenario.duration)
-    start = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    exogenous = exogenous_references(
-        scenario, loop.plant.dae, loop.controller.law.exogenous_degrees
-    )
-    period = common_period([r.repeats for r in (*loop.reference.references, *exogenous)])
     analysis = along(
         examined or examine(model.dae), reference, times, start, period or None, exogenous
     )
@@ -152,15 +144,6 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
         gains=gains,
         slowing=slowing,
     )
-
-
-def _without_gains(scenario: Scenario, model: RobotModel, structure: Structure) -> str:
-    """Why no gains can be computed where they are left out, else empty."""
-    try:
-        advised(scenario, model, structure)
-    except ScenarioError as error:
-        return str(error)
-    return ""
 
 
 def sample_times(
