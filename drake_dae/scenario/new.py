@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, log10, pi
 from pathlib import Path
+from textwrap import wrap
+from time import perf_counter
 from typing import Any, Literal
 
 import casadi as ca
@@ -18,6 +20,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.parsing import GetScopedFrameByName, PackageMap
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
+    BodyIndex,
     JacobianWrtVariable,
     Joint,
     PrismaticJoint,
@@ -87,7 +90,8 @@ _RADIUS, _BEND, _FORCE, _SHORTEST = 0.08, 0.4, 20.0, 5.0
 N; and the shortest period, s."""
 
 _KEYS = ("description", "robot", "constraints", "tool_axis", "references", "start", "duration")
-"""The keys of the text."""
+_PATH = (TAG, "center", "radius", "period", "offset", "amplitudes", "frequencies")
+"""The keys of the text, and of its path."""
 
 _FRACTIONS, _PLACES = (1.0, 0.5, 0.2), 4
 """The fractions of the usual circle and force that are tried, each at so many places."""
@@ -101,6 +105,7 @@ def new_scenario(
     point: Vector = (0.0, 0.0, 0.0),
     folder: str | Path | None = None,
     progress: Callable[[str], object] = lambda text: None,
+    seconds: float = 15.0,
 ) -> tuple[Scenario, str]:
     """Makes a scenario in which a robot presses on a surface and moves in a circle on it.
 
@@ -118,7 +123,8 @@ def new_scenario(
         point: The point in that frame, m, shape (3,).
         folder: The folder in which the text will be saved: a robot's file below it gets a name
             relative to it. Without one the name is absolute, and the text may be saved anywhere.
-        progress: Called with a sentence on each step.
+        progress: Called with a phrase on each step.
+        seconds: After this time by the clock no further place is tried.
 
     Returns:
         The scenario, and its text with a comment on each choice; `load_scenario` reads the same
@@ -129,6 +135,7 @@ def new_scenario(
             message lists the places that were tried.
     """
     progress("reading the robot")
+    end = perf_counter() + seconds
     is_url = file.startswith("package://")
     with at("robot.file"):
         robot, tip, point, why = _robot(
@@ -143,7 +150,9 @@ def new_scenario(
     for fraction, place in product(_FRACTIONS, places[:_PLACES]):
         scenario = _scenario(robot, tip, point, place, names, surface, fraction)
         name, center = scenario.constraints[0].name, place.center
-        progress(f"trying a {name} at {center}")
+        if tried and perf_counter() > end:
+            break
+        progress(f"trying a {name} at {center} m")
         try:
             completed, _, _ = completed_model(scenario, None, robot=read)
             problem = next((n for n in completed.notes if n.startswith("no start")), "")
@@ -165,7 +174,10 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, dict
     plant, robot = _read(file)
     why = {"packages": "where package://<name>/ leads", "leave_out": "what no equation has"}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
-    joints, bodies = joints_of(plant), [plant.get_body(i) for i in plant.GetBodyIndices()[1:]]
+    joints, bodies = (
+        joints_of(plant),
+        [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())],
+    )
     above = {joint.child_body().index(): joint for joint in joints}
     body_of = dict(zip(unique_names(plant, bodies), bodies, strict=True))
     # The base.
@@ -542,6 +554,7 @@ def _text(scenario: Scenario, why: dict[str, str], folder: str | Path | None) ->
     keys = ("file", "packages", "base", "locked", "actuators", "leave_out")
     (along, path), (pressing, force) = data["references"].items()
     radius = path.get("radius") or path["amplitudes"][0]
+    path = {key: path[key] for key in path if key in _PATH}
     notes = {"file": "", "surface": why["place"], **why}
     lines = [
         "# Written by `drake-dae new`, to be changed. Units: m, rad, s, N, N m.",
@@ -575,17 +588,19 @@ def _text(scenario: Scenario, why: dict[str, str], folder: str | Path | None) ->
 def _line(key: str, value: Any, note: str) -> str:
     """A line of YAML; a note that makes it too long stands above it."""
     line, indent = f"{key}: {_flow(value)}", " " * (len(key) - len(key.lstrip()))
-    if not note:
-        return line
-    return f"{line}  # {note}" if len(line) + len(note) < 96 else f"{indent}# {note}\n{line}"
+    if note and len(line) + len(note) < 96:
+        return f"{line}  # {note}"
+    options: Any = {"break_long_words": False, "break_on_hyphens": False}
+    lines = wrap(line, 100, subsequent_indent=f"{indent}    ", **options)
+    return "\n".join([f"{indent}# {note}", *lines] if note else lines)
 
 
 def _flow(value: Any) -> str:
-    """Data in one line, without keys that have their defaults."""
+    """Data in one line, without keys that are empty or zero vectors."""
     if isinstance(value, Mapping):
-        defaults: tuple[Any, ...] = ("", [], {}, None, False, [0.0, 0.0, 0.0], [0.0])
-        kept = {k: v for k, v in value.items() if k != TAG and v not in defaults}
-        inner = ", ".join(f"{_flow(k)}: {_flow(v)}" for k, v in kept.items())
+        texts = {k: _flow(v) for k, v in value.items() if k != TAG and v is not False}
+        empty = ('""', "[]", "{}", "null", "[0.0, 0.0, 0.0]", "[0.0]")
+        inner = ", ".join(f"{_flow(k)}: {text}" for k, text in texts.items() if text not in empty)
         return f"{value[TAG]} {{{inner}}}" if TAG in value else f"{{{inner}}}"
     if isinstance(value, list):
         return f"[{', '.join(map(_flow, value))}]"
