@@ -13,7 +13,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references.reference import common_period
 from drake_dae.robots.links_behind import links_behind
