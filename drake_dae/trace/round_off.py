@@ -26,14 +26,7 @@ Sized = tuple[FloatArray, FloatArray]
 def multiply(
     left: FloatArray, right: Sized, scale: FloatArray, negligible: float = NEGLIGIBLE
 ) -> Sized:
-    """Multiplies matrices; entries that are only round-off are set to zero.
-
-    Args:
-        left: The left factor, shape (a, k).
-        right: The right factor, shape (k, b).
-        scale: The scales of the columns of `left` and the rows of `right`, shape (k,).
-        negligible: A factor below this, relative to the others in its row or column, is zero.
-    """
+    """Multiplies matrices; entries that are only round-off are set to zero."""
     value, size = right
     row, column = np.abs(left) * scale, size / scale[:, None]
     row_noise = negligible * np.max(row, axis=1, keepdims=True, initial=0.0)
@@ -45,12 +38,7 @@ def multiply(
 
 
 def without_round_off(value: FloatArray, size: FloatArray) -> Sized:
-    """Sets those entries of a sum of products to zero that are only round-off.
-
-    Args:
-        value: The sum, shape (a, b).
-        size: The sum of the sizes of its terms, shape (a, b).
-    """
+    """Sets those entries of a sum of products to zero that are only round-off."""
     return np.where(np.abs(value) > ZERO * size, value, 0.0), size
 
 
@@ -76,12 +64,7 @@ def significant(matrix: FloatArray) -> FloatArray:
 
 
 def rank_of(matrix: FloatArray, least: float) -> int:
-    """Returns the rank of a matrix: its rows and columns scaled, above its round-off.
-
-    Args:
-        matrix: The matrix.
-        least: Singular values below this, relative to the largest, are zero.
-    """
+    """Returns the rank of a matrix: its rows and columns scaled, above its round-off."""
     matrix = significant(matrix)
     return int(np.linalg.matrix_rank(equilibrated(matrix), least)) if matrix.size else 0
 

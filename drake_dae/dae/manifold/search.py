@@ -21,23 +21,13 @@ relative to its size is at most this; where gradients are dependent, if its resi
 
 
 class ConsistentStateSearch:
-    """Searches a consistent state by Newton's method, then by least squares.
-
-    Args:
-        residual: The residual of N*.
-        first_steps: The first Newton steps; see `trace_first_steps`.
-    """
+    """Searches a consistent state by Newton's method, then by least squares."""
 
     def __init__(self, residual: Residual, first_steps: TracedFunction) -> None:
         self._residual, self._first_steps = residual, first_steps
 
     def searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """Acts as `project` from a state from which `first_steps` did not converge.
-
-        Args:
-            start: The state, shape (n,).
-            p: Values of all parameters, shape (k,).
-        """
+        """Acts as `project` from a state from which `first_steps` did not converge."""
         function = self._first_steps
         sizes, moved, _ = function.evaluate(start, p)
         is_finite = function.is_finite

@@ -132,17 +132,7 @@ def find_constraint_structure(
 def constraint_structure_of(
     owner: str, system: DaeSystem, structure: ConstraintStructure | None
 ) -> ConstraintStructure:
-    """Returns the constraint structure of a system: the argument, or a new one if None.
-
-    Args:
-        owner: The caller's name in messages.
-        system: The system (1)-(3).
-        structure: The structure, or that with the outputs; None to find it.
-
-    Raises:
-        AssumptionError, InconsistentStateError: It has none; see `find_constraint_structure`.
-        ModelError: It is not a structure, or that of another system.
-    """
+    """Returns the constraint structure of a system: the argument, or a new one if None."""
     if structure is None:
         return find_constraint_structure(system)
     makers = "find_structure or find_constraint_structure"
@@ -152,11 +142,7 @@ def constraint_structure_of(
 def checked_structure(
     owner: str, system: DaeSystem, structure: Kind, kind: type[Kind], made_by: str
 ) -> Kind:
-    """Checks that a structure belongs to a system, and returns it.
-
-    Raises:
-        ModelError: It is not a structure of this kind, or that of another system.
-    """
+    """Checks that a structure belongs to a system, and returns it."""
     if not isinstance(structure, kind):
         raise ModelError(
             f"{owner}: structure must be what {made_by} returns, got {type(structure).__name__}"
@@ -170,11 +156,7 @@ def checked_structure(
 
 
 def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """Returns initial guesses of consistent states, shape (count + 1, n).
-
-    Raises:
-        AssumptionError, ModelError: The system or an argument makes no sense.
-    """
+    """Returns initial guesses of consistent states, shape (count + 1, n)."""
     check_system(system)
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
@@ -184,22 +166,7 @@ def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) 
 def examine_constraints(
     system: DaeSystem, guesses: FloatArray, region: Region | None = None
 ) -> tuple[ConstraintStructure, Samples]:
-    """Finds r_1, ..., r_m and A(x) of a system that `check_system` accepts.
-
-    Args:
-        system: The system (1)-(3).
-        guesses: States near which consistent ones are sought, shape (count, n).
-        region: The region of the consistent states; None for no restriction.
-
-    Returns:
-        The structure, and the consistent states with the numbers at them.
-
-    Raises:
-        AssumptionError: Assumption (1) or (3) is violated, or no constraint input acts on a
-            constraint. A singular A(x) is left to `constraint_violation`.
-        InconsistentStateError: There is no consistent state near a guess.
-        ModelError: A function is not finite, or the mass matrix is none.
-    """
+    """Finds r_1, ..., r_m and A(x) of a system that `check_system` accepts."""
     try:
         chains, samples = constraint_chains(system, guesses, region)
     except AssumptionError as error:
@@ -225,12 +192,7 @@ def examine_constraints(
 
 
 def check_system(system: DaeSystem) -> None:
-    """Checks the number of constraints and the mass matrix of a system.
-
-    Raises:
-        AssumptionError: There are more constraints than states.
-        ModelError: The mass matrix is not symmetric and positive definite.
-    """
+    """Checks the number of constraints and the mass matrix of a system."""
     check_mass_matrix(system, system.nominal_state[None])
     if system.num_constraints > system.num_states:
         names = tuple(signal.name for signal in system.constraint_output_signals)
@@ -269,19 +231,7 @@ def with_numbers(
     states: FloatArray,
     matrix: ca.SX,
 ) -> Violation | None:
-    """Returns the violation by a matrix, also for other parameters than the defaults.
-
-    Args:
-        violation: The violation with the defaults; None if there is none.
-        assumption: The number of the assumption that it is regular.
-        manifold: N*.
-        states: Consistent states, shape (samples, n).
-        matrix: The matrix.
-
-    Returns:
-        The violation with the deciding numbers, if the matrix is regular for others; or the
-        violation that it is singular within given bounds.
-    """
+    """Returns the violation by a matrix, also for other parameters than the defaults."""
     system = manifold.system
     bounded = any(p.bounds is not None for p in system.parameters)
     if violation is None and not (bounded and matrix.is_square()):

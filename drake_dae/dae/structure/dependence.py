@@ -21,14 +21,7 @@ that is a constraint times a factor."""
 
 @dataclass(frozen=True)
 class Combination:
-    """A row of a matrix that is a linear combination of others: row = sum factors_j row_j.
-
-    Attributes:
-        name: The constraint or the output whose row it is.
-        others: The constraints or outputs that it follows from.
-        factors: The factors, shape (len(others),), at the state where this was found.
-        constant: Whether the factors are the same at all examined states.
-    """
+    """A row of a matrix that is a linear combination of others: row = sum factors_j row_j."""
 
     name: str
     others: tuple[str, ...]
@@ -45,15 +38,7 @@ class Combination:
 
 @dataclass(frozen=True)
 class Dependence:
-    """The linear dependence of the constraints where A(x) is singular.
-
-    Attributes:
-        combinations: The rows that follow from those before them: of the gradients of the
-            constraints if these depend on each other, otherwise of A(x).
-        everywhere: Whether A(x) is singular at all examined states, and not just at one.
-        in_gradients: Whether the gradients of the chains k_i, L_f k_i, ..., depend on each other,
-            at all examined states if `everywhere`.
-    """
+    """The linear dependence of the constraints where A(x) is singular."""
 
     combinations: tuple[Combination, ...]
     everywhere: bool
@@ -63,14 +48,7 @@ class Dependence:
 def find_dependence(
     manifold: Manifold, elimination: Elimination, states: FloatArray, where: FloatArray
 ) -> Dependence:
-    """Finds how the constraints depend on each other at a state where A(x) is singular.
-
-    Args:
-        manifold: N*.
-        elimination: A(x), and the gradients of the last derivative in each chain.
-        states: Other consistent states, shape (count, n).
-        where: The state, shape (n,).
-    """
+    """Finds how the constraints depend on each other at a state where A(x) is singular."""
     system = manifold.system
     names = [signal.name for signal in system.constraint_output_signals]
     rows = {"a": elimination.constraint_matrix, "last": elimination.constraint_gradient}
@@ -129,13 +107,7 @@ def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
 def combinations_of(
     names: list[str], values: list[FloatArray], least: float = SINGULAR
 ) -> list[Combination]:
-    """Returns the rows that depend on earlier rows at the first of some states.
-
-    Args:
-        names: The names of the rows.
-        values: The matrix at each state.
-        least: A row depends on others if its remainder, relative to its length, is below this.
-    """
+    """Returns the rows that depend on earlier rows at the first of some states."""
     matrix, lengths = _scaled(values[0])
     independent: list[int] = []
     combinations = []

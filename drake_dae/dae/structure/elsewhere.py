@@ -29,12 +29,6 @@ class Elsewhere:
     def look(self, index: int, violation: Violation, samples: Samples, row: Row) -> None:
         """Tests a row that is zero at the default parameters at other parameters, and records it.
 
-        Args:
-            index: The constraint or output of the row; the first violation of each is recorded.
-            violation: The violation if the row is not zero.
-            samples: The states at which it is zero.
-            row: The row at a state, with values of all parameters.
-
         Warns:
             NegligibleWarning: An entry counts as zero but may be intended.
         """
@@ -65,11 +59,7 @@ class Elsewhere:
             )
 
     def refuse(self, index: int) -> None:
-        """Checks that the degree of a constraint or output is the same for other parameters.
-
-        Raises:
-            AssumptionError: The degree differs; the message has the deciding numbers.
-        """
+        """Checks that the degree of a constraint or output is the same for other parameters."""
         if index in self._violations:
             raise self._violations[index].error()
 

@@ -9,11 +9,7 @@ from drake_dae.errors import ModelError
 
 
 def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
-    """Checks a mass matrix, since LDL^T reads only one triangle of it.
-
-    Raises:
-        ModelError: It is not symmetric and positive definite at a state.
-    """
+    """Checks a mass matrix, since LDL^T reads only one triangle of it."""
     function = system.trace("mass matrix", {"mass": ca.densify(system.mass_matrix)}, often=False)
     for state in states:
         mass = function(state, system.parameter_values)[0].reshape(state.size, state.size)

@@ -117,11 +117,7 @@ class _Redundant(Manifold):
 
 
 def constraints_kept(system: DaeSystem, names: Sequence[str]) -> list[int]:
-    """Returns the indices of the constraints whose names are not listed.
-
-    Raises:
-        ModelError: No constraint has that name.
-    """
+    """Returns the indices of the constraints whose names are not listed."""
     signals = [signal.name for signal in system.constraint_output_signals]
     for name in names:
         if name not in signals:

@@ -34,22 +34,7 @@ MANY = 10
 def constraint_chains(
     system: DaeSystem, guesses: FloatArray, region: Region | None
 ) -> tuple[list[list[ca.SX]], Samples]:
-    """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3).
-
-    Args:
-        system: The system (1)-(3).
-        guesses: States near which consistent ones are sought, shape (count, n).
-        region: The region of the consistent states; None for no restriction.
-
-    Returns:
-        The chains, and consistent states with the numbers at them.
-
-    Raises:
-        AssumptionError: Assumption (1) or (3) is violated, or no constraint input acts on a
-            constraint.
-        InconsistentStateError: There is no consistent state near a guess.
-        ModelError: A function is not finite.
-    """
+    """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3)."""
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
     chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
@@ -119,16 +104,7 @@ class OutputChains(NamedTuple):
 def output_chains(
     derivatives: Derivatives, elimination: Elimination, samples: Samples
 ) -> OutputChains:
-    """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and the rows of B(x).
-
-    Args:
-        derivatives: The time derivatives along the motion on N*.
-        elimination: Equations (9)-(14) as expressions.
-        samples: The consistent states at which numbers decide.
-
-    Raises:
-        AssumptionError: Assumption (4) is violated, or no control acts on an output.
-    """
+    """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and the rows of B(x)."""
     system = derivatives.system
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     names, count = [s.name for s in system.output_signals], system.num_outputs
@@ -212,13 +188,7 @@ def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Size
 
 
 class _ChainRows:
-    """The action of inputs at a state, for values of all parameters.
-
-    Args:
-        samples: States with the default parameters.
-        elimination: Equations (9)-(14), for the action of the control through the constraint
-            inputs.
-    """
+    """The action of inputs at a state, for values of all parameters."""
 
     def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
         self._system, self._scale = samples.system, samples.scale

@@ -135,11 +135,7 @@ def _weights(system: DaeSystem, compliances: Mapping[str, float]) -> FloatArray:
 
 
 def _undetermined(samples: Samples, gather: ca.SX, split: ca.SX) -> tuple[str, ...]:
-    """The constraint inputs that are not determined.
-
-    Raises:
-        ModelError: An output is not determined.
-    """
+    """The constraint inputs that are not determined."""
     system = samples.system
     every = np.eye(system.num_constraints)
     free = np.zeros(system.num_constraints, dtype=bool)

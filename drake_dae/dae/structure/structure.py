@@ -172,17 +172,7 @@ def find_structure(
 
 
 def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """Returns the structure of a system: the argument, or the result of `find_structure` if None.
-
-    Args:
-        owner: The caller's name in messages.
-        system: The system (1)-(3).
-        structure: The structure, or None to find it.
-
-    Raises:
-        AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
-        ModelError: It is not a system, or the structure is that of another one.
-    """
+    """Returns the given structure of a system, or the result of `find_structure`."""
     if structure is None:
         return find_structure(system)
     return checked_structure(owner, system, structure, Structure, "find_structure")
@@ -191,16 +181,7 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
 def examine_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> tuple[Structure, Violation | None]:
-    """Finds the structure as `find_structure`, but also returns it where B(x) is singular.
-
-    Returns:
-        The structure, and how B(x) violates Assumption (4) or (5); None if it does not.
-
-    Raises:
-        AssumptionError: There is no B(x), since one of Assumptions (1)-(3) is violated or an
-            output has no degree.
-        InconsistentStateError, ModelError: It has no structure; see `find_structure`.
-    """
+    """Finds the structure as `find_structure`, but also returns it where B(x) is singular."""
     if why := why_no_law(system):
         raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
     constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
@@ -231,13 +212,7 @@ def why_no_law(system: DaeSystem) -> str:
 
 
 def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
-    """Finds mu_1, ..., mu_p and B(x) if A(x) is regular.
-
-    Raises:
-        AssumptionError: Assumption (4) is violated, or no control acts on an output. A singular
-            B(x) is left to `control_violation`.
-        ModelError: A function is not finite, or `control_metric` is not valid.
-    """
+    """Finds mu_1, ..., mu_p and B(x) if A(x) is regular."""
     _check_metric(samples)
     elimination = constrained.elimination
     outputs = output_chains(constrained.derivatives, elimination, samples)
@@ -263,11 +238,7 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
 
 
 def _check_metric(samples: Samples) -> None:
-    """Checks the `control_metric`.
-
-    Raises:
-        ModelError: It is not symmetric and positive definite at a state.
-    """
+    """Checks the `control_metric`."""
     system = samples.system
     if system.control_metric is None:
         return

@@ -44,18 +44,7 @@ REPEATED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class StabilityAlong:
-    """The stability of the internal states while the outputs follow a periodic reference.
-
-    Attributes:
-        verdict: Exponentially stable if all multipliers are inside the unit circle, unstable if one
-            is outside. Otherwise not decided: one is on the circle up to the error of integration,
-            or no motion with the period of the reference is found.
-        reason: The reason for the verdict, in words.
-        period: The period of the reference in s.
-        multipliers: The Floquet multipliers of the periodic motion, the largest first, shape
-            (dimension,); empty if none is found.
-        state: The start of the periodic motion, shape (n,); None without one.
-    """
+    """The stability of the internal states while the outputs follow a periodic reference."""
 
     verdict: Verdict
     reason: str

@@ -69,18 +69,7 @@ class MotionEnd:
 
 @dataclass(frozen=True, eq=False)
 class PinnedMotion:
-    """The motion with the outputs on a reference, until the last time or until it ends.
-
-    Attributes:
-        times: The requested times that were reached, in s, shape (k,).
-        states: x at these times, shape (k, n).
-        controls: u at these times, shape (k, p).
-        constraint_inputs: v at these times, shape (k, m).
-        parameters: The values of all parameters at these times, shape (k, P).
-        constraint_margins: The smallest singular value of A(x), shape (k,); infinite if m = 0.
-        control_margins: The smallest singular value of B(x), shape (k,).
-        ending: Why the last time was not reached; None if it was.
-    """
+    """The motion with the outputs on a reference, until the last time or until it ends."""
 
     times: FloatArray
     states: FloatArray
@@ -121,7 +110,8 @@ def follow(
         rows([point.control for point in points], system.num_controls),
         rows([point.constraint_input for point in points], system.num_constraints),
         rows([parameters(time) for time in times[:count]], system.parameter_symbol.numel()),
-        *margins.T,
+        margins[:, 0],
+        margins[:, 1],
         ending,
     )
 

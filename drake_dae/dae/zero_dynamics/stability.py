@@ -36,18 +36,6 @@ class Stability:
 
     The verdict is local: for states near this equilibrium and outputs near its outputs. The global
     sufficient conditions (i) and (ii) below (36) are not examined.
-
-    Attributes:
-        verdict: Stable if all eigenvalues have negative real parts, unstable if one has a positive
-            one; otherwise not decided: an eigenvalue is on the imaginary axis up to round-off, the
-            Jacobian is singular, or no equilibrium is found. Whether a motion that leaves an
-            unstable equilibrium stays bounded, as on a limit cycle, is not examined. Without zero
-            dynamics: stable, or not decided if A(x) or B(x) is singular.
-        reason: The reason for the verdict, in words.
-        eigenvalues: The eigenvalues of the zero dynamics in 1/s, largest real part first, shape
-            (dimension,); empty if no state at rest is found.
-        state: The equilibrium, or the state at rest with a singular Jacobian, shape (n,); None if
-            none is needed, or found.
     """
 
     verdict: Verdict
