@@ -10,12 +10,12 @@ from pydrake.geometry import SceneGraph
 from drake_dae.analysis.analyze import along, analyze, examine
 from drake_dae.analysis.limits import limits_along
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references.reference import common_period
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError, ScenarioError
+from drake_dae.references.reference import common_period
 from drake_dae.robots.links_behind import links_behind
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised

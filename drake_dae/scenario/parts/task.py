@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
+from drake_dae.references import Reference
 from drake_dae.scenario.parts.parts import Gains
 from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.task import Task
