@@ -105,12 +105,9 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     # The law's model, without differences of the plant.
     ideal = replace(
         scenario,
-        plant=IdealConstraints(),
-        plant_payloads=[],
-        plant_disturbances=[],
-        encoders=None,
-        observer=None,
-        identified=[],
+        plant=IdealConstraints(parameters=scenario.plant.parameters),
+        sensors=replace(scenario.sensors, encoders=None),
+        estimator=None,
     )
     loop = build_loop(ideal, model, structure)
     context = start_scenario(ideal, loop)
@@ -131,8 +128,8 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     )
     motion, slowing = analysis.motion, None
     if motion is not None and analysis.structure is not None:
-        with at("friction_cones"):
-            limits = robot_limits(model, scenario.friction_cones)
+        with at("judgement.friction_cones"):
+            limits = robot_limits(model, scenario.judgement.friction_cones)
         slowing = limits_along(analysis.structure, limits, reference, motion)
     return Feasibility(
         analysis,
