@@ -9,11 +9,10 @@ from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
     NewtonModel,
-    are_dependent,
     newton,
     shortest_steps,
 )
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.round_off import are_dependent, positive
 
 CONSISTENT = 1e-8
 """A state counts as consistent, and is projected without a message, if its distance from N*
