@@ -19,12 +19,7 @@ ALONG = 1e-6
 
 
 class KineticMetric:
-    """The directions in which states move onto N* with least kinetic energy.
-
-    Args:
-        system: The system (1)-(3).
-        layout: The degrees of the constraints.
-    """
+    """The directions in which states move onto N* with least kinetic energy."""
 
     def __init__(self, system: DaeSystem, layout: DerivativeLayout) -> None:
         self._system = system
@@ -57,13 +52,7 @@ class KineticMetric:
     def does_no_work(
         self, state: FloatArray, parameters: FloatArray, gradients: FloatArray
     ) -> bool:
-        """Returns whether all constraint forces are along their gradients at a state.
-
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters.
-            gradients: C, shape (sum r_i, n).
-        """
+        """Returns whether all constraint forces are along their gradients at a state."""
         if not self.is_known:
             return False
         forces = self._values(state, parameters)[1]
@@ -78,14 +67,7 @@ class KineticMetric:
     def directions(
         self, state: FloatArray, parameters: FloatArray, gradient: FloatArray, depth: int
     ) -> FloatArray:
-        """Returns W^-1 C^T of some rows of C, where W is the metric of the states of a level.
-
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters.
-            gradient: The rows, by the states of the level, shape (k, c).
-            depth: The number of further derivatives of the rows until the constraint inputs act.
-        """
+        """Returns W^-1 C^T of some rows of C, where W is the metric of the states of a level."""
         mass, _, *rates = self._values(state, parameters)
         moved: FloatArray = gradient.T
         for rate in reversed(rates[:depth]):

@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, positive
+from drake_dae.arrays import FloatArray, positive, unknown_name
 from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import outputs_named
@@ -32,6 +32,7 @@ from drake_dae.scenario.controllers.task_controller import check_task, task_cont
 from drake_dae.scenario.forms.keys import at, each, violated
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, references_of
+from drake_dae.scenario.parts.parts import Poles
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -88,7 +89,7 @@ def build_completed(
     # The plant, which may carry payloads and disturbances that the law does not know.
     plant, plant_exogenous, scene_graph = _plant(scenario, model, structure, scene_graph)
 
-    # The law, of a model with a disturbance if there is an observer of it.
+    # The law, of a model with a disturbance if there is an estimator of it.
     law = tracking_law(scenario, model, structure)
 
     # The controller, and the signals of time that it follows.
@@ -96,18 +97,19 @@ def build_completed(
     if task is None:
         names = [signal.name for signal in law.system.output_signals]
         references = references_of(scenario, names, law.layout.reference_degrees)
-    if scenario.observer is None:
+    if scenario.estimator is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
 
     # The parts between plant and law; errors get the key of the part.
-    with at("force_feedback"):
-        sensor = scenario.force_feedback.sensor(model.dae.num_constraints)
+    force = scenario.sensors.force
+    with at("sensors.force"):
+        sensor = None if force is None else force.sensor(model.dae.num_constraints)
     settings = LoopSettings(
         sensor=sensor,
-        encoders=scenario.encoders,
+        encoders=scenario.sensors.encoders,
         sampling=scenario.sampling,
         control_limits=_limits(scenario, model),
-        observer=scenario.observer,
+        observer=scenario.estimator,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
         signals={} if task is None or commanded else task.signals,
@@ -119,11 +121,11 @@ def build_completed(
         with at("sampling"):
             hold_before(plant, settings.sampling)
     if settings.encoders is not None:
-        with at("encoders"):
+        with at("sensors.encoders"):
             make_sensor(plant, settings.encoders, period)
-    with at("tolerances"):
-        outputs_named(scenario.tolerances, model.dae.output_signals)
-        for name, tolerated in scenario.tolerances.items():
+    with at("judgement.tolerances"):
+        outputs_named(scenario.judgement.tolerances, model.dae.output_signals)
+        for name, tolerated in scenario.judgement.tolerances.items():
             if tolerated != np.inf:
                 positive(name, tolerated)
 
@@ -134,11 +136,11 @@ def build_completed(
             controller = task_controller(scenario, model, law, period)
             loop = wire_loop(plant, controller, None, settings, **drawn)
     else:
-        keys = ["observer"] if scenario.observer is not None else []
-        keys += ["force_feedback"] if scenario.force_feedback.is_measured or keys else []
+        keys = ["estimator"] if scenario.estimator is not None else []
+        keys += ["sensors.force"] if force is not None or keys else []
         with at(" or ".join(keys) or "start.positions"):
             loop = make_closed_loop(plant, law, references, settings, **drawn)
-    loop.memory["gains"] = {repr(scenario.gains): None}  # Those of the law.
+    loop.memory["gains"] = {repr(scenario.law.gains): None}  # Those of the law.
     notes = [*completed.notes, *chosen.notes, sticking_before(scenario, model, structure)]
     return Completed(scenario, tuple(filter(None, notes))), loop
 
@@ -154,13 +156,13 @@ def make_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> P
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
     """
-    check_disturbances(scenario.plant_disturbances, model.links)
+    check_disturbances(scenario.plant.disturbances, model.links)
     robot = RobotToSimulate(
         model,
         structure,
-        partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
-        scenario.plant_parameters,
-        scenario.plant_disturbances,
+        partial(add_robot, scenario.robot, payloads=scenario.plant.payloads),
+        scenario.plant.parameters,
+        scenario.plant.disturbances,
     )
     try:
         return scenario.plant.plant(robot)
@@ -176,7 +178,7 @@ def _plant(
     In an ideal plant a payload is a further body, and the course of a disturbance an exogenous
     signal. Masses and forces are parameters, which `start_scenario` sets in a context.
     """
-    payloads, disturbances = scenario.plant_payloads, scenario.plant_disturbances
+    payloads, disturbances = scenario.plant.payloads, scenario.plant.disturbances
     if scenario.plant.carries or not (payloads or disturbances):
         return make_plant(scenario, model, structure), None, scene_graph
     check_disturbances(disturbances, model.links)
@@ -185,7 +187,7 @@ def _plant(
     moving: dict[str, Any] = {f"{name}.course": [entry.course] for name, entry in named.items()}
     own = replace(
         scenario,
-        known_forces=[*scenario.known_forces, *forces],
+        robot=replace(scenario.robot, known_forces=[*scenario.robot.known_forces, *forces]),
         exogenous={**scenario.exogenous, **moving},
     )
     scene_graph = SceneGraph()
@@ -203,7 +205,7 @@ def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -
         if disturbance.frame == "world":
             raise ModelError("a disturbance on the world moves nothing; name a frame of the robot")
 
-    each("plant_disturbances", disturbances, check)
+    each("plant.disturbances", disturbances, check)
 
 
 def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) -> TrackingLaw:
@@ -213,57 +215,53 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
     joints. A plant that steps by h damps with the speed at the end of each step: h / 2 later than
     the mean, and h later than a law without sampling, which acts at each step.
     """
-    force, damping = scenario.force_feedback, scenario.constraint_damping
+    settings, is_measured = scenario.law, scenario.sensors.force is not None
+    damping = settings.constraint_damping
     sampling, material = scenario.sampling, scenario.plant.material
     step = 0.0 if material is None else material.time_step
     latency = step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
-    keys = ["force_feedback", "gains"] if force.is_measured else ["gains"]
-    keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
-    if scenario.contact_stiffness is not None:
-        keys = ["contact_stiffness", *keys]
+    keys = ["sensors.force", "law.gains"] if is_measured else ["law.gains"]
+    keys += [f"law.{key}" for key in ("constraint_damping", "integral") if getattr(settings, key)]
+    if settings.contact_stiffness is not None:
+        keys = ["law.contact_stiffness", *keys]
         if scenario.task is not None:
             text = "is not for scenarios with `task`; leave it out"
-            raise ScenarioError(("contact_stiffness", text))
+            raise ScenarioError(("law.contact_stiffness", text))
     structure = _observed(scenario, model, structure)
     with at(" or ".join(keys)):
-        assert scenario.gains is not None  # advised.
         return TrackingLaw(
             structure.system,
-            scenario.gains.design(),
+            (settings.gains or Poles(all=[-4.0])).design(),
             structure=structure,
-            measured_force=force.is_measured,
-            force_gain=force.gain,
+            measured_force=is_measured,
+            force_gain=settings.force_gain,
             constraint_damping=None if damping is None else damping.design(),
-            integral=scenario.integral or (),
-            contact_stiffness=scenario.contact_stiffness,
+            integral=settings.integral or (),
+            contact_stiffness=settings.contact_stiffness,
             latency=0.0 if model.stages else latency,
         )
 
 
 def _observed(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
-    """The structure of the law's system, with a disturbance if the scenario has an observer."""
-    observer = scenario.observer
-    if observer is None:
-        if scenario.identified:
-            text = "needs an observer; give `observer`, or leave `gains` out with Drake's contact"
-            raise ScenarioError(("identified", text))
+    """The structure of the law's system, with a disturbance if the scenario has an estimator."""
+    estimator = scenario.estimator
+    if estimator is None:
         return structure
-    with at("observer"):
+    if estimator.rate is None:
+        text = "needed, since no gains are computed; leave `law.gains` out with Drake's contact"
+        raise ScenarioError(("estimator.rate", text))
+    with at("estimator"):
         if scenario.exogenous:
             raise ModelError("not beside exogenous signals, whose port it feeds")
-        constraints = model.constraints
-        frictional = {c.name: c.friction_parameter for c in constraints if c.friction_parameter}
-        for name in observer.identify_friction:
-            if name not in frictional:
-                raise ModelError(
-                    f"identify_friction: '{name}' is not a constraint with friction; give it "
-                    "friction: 0.0 if it is unknown. With friction: "
-                    f"{', '.join(frictional) or 'none'}"
-                )
+        known = [parameter.name for parameter in model.dae.parameters]
+        for name in estimator.identify:
+            if name not in known:
+                hint = "; give the constraint friction: 0.0 if it is unknown"
+                text = unknown_name("parameter", name, known)
+                raise ModelError(f"identify: {text}{hint * name.endswith('.friction')}")
         velocities = [signal.name for signal in model.links.velocity_signals]
-        frictions = [frictional[name] for name in observer.identify_friction]
-        with at("identified"):
-            observed = with_disturbance(model.dae, velocities, [*frictions, *scenario.identified])
+        with at("estimator.identify"):
+            observed = with_disturbance(model.dae, velocities, estimator.identify)
         return find_structure(observed)
 
 

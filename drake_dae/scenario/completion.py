@@ -86,7 +86,7 @@ def completions(
         missing < 0
         or (missing == 0 and is_placed)
         or not (rows.given or S.shape[0] or scenario.references or task)  # Only simulated.
-        or scenario.control_weights
+        or scenario.law.control_weights
         or scenario.compliances is not None
         # The model refuses such actuators.
         or np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals)
@@ -260,7 +260,9 @@ def _written(
         scenario = replace(
             scenario,
             references={**scenario.references, **resting},
-            tolerances={**free, **scenario.tolerances},
+            judgement=replace(
+                scenario.judgement, tolerances={**free, **scenario.judgement.tolerances}
+            ),
         )
     if rows.is_task and scenario.start.positions:
         return Completed(scenario, tuple(notes))
@@ -372,7 +374,7 @@ class _Rows:
     ) -> Postures:
         """The configurations of the robot at the start, with some parameters moved."""
         begin = scenario.integrator.start_time
-        values = {name: np.atleast_1d(value) for name, value in scenario.plant_parameters.items()}
+        values = {name: np.atleast_1d(value) for name, value in scenario.plant.parameters.items()}
         for name, references in scenario.exogenous.items():
             sizes = [getattr(r, "size", 1) for r in references]
             pairs = zip(references, sizes, strict=True)
@@ -380,7 +382,7 @@ class _Rows:
             values[name] = np.concatenate([np.zeros(0), *at_start])
         rows = ca.vertcat(ca.SX(0, 1), *self._expressions)
         touches = list(zip(self.touches.values(), self.outward, strict=True))
-        with at("plant_parameters or exogenous"):
+        with at("plant.parameters or exogenous"):
             return Postures(self.links, bound, rows, S, touches, {**values, **(moved or {})})
 
     def off_surface(self, scenario: Scenario, touching: Posture) -> FloatArray:
@@ -391,7 +393,7 @@ class _Rows:
         contact, bound = scenario.task.contact, self._bound
         names = [contact] if isinstance(contact, str) else [*contact]
         values = {p.name: p.value for p in bound.parameters}
-        values |= {name: np.atleast_1d(v) for name, v in scenario.plant_parameters.items()}
+        values |= {name: np.atleast_1d(v) for name, v in scenario.plant.parameters.items()}
         moved = {
             f"{name}.position": values[f"{name}.position"] + BEFORE * normal
             for name, normal in zip(self.touches, touching.normals, strict=True)

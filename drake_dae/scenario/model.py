@@ -177,7 +177,7 @@ def _checked_constraints(
         each("actuation", scenario.actuation, lambda stage: stage.attach(links))
     with at("actuation"):
         chain(scenario.actuation, links)
-    forces, known = scenario.forces, scenario.known_forces
+    forces, known = scenario.forces, scenario.robot.known_forces
     each("forces", forces or (), lambda f: force_rows(force_outputs([f], bound), bound, links))
     with at("forces"):
         force_outputs(forces, bound)
@@ -186,9 +186,9 @@ def _checked_constraints(
             bound.place(force)
             if not value > 0.0:
                 raise ModelError(f"a compliance must be positive, got {value}")
-    each("known_forces", known, lambda force: force.reaction(links.kinematics()))
-    with at("control_weights"):
-        choice = control_choice(name, scenario.control_weights or None, actuators)
+    each("robot.known_forces", known, lambda force: force.reaction(links.kinematics()))
+    with at("law.control_weights"):
+        choice = control_choice(name, scenario.law.control_weights or None, actuators)
     with at("exogenous"):
         attached = [stage.attach(links).parameters for stage in scenario.actuation]
         members = (member.parameters for member in (*constraints, *known))
@@ -214,9 +214,9 @@ def _model(
             scenario.actuation,
             scenario.forces,
             tuple(scenario.exogenous),
-            scenario.known_forces,
+            scenario.robot.known_forces,
             scenario.compliances,
-            scenario.control_weights or None,
+            scenario.law.control_weights or None,
             scenario.compiled,
         )
     with at("parameters"):

@@ -8,7 +8,7 @@ from drake_dae.analysis.limits import SignalLimits
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.references import ConstantReference, Reference
@@ -111,7 +111,7 @@ def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> s
     nq = model.links.q.numel()
     positions, (low, high) = motion.states[:, :nq], model.links.position_limits
     outside = np.maximum(low - positions, positions - high)
-    limits = robot_limits(model, scenario.friction_cones)
+    limits = robot_limits(model, scenario.judgement.friction_cones)
     excess = _worst(limits, motion)
     if np.max(outside, initial=-1.0) > _DISTANCE_LEFT:
         row, joint = np.unravel_index(np.argmax(outside), outside.shape)

@@ -27,12 +27,12 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     """A context of a closed loop at a scenario's start.
 
     The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
-    references plus the errors, with outputs as in its model, where `plant_parameters` may differ,
+    references plus the errors, with outputs as in its model, where `plant.parameters` may differ,
     and on the plant's constraints; a task at start.positions, in contact if its first phase needs
     it.
 
     Args:
-        scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
+        scenario: The scenario of the loop; start, plant.parameters, integrator, the numbers of
             uncoupled gains, and the seed of the sensor may be others than those it was built with.
         loop: What `build_completed` made.
 
@@ -75,38 +75,39 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
     at_plant = plant.GetMyMutableContextFromRoot(context)
     numbers: list[tuple[str, str, ArrayLike]] = []
     if not scenario.plant.carries:
-        numbers += [("plant_parameters", *entry) for entry in scenario.plant_parameters.items()]
-        numbers += [("plant_payloads", f"{p.name}.mass", p.mass) for p in scenario.plant_payloads]
+        numbers += [("plant.parameters", *entry) for entry in scenario.plant.parameters.items()]
+        numbers += [("plant.payloads", f"{p.name}.mass", p.mass) for p in scenario.plant.payloads]
         numbers += [
-            ("plant_disturbances", f"plant_disturbance_{index}.force", disturbance.force)
-            for index, disturbance in enumerate(scenario.plant_disturbances)
+            ("plant.disturbances", f"plant_disturbance_{index}.force", disturbance.force)
+            for index, disturbance in enumerate(scenario.plant.disturbances)
         ]
     values = plant.parameters(at_plant)
     for key, name, value in numbers:
         with at(key):
             # A user's own plant may not let these numbers be set, and has been made with them.
-            is_set = key != "plant_parameters" and np.array_equal(
+            is_set = key != "plant.parameters" and np.array_equal(
                 values[plant.dae.parameter_slice(name)], np.ravel(value)
             )
             if not is_set:
                 plant.set_parameter(at_plant, name, value)
     with at("plant"):
         scenario.plant.begin(plant, at_plant)
-    if loop.sensor is not None:
-        with at("force_feedback"):
+    force, encoders = scenario.sensors.force, scenario.sensors.encoders
+    if loop.sensor is not None and force is not None:
+        with at("sensors.force"):
             at_sensor = loop.sensor.GetMyMutableContextFromRoot(context)
-            scenario.force_feedback.begin(loop.sensor, at_sensor)
+            loop.sensor.set_errors(at_sensor, force.bias, force.noise_deviation, force.drift)
     # The loop has the gains with which it was built.
-    gains, designs = scenario.gains, loop.memory.setdefault("gains", {})
+    gains, designs = scenario.law.gains, loop.memory.setdefault("gains", {})
     if gains is not None and not controller.takes_over and designs.get(repr(gains), "") is not None:
-        with at("gains"):
+        with at("law.gains"):
             if repr(gains) not in designs:
                 designs[repr(gains)] = controller.law.design(gains.design())
             at_controller = controller.GetMyMutableContextFromRoot(context)
             controller.set_gains(at_controller, designs[repr(gains)])
-    loop.set_seed(context, scenario.force_feedback.seed)
-    if loop.encoders is not None and scenario.encoders is not None:
-        loop.encoders.set_seed(context, scenario.encoders.seed)
+    loop.set_seed(context, 0 if force is None else force.seed)
+    if loop.encoders is not None and encoders is not None:
+        loop.encoders.set_seed(context, encoders.seed)
 
 
 def _at_rest(

@@ -53,14 +53,7 @@ def trace_first_steps(residual: Residual) -> TracedFunction:
 def _followed(
     start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Returns the state that `newton` reaches by these first steps, and the outcome.
-
-    Args:
-        start: The state, shape (n, 1).
-        steps: The Newton steps that follow each other from there.
-        lengths: The lengths of the steps, in states over their scale.
-        size, left: The sizes of the first two, relative to the state.
-    """
+    """Returns the state that `newton` reaches by these first steps, and the outcome."""
     # Newton's method ends at the start, or after its first step; then it is polished.
     at_start = size <= ROUNDING
     after_one = ca.logic_and(ca.logic_not(at_start), left * left <= PRECISION * size)

@@ -25,16 +25,7 @@ FLOOR = 1e-12
 
 
 class Manifold(Residual):
-    """The manifold N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m} (4).
-
-    Args:
-        system: The system (1)-(3).
-        chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
-
-    Attributes:
-        searched: `project` where `first_steps` did not converge; see `ConsistentStateSearch`. For
-            the other attributes see `Residual`.
-    """
+    """The manifold N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m} (4)."""
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
         super().__init__(system, chains)
@@ -48,12 +39,7 @@ class Manifold(Residual):
         return self.system.num_states - len(self.residual_signals)
 
     def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Returns the constraint outputs and their derivatives, shape (sum r_i,), constraint-major.
-
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-        """
+        """Returns k_1, k_1', ..., constraint-major, shape (sum r_i,)."""
         return self.residual_function(state, self.system.parameter_vector(parameters))[0]
 
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
@@ -74,19 +60,7 @@ class Manifold(Residual):
         state: ArrayLike,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """Returns the consistent state next to a state, to round-off, by Newton's method.
-
-        Args:
-            state: A state near N*, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-
-        Returns:
-            The consistent state, shape (n,).
-
-        Raises:
-            InconsistentStateError: Newton's method does not reach N* from there.
-            ModelError: The state has a wrong shape.
-        """
+        """Returns the consistent state next to a state, to round-off, by Newton's method."""
         start, p = self._state(state), self.system.parameter_vector(parameters)
         found = self.projected(start, p)
         if self._is_at_pole(found, p):
@@ -125,16 +99,7 @@ class Manifold(Residual):
         return moved if moved is start else moved.copy()
 
     def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
-        """Takes the first few Newton steps of `project`, without checks of arguments.
-
-        Args:
-            start: The state, shape (n,).
-            p: Values of all parameters, shape (k,).
-
-        Returns:
-            The consistent state, overwritten by the next call; `start` itself if it is consistent;
-            None if the steps do not converge, so that `searched` is needed.
-        """
+        """Takes the first few Newton steps of `project`, without checks of arguments."""
         function = self._first_steps
         sizes, moved, _ = function.evaluate(start, p)
         outcome = sizes.item(0)

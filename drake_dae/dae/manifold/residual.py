@@ -18,22 +18,7 @@ from drake_dae.trace.round_off import positive
 
 
 class Residual:
-    """The residual L_f^k k_i(x), k = 0, ..., r_i - 1, i = 1, ..., m, and its gradients.
-
-    Args:
-        system: The system (1)-(3).
-        chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
-
-    Attributes:
-        residual_expression: The residual, shape (sum r_i, 1).
-        gradient: Its derivative by the state, shape (sum r_i, n).
-        layout: The layout of the constraints' derivatives.
-        residual_signals: Names and units of the residual.
-        residual_function: The residual as a function of state and parameters.
-        scale: The sizes of the states in use, shape (n,).
-        lengths: The lengths of the gradients at the nominal state, over the scale of the states; 0
-            if they are not finite there. Shape (sum r_i,).
-    """
+    """The residual L_f^k k_i(x), k = 0, ..., r_i - 1, i = 1, ..., m, and its gradients."""
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
         self.system = system
@@ -53,12 +38,7 @@ class Residual:
         self.lengths: FloatArray = np.linalg.norm(gradients, axis=1)
 
     def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Returns the gradients C of the residual at a state, shape (sum r_i, n).
-
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-        """
+        """Returns the gradients C of the residual at a state, shape (sum r_i, n)."""
         values = self._gradient(state, self.system.parameter_vector(parameters))[0]
         return values.reshape(-1, self.system.num_states)
 

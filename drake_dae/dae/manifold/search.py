@@ -9,11 +9,10 @@ from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import (
     NewtonModel,
-    are_dependent,
     newton,
     shortest_steps,
 )
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.round_off import are_dependent, positive
 
 CONSISTENT = 1e-8
 """A state counts as consistent, and is projected without a message, if its distance from N*
@@ -21,23 +20,13 @@ relative to its size is at most this; where gradients are dependent, if its resi
 
 
 class ConsistentStateSearch:
-    """Searches a consistent state by Newton's method, then by least squares.
-
-    Args:
-        residual: The residual of N*.
-        first_steps: The first Newton steps; see `trace_first_steps`.
-    """
+    """Searches a consistent state by Newton's method, then by least squares."""
 
     def __init__(self, residual: Residual, first_steps: TracedFunction) -> None:
         self._residual, self._first_steps = residual, first_steps
 
     def searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """Acts as `project` from a state from which `first_steps` did not converge.
-
-        Args:
-            start: The state, shape (n,).
-            p: Values of all parameters, shape (k,).
-        """
+        """Acts as `project` from a state from which `first_steps` did not converge."""
         function = self._first_steps
         sizes, moved, _ = function.evaluate(start, p)
         is_finite = function.is_finite

@@ -19,10 +19,6 @@ class Settling:
 
     Where constraint forces do no work, as in a mechanism, its steps take the least kinetic energy,
     see `KineticMetric`; else they are shortest relative to the scale of the states.
-
-    Args:
-        system: The system.
-        residual: The residual of N*.
     """
 
     def __init__(self, system: DaeSystem, residual: Residual) -> None:
@@ -57,16 +53,7 @@ def _settle_level(
     parameters: FloatArray,
     energy: tuple[KineticMetric, int] | None = None,
 ) -> bool:
-    """Changes some states so that some rows of the residual vanish; returns whether they do.
-
-    Args:
-        residual: The residual of N*.
-        state: The state, which is changed.
-        rows, columns: The rows and the states.
-        parameters: Values of all parameters.
-        energy: The metric of kinetic energy, and how many derivatives are left until the constraint
-            inputs act; None for steps of least norm.
-    """
+    """Changes some states so that some rows of the residual vanish; returns whether they do."""
     scale = residual.scale[columns]
 
     def filled(z: FloatArray) -> FloatArray:

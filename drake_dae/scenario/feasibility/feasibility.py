@@ -11,7 +11,7 @@ from drake_dae.analysis.limits import limits_along
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots.links_behind import links_behind
@@ -106,7 +106,7 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     if scenario.task is not None:
         return Feasibility(analyze(model.dae), scenario.duration, gains=gains)
     reference, start = reference_and_start(scenario, model, structure)
-    degrees = None if law is None or scenario.observer is not None else law.exogenous_degrees
+    degrees = None if law is None or scenario.estimator is not None else law.exogenous_degrees
     exogenous = exogenous_references(scenario, model.dae, degrees)
     names = [signal.name for signal in model.dae.output_signals]
     outputs = references_of(scenario, names, structure.layout.reference_degrees)
@@ -123,8 +123,8 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     )
     motion, slowing = analysis.motion, None
     if motion is not None and analysis.structure is not None:
-        with at("friction_cones"):
-            limits = robot_limits(model, scenario.friction_cones)
+        with at("judgement.friction_cones"):
+            limits = robot_limits(model, scenario.judgement.friction_cones)
         slowing = limits_along(analysis.structure, limits, reference, motion)
     return Feasibility(
         analysis,
