@@ -78,10 +78,9 @@ def _check(scenario: Scenario, end: float) -> str:
 
     def look(context: Context) -> None:
         if time.perf_counter() > end:
-            when = f"{context.get_time():.3g} of {scenario.duration:g} s"
-            raise SimulationError(
-                f"not to its end: the run takes long, and kept all limits to {when}"
-            )
+            now = context.get_time()
+            text = f"not to its end: the run takes long, and came to {now:.3g} s without a fault"
+            raise SimulationError(text, now, [])
 
     try:
         completed, loop = build_completed(scenario)

@@ -336,8 +336,8 @@ class _Rows:
         self.outward: list[ca.SX] = []
         for name, touch in self.touches.items():
             # Names are unique: the constraint's name is used if the frame's is taken.
-            other = f"{name}_point" if {f"{touch.frame}.{a}" for a in "xyz"} & taken else ""
-            points = [PointCoordinates(touch.frame, a, touch.point, other) for a in "xyz"]
+            others = {a: f"{name}_point" * (f"{touch.frame}.{a}" in taken) for a in "xyz"}
+            points = [PointCoordinates(touch.frame, a, touch.point, others[a]) for a in "xyz"]
             self._points.append([self._add(form) for form in points])
             column, sign = tool_axis(links, touch)
             axis = "xyz"[column]

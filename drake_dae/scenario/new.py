@@ -520,8 +520,10 @@ def _scenario(
         i, j, k = np.eye(3)[along].tolist()
         name, surface = "pipe", Cylinder((x, y, z), (i, j, k), bend)
     middle = [place.center[way] for way in place.ways]
-    path: Any = CircleReference(middle, radius, period=period)
-    if len(middle) == 1:
+    path: Any
+    if len(middle) > 1:
+        path = CircleReference(middle, radius, period=period)
+    else:
         path = SinusoidReference(middle[0], [radius], [round(2 * pi / period, 4)])
     axes = "".join("xyz"[way] for way in place.ways)
     near = dict(zip(names, (np.round(place.q, 4) + 0.0).tolist(), strict=True))
