@@ -26,12 +26,12 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
+from drake_dae.blocks.failures import cannot_go_on
 from drake_dae.compiler.stepped import NO_EVENTS
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
 from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
 from drake_dae.simulation.sampled import SampledRun
-from drake_dae.systems.blocks.failures import cannot_go_on
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines without a terminal, in s."""

@@ -22,7 +22,7 @@ from drake_dae.studies.study import FILES, Study
 
 KEYS = {
     "start.errors.tool.z": np.linspace(-0.05, 0.05, 10),
-    "plant_parameters.link1.mass": [9.0, 11.0],
+    "plant.parameters.link1.mass": [9.0, 11.0],
 }
 VARIATIONS = dd.grid_variations(KEYS)
 COUNT = len(VARIATIONS)
@@ -278,7 +278,7 @@ def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
             r"duration: .*nan",
         ),
         (
-            [{"force_feedback.seed": 0.0}, {"force_feedback.seed": 1}],
+            [{"sensors.force.seed": 0.0}, {"sensors.force.seed": 1}],
             r"force_feedback: .*'seed'",
         ),
         ([{"duration": -1.0}], r"duration: .*-1.0"),
@@ -286,9 +286,9 @@ def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
         ([{"a..b": 1}], "a..b"),
         ([{"duration": object()}], "duration: "),
         ([{"start.errors.tool.x": 0.1}], r"start.errors: .*'tool.x'"),
-        ([{"plant_parameters.link1.mas": 1.0}], "'link1.mas'"),
+        ([{"plant.parameters.link1.mas": 1.0}], "'link1.mas'"),
         ([{"start.positions.joint9": 0.1}], r"start.positions: .*'joint9'"),
-        ([{"plant_parameters.wall.position": [1.0, 2.0]}], r"wall.position' .*3"),
+        ([{"plant.parameters.wall.position": [1.0, 2.0]}], r"wall.position' .*3"),
     ],
 )
 def test_what_cannot_be_is_reported_before_anything_runs(variations, words, tmp_path):

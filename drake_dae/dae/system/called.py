@@ -20,18 +20,7 @@ def called_functions(
     labels: Mapping[str, Any],
     fields: Sequence[str],
 ) -> dict[str, Any]:
-    """Returns the fields of a `DaeSystem` from Python functions; see `from_functions`.
-
-    Args:
-        state: Names (or Signals) of the states, or their number n.
-        functions: "f", "g", ..., "m" -> the function; None where there is none.
-        parameters: Name -> default.
-        labels: The other fields.
-        fields: The names of all fields.
-
-    Raises:
-        ModelError: A name is wrong, or a function fails.
-    """
+    """Returns the fields of a `DaeSystem` from Python functions; see `from_functions`."""
     owner = labels.get("name", "system")
     fixed = {"state", "parameters", "state_signals", *"fghklm"}
     allowed = [item for item in fields if item not in fixed]

@@ -16,14 +16,7 @@ from drake_dae.trace.compiled import check_choice
 
 
 def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Checks the fields of a system and returns them converted.
-
-    Args:
-        arguments: Name -> value of every field; see `DaeSystem`.
-
-    Raises:
-        ModelError: They do not form a system; see `DaeSystem`.
-    """
+    """Checks the fields of a system and returns them converted."""
     name = arguments["name"]
     if not isinstance(name, str):
         raise ModelError(f"the name of a system must be text, got {name!r}")

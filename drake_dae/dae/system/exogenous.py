@@ -11,12 +11,7 @@ from drake_dae.errors import ModelError
 
 @dataclass(frozen=True, eq=False)
 class Exogenous:
-    """The exogenous parameters w of a system, with symbols for their time derivatives.
-
-    Attributes:
-        owner: The name of the system, for messages.
-        parameters: All parameters of the system.
-    """
+    """The exogenous parameters w of a system, with symbols for their time derivatives."""
 
     owner: str
     parameters: tuple[Parameter, ...]
@@ -35,11 +30,7 @@ class Exogenous:
         return tuple(signal for p in self.moving for signal in p.signals)
 
     def rate(self, expression: ca.SX) -> ca.SX:
-        """Returns the part sum_j (d/dw^(j)) w^(j+1) of a time derivative, shape (k, 1).
-
-        Raises:
-            ModelError: The expression needs more derivatives of w than are available.
-        """
+        """Returns the part sum_j (d/dw^(j)) w^(j+1) of a time derivative, shape (k, 1)."""
         rate = ca.SX(expression.numel(), 1)
         for p in self.moving:
             levels = (p.symbol, *p.derivatives)
@@ -73,11 +64,7 @@ class Exogenous:
         return rates
 
     def places(self, degrees: Sequence[int]) -> list[int]:
-        """Returns the indices of W = (w_1, w_1', ..., w_1^(d_1), w_2, ...) in the parameter vector.
-
-        Args:
-            degrees: d_1, d_2, ..., one for each entry of w.
-        """
+        """Returns the indices of w_1, w_1', ..., w_1^(d_1), w_2, ... among the parameters."""
         start, following = 0, sum(p.value.size for p in self.parameters)
         places, remaining = [], iter(degrees)
         for p in self.parameters:

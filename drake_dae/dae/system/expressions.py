@@ -18,16 +18,7 @@ from drake_dae.trace.smoothness import find_flaw
 
 
 def as_expression(owner: str, key: str, value: Any) -> ca.SX:
-    """Converts an SX, a number, an array, or a (nested) list of these to an SX matrix.
-
-    Args:
-        owner: The name of the system, for messages.
-        key: The name of the value, for messages.
-        value: A list of lists is a matrix, row by row.
-
-    Raises:
-        ModelError: The value is none of these.
-    """
+    """Converts an SX, a number, an array, or a (nested) list of these to an SX matrix."""
     if isinstance(value, ca.MX):
         raise ModelError(f"{owner}: {key} is a CasADi MX; use SX symbols and expressions")
     if isinstance(value, np.ndarray) and value.dtype == object:
@@ -47,18 +38,7 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 def as_functions(
     owner: str, functions: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
-    """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them.
-
-    Args:
-        owner: The name of the system, for messages.
-        functions: Name -> what `as_expression` takes.
-        state: x, shape (n, 1).
-        parameters: The symbols of all parameters, below each other.
-
-    Raises:
-        ModelError: A shape does not fit, a symbol is neither state nor parameter, a constant is
-            not finite, or a function is not smooth in the state.
-    """
+    """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them."""
     values = {key: as_expression(owner, key, value) for key, value in functions.items()}
     n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
     q = values["l"].numel()
@@ -113,22 +93,14 @@ def _check_smoothness(owner: str, values: Mapping[str, ca.SX], state: ca.SX, oth
 
 
 def check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
-    """Checks that no name occurs twice.
-
-    Raises:
-        ModelError: A name occurs twice.
-    """
+    """Checks that no name occurs twice."""
     double = sorted({name for name in names if names.count(name) > 1})
     if double:
         raise ModelError(f"{owner}: {kind} names must be unique, twice: {', '.join(double)}")
 
 
 def as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
-    """Converts a list of signals, or of names of signals without unit, to signals.
-
-    Raises:
-        ModelError: An entry is neither.
-    """
+    """Converts a list of signals, or of names of signals without unit, to signals."""
     items = [signals] if isinstance(signals, str) or not isinstance(signals, Sequence) else signals
     bad = [item for item in items if not isinstance(item, (Signal, str))]
     if items is not signals or bad:
@@ -139,17 +111,7 @@ def as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
 def call(
     owner: str, letter: str, function: Callable[..., Any] | None, arguments: list[Any]
 ) -> ca.SX:
-    """Calls a user's function with symbols and returns its expression; empty without a function.
-
-    Args:
-        owner: The name of the system, for messages.
-        letter: The letter of the function in (1)-(3), for messages.
-        function: A function of the state, and of the parameters if there are any.
-        arguments: The CasADi column x, and a namespace of the parameters' symbols.
-
-    Raises:
-        ModelError: The function fails, or returns something else.
-    """
+    """Calls a user's function with symbols and returns its expression; empty without a function."""
     if function is None:
         return ca.SX(0, 0)
     if not callable(function):

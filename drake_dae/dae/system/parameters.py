@@ -16,11 +16,7 @@ def parameter_symbol(parameters: Sequence[Parameter]) -> ca.SX:
 
 
 def parameter_slice(owner: str, parameters: Sequence[Parameter], name: str) -> slice:
-    """Returns the slice of a parameter in the parameter vector.
-
-    Raises:
-        ModelError: No parameter has that name.
-    """
+    """Returns the slice of a parameter in the parameter vector."""
     start = 0
     for parameter in parameters:
         if parameter.name == name:

@@ -13,15 +13,6 @@ class ForceSharing:
 
     The motion determines the sum v = G(x) v_all alone. Among all v_all with that sum the one with
     the least sum of c_i v_i^2 is shown, v_all = T(x) v: G T = 1. See `share_forces`.
-
-    Attributes:
-        split: T(x), shape (M, m).
-        gather: G(x), shape (m, M): the identity at the constraints that stay.
-        signals: Names and units of v_all.
-        undetermined: The names of those that (1)-(3) do not determine: another split moves the
-            system in the same way.
-        left_out: The removed constraint outputs, which are zero where k is zero, shape (M - m, 1).
-        left_out_signals: Names and units of `left_out`.
     """
 
     split: ca.SX

@@ -173,11 +173,7 @@ def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
 
 
 def outputs_named(names: Collection[str], outputs: Sequence[Signal]) -> list[int]:
-    """Returns the indices of outputs by their names.
-
-    Raises:
-        ModelError: There is no output of such a name.
-    """
+    """Returns the indices of outputs by their names."""
     known = [signal.name for signal in outputs]
     for name in names:
         if name not in known:
@@ -193,20 +189,12 @@ def moving(parameters: Sequence[Parameter], names: Container[str]) -> tuple[Para
 
 
 def bounded(parameter: Parameter, bounds: tuple[ArrayLike, ArrayLike]) -> Parameter:
-    """Returns a parameter with bounds and with the same symbols.
-
-    Raises:
-        ModelError: The bounds are not valid, or the value is outside of them.
-    """
+    """Returns a parameter with bounds and with the same symbols."""
     return _same_symbols(parameter, replace(parameter, bounds=bounds))
 
 
 def valued(parameter: Parameter, value: ArrayLike) -> Parameter:
-    """Returns a parameter with another default and the same symbols; one number sets all entries.
-
-    Raises:
-        ModelError: The value does not fit, or is out of the parameter's range.
-    """
+    """Returns a parameter with another default; one number sets all entries."""
     entries = np.atleast_1d(numbers(f"parameter '{parameter.name}'", value))
     if entries.shape not in ((1,), parameter.value.shape):
         raise ModelError(
