@@ -126,7 +126,7 @@ def build_completed(
     with at("judgement.tolerances"):
         outputs_named(scenario.judgement.tolerances, model.dae.output_signals)
         for name, tolerated in scenario.judgement.tolerances.items():
-            if tolerated != np.inf:
+            if tolerated is not None:
                 positive(name, tolerated)
 
     # The loop.

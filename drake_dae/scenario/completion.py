@@ -113,18 +113,18 @@ def completions(
             if start:
                 return
     starts = _starts(postures, rows, named, begin, guess, bool(start), missing)
-    found = list[tuple[float, Posture, list[int], list[int]]]()
+    found = list[tuple[tuple[bool, int, float], Posture, list[int], list[int]]]()
     for posture in starts[: 1 if start else _POSTURES]:
         for added in _added(rows, named, posture, missing):
-            held = [*named, *added]
-            worst = sorted((entry[0] for entry in found), reverse=True)[:MOST][-1:]
-            enough = worst[0] if len(found) >= MOST else 0.0
+            held, count = [*named, *added], len({*added} - {*rows.joints})
+            rivals = sorted((rank[2] for rank, *_ in found if rank[1] >= count), reverse=True)
+            enough = rivals[MOST - 1] if len(rivals) >= MOST else 0.0
             quality = _least(postures, goals, posture, held, enough)
-            found.append((quality, posture, held, added))
+            found.append(((quality > 0.0, count, quality), posture, held, added))
     if not found:
         raise ScenarioError(_why_none(starts[0], rows, named, missing, bound))
     # Of those that are equal along the reference, the best one at the start.
-    found.sort(key=lambda entry: -entry[0])
+    found.sort(key=lambda entry: entry[0], reverse=True)
     for _, posture, held, added in found[:MOST]:
         yield _written(scenario, rows, postures, posture, held, added)
 
@@ -167,7 +167,8 @@ def _starts(
     signals = [rows.signals[row] for row in named]
     reached = postures.at(q).rows[list(named)]
     missed = [
-        f"{s.name} comes to {value:.4g} {s.unit}, {abs(goal - value):.2g} {s.unit} from {goal:.4g}"
+        f"{s.name} comes to {value:.4g} {s.unit}, {abs(goal - value):.2g} {s.unit} from {goal:.4g} "
+        f"{s.unit}"
         for s, value, goal in zip(signals, reached, wanted, strict=True)
         if abs(goal - value) > 1e-6
     ]
@@ -256,7 +257,7 @@ def _written(
         upright = np.max(np.abs(posture.rows[rows.tilts]), initial=0.0) < 1e-6
         values[rows.tilts] *= not upright
         resting = {names[row]: float(values[row]) for row in added}
-        free = {names[row]: np.inf for row in added if row in rows.joints}
+        free = dict.fromkeys(names[row] for row in added if row in rows.joints)
         scenario = replace(
             scenario,
             references={**scenario.references, **resting},
@@ -325,7 +326,7 @@ class _Rows:
         self.links, self.start, self.is_task = links, scenario.start.positions, bool(scenario.task)
         self.signals: list[Signal] = [s for output in outputs for s in output.signals(links)]
         self._expressions = [output.expression(links) for output in outputs]
-        self.given, self._bound, self._scenario = len(self.signals), bound, scenario
+        self.given, self.bound, self._scenario = len(self.signals), bound, scenario
         self.forms: dict[int, Output] = {}
         touches = {c.name: c.touch(links) for c in bound.constraints}
         self.touches = {name: touch for name, touch in touches.items() if touch is not None}
@@ -353,7 +354,7 @@ class _Rows:
         self.joints = [self._add(JointPositions([name])) for name in names]
 
     def _add(self, form: Output) -> int:
-        output, row = make(form, self._bound.constraints), len(self.signals)
+        output, row = make(form, self.bound.constraints), len(self.signals)
         self._expressions.append(output.expression(self.links))
         self.forms[row] = form
         self.signals += output.signals(self.links)
@@ -388,9 +389,9 @@ class _Rows:
     def off_surface(self, scenario: Scenario, touching: Posture) -> FloatArray:
         """The configuration with the same outputs, `BEFORE` the surface of a task."""
         assert scenario.task is not None
-        outputs = [make(form, self._bound.constraints) for form in scenario.outputs]
-        rows = _Rows(scenario, self.links, outputs, self._bound)
-        contact, bound = scenario.task.contact, self._bound
+        outputs = [make(form, self.bound.constraints) for form in scenario.outputs]
+        rows = _Rows(scenario, self.links, outputs, self.bound)
+        contact, bound = scenario.task.contact, self.bound
         names = [contact] if isinstance(contact, str) else [*contact]
         values = {p.name: p.value for p in bound.parameters}
         values |= {name: np.atleast_1d(v) for name, v in scenario.plant.parameters.items()}
@@ -424,7 +425,7 @@ class _Goals:
         self._held = near.rows  # What a task gives no reference.
         if scenario.task is not None:
             key = "task.phases"
-            distances = {signal.name for signal in rows._bound.residual_signals}
+            distances = {signal.name for signal in rows.bound.residual_signals}
             references = _of_phases(scenario, distances)
         self._references: list[tuple[_Values, list[int | None]]] = []
         for name, reference in references.items():
@@ -506,6 +507,13 @@ def _meaning(
             chosen = of_point or [others[k] for k in denoted(name, others, [2] * len(others))]
             return [signals.index(signal) for signal in chosen]
         outputs += others
+    for constraint in rows.bound.constraints:
+        if name in [signal.name for signal in constraint.coordinate_signals]:
+            text = (
+                f"no output '{name}'; it is a coordinate along the constraint '{constraint.name}'"
+            )
+            form = f"!SurfaceCoordinates {{constraint: {constraint.name}}}"
+            raise ScenarioError((key, f"{text}: add {form} to outputs"))
     raise ScenarioError((key, unknown_name("output", name, outputs)))
 
 

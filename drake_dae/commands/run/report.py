@@ -84,7 +84,7 @@ def report_run(
     job = judge_job(
         record,
         predicted,
-        scenario.judgement.tolerances,
+        scenario.judgement.tolerated,
         [
             *shortfalls(record, limits),
             *exceeded,
