@@ -63,6 +63,8 @@ class TrackingLaw:
         reference_signals: Names and units of R.
         function: The law as (state, reference, measured_force, parameters) -> control and
             tracking_error, with `all_parameters`; without measured force there is no such input.
+        outputs: Name of an output of `function` -> its expression, of `inputs`.
+        pivot, regular: A scalar that is 0 where a matrix is singular, and that matrix in words.
         measured_force: The measurement of v in the law; None without one.
         deflection: The deflection of compliant contacts under the wanted forces, or None.
         exogenous_degrees: The number of derivatives of each entry of w that the law needs.
@@ -146,14 +148,17 @@ class TrackingLaw:
             ca.depends_on(ca.vertcat(control, output), measured.symbol)
         )
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
-        self._ubar = ubar
+        self._ubar, self.outputs, self.pivot = ubar, outputs, pivot
         self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
+        self.regular = (
+            f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}"
+        )
         return TracedFunction(
             f"{self.system.name} tracking law",
             self._inputs,
             outputs,
             pivot,
-            f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}",
+            self.regular,
             compiled=self.system.compiled,
         )
 
