@@ -10,9 +10,9 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.dae.references import ConstantReference
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.references import ConstantReference
 from drake_dae.robots.constraints.points import PointOnSurface
 from drake_dae.robots.known_forces import KnownWrench
 from drake_dae.scenario.build import build_completed
@@ -104,7 +104,7 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
     """
     if scenario.plant.material is not None:
         return scenario
-    for part, what in ((scenario.task, "a task"), (scenario.observer, "an observer")):
+    for part, what in ((scenario.task, "a task"), (scenario.estimator, "an estimator")):
         if part is not None:
             return (
                 f"none, since {what} does not know how a surface moves, and an ideal contact needs "
@@ -144,7 +144,8 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
         for body in bodies
         if plant.GetVisualGeometriesForBody(body) and not plant.IsAnchored(body)
     ]
-    return replace(scenario, known_forces=[*scenario.known_forces, *pushes])
+    robot = scenario.robot
+    return replace(scenario, robot=replace(robot, known_forces=[*robot.known_forces, *pushes]))
 
 
 _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {

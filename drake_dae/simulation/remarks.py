@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.references import Reference
+from drake_dae.references import Reference
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.model import RobotModel
 from drake_dae.simulation.records.record import Record

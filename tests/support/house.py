@@ -25,6 +25,7 @@ FLOORS = (
     ("arguments",),
     ("trace",),
     ("dae",),
+    ("references",),
     ("analysis", "symbolic", "robots"),
     ("blocks",),
     ("systems",),
@@ -43,19 +44,17 @@ FLOORS = (
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 # The mathematics can be read, tested and used without Drake.
-WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "analysis")
+WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references", "analysis")
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
     "system",
-    "kinetic_metric",
     "manifold",
     "derivatives",
     "elimination",
     "states",
     "structure",
     "normal_form",
-    "references",
     "tracking",
     "linearization",
     "beyond",

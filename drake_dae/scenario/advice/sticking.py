@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references.by_name import references_by_name
-from drake_dae.dae.references.reference import stack_references
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.references.by_name import references_by_name
+from drake_dae.references.reference import stack_references
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.plants import CompliantContact
 from drake_dae.scenario.scenario import Scenario
@@ -121,8 +121,8 @@ def _longest(
     part = slice(links.q.numel(), links.q.numel() + links.v.numel())
     factors = PositiveDefiniteFactorization(dae.mass_matrix[part, part])
     parameters, known = dae.parameter_values, {parameter.name for parameter in dae.parameters}
-    for name in known.intersection(scenario.plant_parameters):
-        parameters[dae.parameter_slice(name)] = scenario.plant_parameters[name]
+    for name in known.intersection(scenario.plant.parameters):
+        parameters[dae.parameter_slice(name)] = scenario.plant.parameters[name]
     kinematics, mobilities, names, coefficients = links.kinematics(), [], [], []
     for constraint, touch in touching(model):
         moving = kinematics.value(kinematics.velocity(touch.frame, touch.point))

@@ -1,6 +1,6 @@
 """Drake's trajectories as references."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import factorial
@@ -11,11 +11,9 @@ from numpy.polynomial import Polynomial
 from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import Reference
-from drake_dae.dae.references.pieces import PiecewisePolynomials
-from drake_dae.dae.references.reference import at_time
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references import Reference
+from drake_dae.references.polynomials import PiecewisePolynomials
 
 
 @checked(ReferenceSignalError)
@@ -60,11 +58,6 @@ class TrajectoryReference(Reference):
             table.append(pieces.expression(time))
         rows = [table[k][i] for i, degree in enumerate(degrees) for k in range(degree + 1)]
         return ca.vertcat(*rows) + ca.if_else(self.margin(time) >= 0.0, 0.0, np.nan)
-
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        time = ca.SX.sym("t")
-        value = at_time(time, self.expression(degrees, time))
-        return lambda time: value(time).copy()
 
     def margin(self, time: ca.SX) -> ca.SX:
         """The distance of a time from the ends of the trajectory, in s; negative outside."""

@@ -15,10 +15,10 @@ from drake_dae.blocks.block import TIME, Block, BlockFunction, Requirement, stac
 from drake_dae.blocks.failures import simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae.references import Reference, ReferenceRows
-from drake_dae.dae.references.reference import with_degrees
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import DrakeDaeError, ReferenceSignalError
+from drake_dae.references import Reference, ReferenceRows
+from drake_dae.references.reference import with_degrees
 from drake_dae.systems.control.drake_references import TrajectoryReference
 from drake_dae.trace.functions import FailureKind
 

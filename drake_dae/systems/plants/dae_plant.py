@@ -20,8 +20,7 @@ from drake_dae.blocks.failures import (
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.structure.shared_forces import manifold_of_left_out
-from drake_dae.dae.structure.singular import dependent_constraints
+from drake_dae.dae.structure.redundancy import manifold_of_left_out
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.systems.parameterized import ParameterizedSystem
@@ -135,7 +134,7 @@ class DaePlant(ParameterizedSystem, Plant):
             parameters = parameters.copy()
             parameters[self.exogenous_places] = values["input exogenous"]
         if not self.dae.frictional_contacts:
-            names = dependent_constraints(self.structure, error.state, parameters)
+            names = self.structure.dependent_constraints(error.state, parameters)
             return singular_configuration(self.dae.name, error.time, error.state, names)
         control = values.get("input control", np.zeros(self.dae.num_controls))
         force = self.structure.trace("force", self.dae.forces(self._constraint_input), True)

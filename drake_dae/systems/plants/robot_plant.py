@@ -73,8 +73,9 @@ class RobotPlant(DaePlant):
 
 def robot_block(model: RobotModel, structure: ConstraintStructure, project: bool = True) -> Block:
     """The block of a constrained robot; see `RobotPlant`."""
-    block, force = dae_block(structure, project), ca.SX.sym("force", model.dae.num_constraints)
-    wrenches, signals = ConstraintSet(model.constraints).wrenches(model.links.kinematics(), force)
+    block, bound = dae_block(structure, project), ConstraintSet(model.constraints)
+    force = ca.SX.sym("force", bound.size)
+    wrenches, signals = bound.wrenches(model.links.kinematics(), force)
     lambdas = block.outputs["constraint_force"]
     outputs = {
         **block.outputs,

@@ -186,7 +186,9 @@ def test_zero_dynamics_are_those_under_the_chosen_control():
     assert ZeroDynamics(grows).stability().verdict is Verdict.UNSTABLE
 
 
+@pytest.mark.equation(27)
 def test_the_realization_moves_as_the_plant(law):
+    """(26), (27) are the rates of the plant's state, in the coordinates."""
     random, structure = np.random.default_rng(3), law.structure
     form, plant = NormalForm(law.system, structure=structure), DaePlant(law.system)
     context = plant.CreateDefaultContext()

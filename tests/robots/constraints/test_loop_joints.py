@@ -36,9 +36,9 @@ from drake_dae import (
     find_structure,
     poles,
 )
-from drake_dae.dae.references import SinusoidReference
 from drake_dae.diagrams.wiring import make_closed_loop
 from drake_dae.errors import ModelError
+from drake_dae.references import SinusoidReference
 from drake_dae.simulation.summary import Limits, summary
 
 COUNT = 8
