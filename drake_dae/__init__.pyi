@@ -17,9 +17,9 @@ from .dae.beyond.sampled import sampling_error as sampling_error
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
 from .dae.extension.extension import Extension as Extension
 from .dae.extension.extension import extend as extend
-from .dae.linearization.linearization import linearize as linearize
-from .dae.linearization.linearization import linearize_loop as linearize_loop
-from .dae.normal_form.normal_form import NormalForm as NormalForm
+from .dae.linearization import linearize as linearize
+from .dae.linearization import linearize_loop as linearize_loop
+from .dae.normal_form import NormalForm as NormalForm
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure
 from .dae.structure.constrained import find_constraint_structure as find_constraint_structure
 from .dae.structure.redundancy import drop_constraints as drop_constraints
