@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.manifold.newton_steps import FOUND, STAYS, shortest_step, trace_first_steps
 from drake_dae.dae.manifold.settling import Settling
-from drake_dae.dae.system.agreement import agree
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
@@ -87,7 +86,7 @@ class Manifold:
         rows = zip(ca.vertsplit(slope), ca.vertsplit(moved), strict=True)
         short = ca.sparsify(ca.vertcat(*[row for pair in rows for row in pair]))
         is_shorter = count_operations(short) < count_operations(self.gradient)
-        return short if is_shorter and agree(system, short, self.gradient) else self.gradient
+        return short if is_shorter and system.agree(short, self.gradient) else self.gradient
 
     @cached_property
     def newton_step(self) -> TracedFunction:
