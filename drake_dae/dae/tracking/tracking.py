@@ -57,7 +57,8 @@ class TrackingLaw:
     `function` is the law as (state, reference, measured_force, integral, parameters) -> control,
     tracking_error and integral_rate, without what the law does not have, and with the parameters of
     `all_parameters`; `outputs` are these as expressions of `inputs`, and `pivot` is 0 where the
-    matrix that `regular` names is singular. `layout` is that of reference vectors, and `reference_signals` names them.
+    matrix that `regular` names is singular. `layout` is that of reference vectors, and
+    `reference_signals` names them.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
