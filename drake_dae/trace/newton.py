@@ -9,15 +9,12 @@ import scipy.linalg
 from scipy.linalg.lapack import dgeqrf, dorgqr, dpotrs, dtrtrs
 
 from drake_dae.arrays import FloatArray
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.round_off import DEPENDENT
 
 T = TypeVar("T")
 
 ROUND_OFF = 1e-12
 """A Newton step below this, relative to the state, is within the round-off of the residual."""
-
-DEPENDENT = 1e-9
-"""Gradients of length one with a smallest singular value below this are dependent."""
 
 CONVERGED = 1e-8
 """A Newton step below this, relative to the state, that stops decreasing is round-off."""
@@ -180,15 +177,3 @@ def steps_along(
     return NewtonModel(
         lambda x: -along @ dpotrs(factors[0], residual(x) / size, lower=factors[1])[0], True
     )
-
-
-def are_dependent(gradients: FloatArray) -> bool:
-    """Whether rows, whose lengths do not matter, are linearly dependent."""
-    if not np.all(np.isfinite(gradients)):
-        return True
-    # By their largest entries first: their squares may be too large for a number.
-    rows = gradients / positive(np.abs(gradients).max(axis=1, keepdims=True, initial=0.0))
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    if rows.shape[0] > rows.shape[1] or not np.all(length > 0.0):
-        return True
-    return bool(np.linalg.svd(rows / length, compute_uv=False)[-1] < DEPENDENT)

@@ -11,8 +11,7 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import are_dependent
-from drake_dae.trace.round_off import Sized, multiply, significant
+from drake_dae.trace.round_off import Sized, are_dependent, multiply, significant
 
 
 class Samples:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
 from drake_dae.dae.manifold.manifold import Manifold
@@ -17,16 +17,18 @@ from drake_dae.dae.states.margins import RankMargin, find_margin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_violation
-from drake_dae.dae.structure.dependence import find_dependence
-from drake_dae.dae.structure.mass_matrix import check_mass_matrix
-from drake_dae.dae.structure.redundancy import find_redundant
+from drake_dae.dae.structure.dependence import find_dependence, redundant_constraints
+from drake_dae.dae.structure.redundancy import all_constraints_hold
 from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibrated, smallest_singular_value
+from drake_dae.trace.round_off import equilibrated, positive, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
+
+PART = 0.1
+"""The least part of a constraint in a vanishing combination, relative to the largest."""
 
 
 @checked(ModelError)
@@ -81,17 +83,22 @@ class ConstraintStructure:
         x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
         return function(x, p)[0].reshape(matrix.shape)
 
-    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
-        """Compiles an expression on N* to a function of state, control and parameters.
+    def dependent_constraints(self, state: FloatArray, parameters: FloatArray) -> tuple[str, ...]:
+        """Returns the names of the constraints that become dependent where A(x) is singular.
 
-        Args:
-            name: Its name in messages.
-            value: An expression of the state and of the control `derivatives.control`.
-            needs_control: Whether the function takes the control; otherwise the control is 0.
-
-        Returns:
-            A function with the output "value", and with A(x) as the matrix that must be regular.
+        They are the parts of n with n^T A(x) = 0, in units of the usual lengths of the gradients.
         """
+        usual = [np.diag(self.constraint_matrix(x, parameters)) for x in self.states]
+        unit = 1.0 / np.sqrt(positive(np.median(np.abs(usual), axis=0)))
+        matrix = self.constraint_matrix(state, parameters) * unit * unit[:, None]
+        if not np.isfinite(matrix).all():
+            return ()
+        part = np.abs(np.linalg.svd(matrix)[0][:, -1])
+        signals = self.system.constraint_output_signals
+        return tuple(signals[i].name for i in np.flatnonzero(part > PART * part.max()))
+
+    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
+        """Compiles an expression of state and `derivatives.control` on N*, or with control 0."""
         control = self.derivatives.control
         inputs = {"control": control}
         if not needs_control:
@@ -199,6 +206,32 @@ def check_system(system: DaeSystem) -> None:
         raise Violation(2, ViolationKind.COUNT, names).error()
 
 
+def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
+    """Checks E of E x' = f + g v + h u, since LDL^T reads only one triangle of it."""
+    function = system.trace("mass matrix", {"mass": ca.densify(system.mass_matrix)}, often=False)
+    for state in states:
+        mass = function(state, system.parameter_values)[0].reshape(state.size, state.size)
+        if is_positive_definite(mass):
+            continue
+        raise ModelError(
+            f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
+            f"{show(state)}. An equation in which no derivative stands is a constraint 0 = k(x) "
+            "with a constraint input; where it holds an unknown z that has no derivative, lift it: "
+            "make z a state with z' = v, v a new constraint input, and keep the equation as "
+            "constraint"
+        )
+
+
+def is_positive_definite(matrix: FloatArray) -> bool:
+    """Whether a matrix is symmetric and positive definite, independent of units."""
+    length = np.sqrt(np.abs(np.diag(matrix)))
+    if not (np.all(np.isfinite(matrix)) and np.all(length > 0.0)):
+        return False
+    scaled = matrix / length / length[:, None]
+    is_symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
+    return bool(is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12)
+
+
 def constraint_violation(structure: ConstraintStructure) -> Violation | None:
     """Returns the violation of Assumption (1) or (2) by a singular A(x); None if it is regular."""
     causes = ((1, ViolationKind.CONSTRAINT_DEGREE), (2, ViolationKind.CONSTRAINT_RANK))
@@ -213,14 +246,16 @@ def constraint_violation(structure: ConstraintStructure) -> Violation | None:
         return violation
     if violation.cause is not ViolationKind.CONSTRAINT_RANK:
         return _as_redundant(system, violation)
-    dependence = find_dependence(structure.manifold, elimination, structure.states, margin.state)
+    combinations, everywhere, in_gradients = find_dependence(
+        structure.manifold, elimination, structure.states, margin.state
+    )
     cause = {  # By whether it is singular everywhere, and by its gradients.
         (True, True): ViolationKind.REDUNDANT,
         (False, True): ViolationKind.SINGULAR_CONFIGURATION,
         (True, False): ViolationKind.HIDDEN_DEGREE,
         (False, False): ViolationKind.CONSTRAINT_RANK,
-    }[dependence.everywhere, dependence.in_gradients]
-    violation = replace(violation, cause=cause, combinations=dependence.combinations)
+    }[everywhere, in_gradients]
+    violation = replace(violation, cause=cause, combinations=combinations)
     return _as_redundant(system, violation)
 
 
@@ -266,7 +301,10 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
     possible = (ViolationKind.CONSTRAINT_DEGREE, ViolationKind.SINGULAR_CONFIGURATION)
     if violation.cause not in possible:
         return violation
-    combinations = find_redundant(system)
+    try:
+        combinations = redundant_constraints(all_constraints_hold(system))
+    except InconsistentStateError:
+        return violation
     # A gradient that vanishes wherever its constraint holds does not depend on others.
     if not combinations or not all(combination.others for combination in combinations):
         return violation

@@ -16,10 +16,10 @@ from drake_dae.dae.structure.constrained import (
     constraint_violation,
     examine_constraints,
     guesses,
+    is_positive_definite,
     with_numbers,
 )
 from drake_dae.dae.structure.dependence import combinations_of
-from drake_dae.dae.structure.mass_matrix import is_positive_definite
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
@@ -84,13 +84,8 @@ class Structure(ConstraintStructure):
 
         No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
 
-        Args:
-            commanded: ubar of (28), shape (p, 1).
-
-        Returns:
-            x', shape (n, 1), v, shape (m, 1), and a scalar that is 0 exactly where one of them is
-            not determined; None if the control is not found in this way, or if friction may leave
-            the motion undetermined.
+        Returns x', v, and a scalar that is 0 exactly where one of them is not determined; None if
+        the control is not found in this way, or if friction may leave the motion undetermined.
         """
         if self.system.control_metric is not None or self.system.frictional_contacts:
             return None
@@ -105,13 +100,8 @@ class Structure(ConstraintStructure):
     def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Returns u = B(x)^-1 (-a(x) + ubar), for which z_i^(mu_i) = ubar_i on N*.
 
-        If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
-
-        Args:
-            commanded: ubar of (28), shape (p, 1).
-
-        Returns:
-            u, shape (p, 1), and a scalar that is 0 exactly where it is not determined.
+        If B(x) does not determine u, `DaeSystem.control_metric` chooses it. Also returns a scalar
+        that is 0 exactly where u is not determined.
         """
         solution: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
@@ -124,14 +114,7 @@ class Structure(ConstraintStructure):
         return control, pivot
 
     def control_by_matrix(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Returns the control of `control_for`, computed with B(x); A(x) must be regular.
-
-        Args:
-            commanded: ubar of (28), shape (p, 1).
-
-        Returns:
-            u, shape (p, 1), and a scalar that is 0 exactly where B(x) loses its rank.
-        """
+        """Returns the control of `control_for`, computed with B(x); A(x) must be regular."""
         needed, metric = commanded - self.drift, self.system.control_metric  # (28)
         if metric is not None:
             return nearest_solution(self.control_matrix, needed, metric, self.system.free_control)
@@ -213,7 +196,13 @@ def why_no_law(system: DaeSystem) -> str:
 
 def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
     """Finds mu_1, ..., mu_p and B(x) if A(x) is regular."""
-    _check_metric(samples)
+    if (metric := samples.system.control_metric) is not None:
+        for state, (value,) in zip(samples.states, samples.values(metric=metric), strict=True):
+            if not is_positive_definite(value):
+                raise ModelError(
+                    f"{samples.system.name}: control_metric is not symmetric and positive definite "
+                    f"at x = {show(state)}; give each control a positive weight"
+                )
     elimination = constrained.elimination
     outputs = output_chains(constrained.derivatives, elimination, samples)
     degrees = tuple(len(chain) for chain in outputs.chains)
@@ -235,20 +224,6 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
         round_off=outputs.round_off,
         control_margin=find_margin(samples, outputs.control_matrix, outputs.round_off),
     )
-
-
-def _check_metric(samples: Samples) -> None:
-    """Checks the `control_metric`."""
-    system = samples.system
-    if system.control_metric is None:
-        return
-    values = samples.values(metric=system.control_metric)
-    for state, (metric,) in zip(samples.states, values, strict=True):
-        if not is_positive_definite(metric):
-            raise ModelError(
-                f"{system.name}: control_metric is not symmetric and positive definite at x = "
-                f"{show(state)}; give each control a positive weight"
-            )
 
 
 def control_violation(structure: Structure) -> Violation | None:

@@ -9,7 +9,8 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint
 from drake_dae.dae.zero_dynamics.stability import ROUNDED, balanced_matrix
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, NewtonModel, newton, shortest_steps
+from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
+from drake_dae.trace.round_off import DEPENDENT
 
 AT_REST = 1e-8
 """A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
