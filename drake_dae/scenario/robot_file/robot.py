@@ -123,7 +123,7 @@ class Robot:
     free: list[str] = field(default_factory=list)
     base: RobotPlacement | None = None
     locked: dict[str, float] = field(default_factory=dict)
-    actuators: Annotated[Any, ACTUATORS] = None
+    actuators: Annotated[Any, ACTUATORS] | None = None
     leave_out: list[LeftOut] = field(default_factory=list)
     description: str = ""
     payloads: list[Payload] = field(default_factory=list)
