@@ -13,6 +13,7 @@ from drake_dae import (
     DaePlant,
     DaeSystem,
     LoopSettings,
+    NormalForm,
     Parameter,
     SinusoidReference,
     TrackingController,
