@@ -27,8 +27,7 @@ from drake_dae.robots.outputs import (
     PositionOutput,
 )
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.parts.families import Output
-from drake_dae.scenario.parts.written import TiltFromNormalForm, make
+from drake_dae.scenario.parts.written import TiltFromNormalForm, WrittenOutput, make
 from drake_dae.scenario.postures import INDEPENDENT, Posture, Postures, tool_axis
 from drake_dae.scenario.scenario import Scenario
 
@@ -292,7 +291,7 @@ _JOINED = {
 """Which attribute of an output holds its rows."""
 
 
-def _joined(forms: Iterator[Output]) -> list[Output]:
+def _joined(forms: Iterator[WrittenOutput]) -> list[WrittenOutput]:
     """The same rows in fewer outputs: neighbours that differ only in their rows are joined."""
     outputs: list[Any] = []
     for form in forms:
@@ -327,7 +326,7 @@ class _Rows:
         self.signals: list[Signal] = [s for output in outputs for s in output.signals(links)]
         self._expressions = [output.expression(links) for output in outputs]
         self.given, self.bound, self._scenario = len(self.signals), bound, scenario
-        self.forms: dict[int, Output] = {}
+        self.forms: dict[int, WrittenOutput] = {}
         touches = {c.name: c.touch(links) for c in bound.constraints}
         self.touches = {name: touch for name, touch in touches.items() if touch is not None}
         taken, kind = {s.name for s in self.signals}, scenario.tool_axis
@@ -353,7 +352,7 @@ class _Rows:
         names = [signal.name for signal in links.position_signals]
         self.joints = [self._add(JointPositions([name])) for name in names]
 
-    def _add(self, form: Output) -> int:
+    def _add(self, form: WrittenOutput) -> int:
         output, row = make(form, self.bound.constraints), len(self.signals)
         self._expressions.append(output.expression(self.links))
         self.forms[row] = form

@@ -191,7 +191,7 @@ def _checked_constraints(
         choice = control_choice(name, scenario.law.control_weights or None, actuators)
     with at("exogenous"):
         attached = [stage.attach(links).parameters for stage in scenario.actuation]
-        members = (member.parameters for member in (*constraints, *known))
+        members = [one.parameters for one in constraints] + [one.parameters for one in known]
         groups = [links.parameters, *members, *attached, choice]
         parameters = [parameter.name for group in groups for parameter in group]
         for moving in scenario.exogenous:

@@ -1,16 +1,14 @@
 """Makes a scenario for a robot from nothing but its file."""
 
-import json
 import os
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, log10, pi
 from pathlib import Path
-from textwrap import wrap
 from time import perf_counter
 from typing import Any, Literal
 
@@ -43,7 +41,7 @@ from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.surfaces.surface import Surface, Vector
 from drake_dae.robots.surfaces.surfaces import Cylinder, Plane, Sphere
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.forms.typed_yaml import TAG
+from drake_dae.scenario.forms.typed_yaml import dump_yaml
 from drake_dae.scenario.model import completed_model
 from drake_dae.scenario.parts.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
@@ -88,10 +86,6 @@ _SHARE = 0.3
 _RADIUS, _BEND, _FORCE, _SHORTEST = 0.08, 0.4, 20.0, 5.0
 """The radii of the circle and of a curved surface, relative to the robot's size; the largest force,
 N; and the shortest period, s."""
-
-_KEYS = ("description", "robot", "constraints", "tool_axis", "references", "start", "duration")
-_PATH = (TAG, "center", "radius", "period", "offset", "amplitudes", "frequencies")
-"""The keys of the text, and of its path."""
 
 _FRACTIONS, _PLACES = (1.0, 0.5, 0.2), 4
 """The fractions of the usual circle and force that are tried, each at so many places."""
@@ -159,7 +153,7 @@ def new_scenario(
         except DrakeDaeError as error:
             problem = str(error)
         if not problem:
-            return scenario, _text(scenario, {**why, "place": place.why}, folder)
+            return scenario, _text(scenario, {**why, "surface": place.why}, folder)
         tried.append(f"{name} at {center} m, {scenario.description}: {problem[:160]}")
     text = (
         f"no place was found where '{tip}' can move along a {surface}. Tried: "
@@ -548,75 +542,25 @@ def _round_number(value: float) -> float:
 
 def _text(scenario: Scenario, why: dict[str, str], folder: str | Path | None) -> str:
     """The text of a new scenario, with a comment on each choice."""
-    data = scenario_data(scenario, _KEYS)
-    robot, (contact,) = data["robot"], data["constraints"]
-    file = Path(robot["file"])
+    data = {**scenario_data(scenario), "duration": scenario.duration}
+    file = Path(data["robot"]["file"])
     if folder is not None and file.is_relative_to(saved := os.path.realpath(folder)):
-        robot["file"] = file.relative_to(saved).as_posix()
-    keys = ("file", "packages", "base", "locked", "actuators", "leave_out")
-    (along, path), (pressing, force) = data["references"].items()
-    radius = path.get("radius") or path["amplitudes"][0]
-    path = {key: path[key] for key in path if key in _PATH}
-    notes = {"file": "", "surface": why["place"], **why}
+        data["robot"]["file"] = file.relative_to(saved).as_posix()
+    contact, force = (
+        scenario.constraints[0].name,
+        "N, at most 20, and a sixth of what efforts allow",
+    )
+    why = {**why, "tool_axis": "kept where it starts", "positions": "near there, in rad or m"}
+    why |= {"duration": "s, two rounds", f"{contact}.force": force}
     lines = [
         "# Written by `drake-dae new`, to be changed. Units: m, rad, s, N, N m.",
         "# Outputs beside the tool's path, gains (poles at -4 1/s) and an exact start are added by",
         "# `drake-dae simulate FILE`; --meshcat shows it. `drake-dae analyze FILE` tells margins.",
-        f"description: {_flow(data['description'])}",
-        "robot:",
-        *(_line(f"  {key}", robot[key], notes[key]) for key in keys if robot[key]),
-        "constraints:",
-        _line("- name", contact["name"], ""),
-        _line("  frame", contact["frame"], why["frame"]),
-        *(
-            [_line("  point", contact["point"], notes.get("point", "m, in that frame"))]
-            * any(contact["point"])
-        ),
-        _line("  surface", contact["surface"], notes["surface"]),
-        *(
-            [_line("tool_axis", data["tool_axis"], "kept where it starts")]
-            * (data["tool_axis"] != "normal")
-        ),
-        "references:",
-        _line(f"  {_flow(along)}", path, f"{radius:g} m: joints stay below their speed limits"),
-        _line(f"  {_flow(pressing)}", force, "N, at most 20, and a sixth of what efforts allow"),
-        "start:",
-        _line("  positions", data["start"]["positions"], "near there, in rad or m"),
-        _line("duration", data["duration"], "s, two rounds"),
     ]
+    for line in dump_yaml(data).splitlines():
+        note = why.get(line.strip(" -").partition(":")[0], "")
+        fits = len(line) + len(note) < 97
+        indent = line[: len(line) - len(line.lstrip(" "))]
+        lines += [f"{line}  # {note}"] if note and fits else [f"{indent}# {note}"] * bool(note)
+        lines += [line] * (not (note and fits))
     return "\n".join(lines) + "\n"
-
-
-def _line(key: str, value: Any, note: str) -> str:
-    """A line of YAML; a note that makes it too long stands above it."""
-    line, indent = f"{key}: {_flow(value)}", " " * (len(key) - len(key.lstrip()))
-    if note and len(line) + len(note) < 96:
-        return f"{line}  # {note}"
-    options: Any = {"break_long_words": False, "break_on_hyphens": False}
-    lines = wrap(line, 100, subsequent_indent=f"{indent}    ", **options)
-    return "\n".join([f"{indent}# {note}", *lines] if note else lines)
-
-
-def _flow(value: Any) -> str:
-    """Data in one line, without keys that are empty or zero vectors."""
-    if isinstance(value, Mapping):
-        texts = {k: _flow(v) for k, v in value.items() if k != TAG and v is not False}
-        empty = ('""', "[]", "{}", "null", "[0.0, 0.0, 0.0]", "[0.0]")
-        inner = ", ".join(f"{_flow(k)}: {text}" for k, text in texts.items() if text not in empty)
-        return f"{value[TAG]} {{{inner}}}" if TAG in value else f"{{{inner}}}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(_flow, value))}]"
-    is_plain = isinstance(value, str) and re.fullmatch(r"[A-Za-z_][\w/-]*(\.[\w/-]+)*", value)
-    if is_plain and value.lower() not in (
-        "y",
-        "n",
-        "yes",
-        "no",
-        "on",
-        "off",
-        "true",
-        "false",
-        "null",
-    ):
-        return str(value)
-    return json.dumps(value, ensure_ascii=False)
