@@ -87,7 +87,8 @@ def reference_and_start(
     reference = stack_references(references_of(scenario, names, degrees), degrees)
     outputs = reference(scenario.integrator.start_time)[structure.layout.lowest]
     parameters = model.dae.parameter_values
-    return reference, start_state(scenario, model, outputs, parameters, parameters)
+    with at("start"):
+        return reference, start_state(scenario, model, outputs, parameters, parameters)
 
 
 def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> str:
