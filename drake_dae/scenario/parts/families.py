@@ -19,7 +19,7 @@ from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts import written
 from drake_dae.scenario.parts.task import ScenarioTask
-from drake_dae.scenario.robot_file import payloads
+from drake_dae.scenario.robot_file import robot
 from drake_dae.systems.control import sampling
 from drake_dae.systems.plants.contact import disturbance_forces
 from drake_dae.systems.sensing import encoders
@@ -88,7 +88,7 @@ Reference = Annotated[
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
 Load = Annotated[known_forces.KnownForce | joint_friction.JointFriction, Choice(_LISTED)]
-Payload = Annotated[payloads.Payload, Form()]
+Payload = Annotated[robot.Payload, Form()]
 DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
 FrictionCone = Annotated[friction.FrictionCone, Form(_WRITTEN)]
 Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]

@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import pydantic
 
-from drake_dae.arrays import brief
+from drake_dae.arrays import brief, positive
 from drake_dae.errors import ModelError
 from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.forms.values import Triple
-from drake_dae.scenario.robot_file.payloads import Payload
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,26 @@ class RobotPlacement:
 
     weld: str
     pose: Pose = Pose()
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A point mass attached to a robot.
+
+    Attributes:
+        frame: Name of the frame to which it is attached.
+        mass: Its mass, in kg; the parameter "<name>.mass".
+        point: Its position in the frame, m.
+        name: The name of its body.
+    """
+
+    frame: str
+    mass: float
+    point: Triple = (0.0, 0.0, 0.0)
+    name: str = "payload"
+
+    def __post_init__(self) -> None:
+        positive("the mass of a payload", self.mass)
 
 
 def _actuators(value: Any) -> Any:
@@ -82,8 +101,13 @@ Actuators = Annotated[
 """The driven joints: "all", a list of names, or name -> effort limit."""
 
 
-LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
-"""The parts of a robot's file that a scenario can leave out."""
+def _part(name: str) -> str:
+    if name not in ("inertia", "empty_limits") and not 0 < name.find("/") < len(name) - 1:
+        raise ValueError(
+            f"expected <parent>/<name> of an element or attribute, inertia or empty_limits, got "
+            f"{brief(name)}"
+        )
+    return name
 
 
 @dataclass(frozen=True)
@@ -118,11 +142,11 @@ class Robot:
             name -> effort limit in N m or N, or "all" revolute and prismatic joints that mimic no
             other. Without a number the limit is that of the file. Controls have this order, after
             those of the file's own actuators.
-        leave_out: Parts of the file that are left out, and are errors otherwise. joint_friction:
-            Coulomb friction of joints. inertia: impossible inertias, which are replaced by the
-            nearest possible ones. empty_limits: position limits that are empty intervals, such as 0
-            to 0. constraints: all constraints of the file except joints, such as <equality> of
-            MJCF; write them under `constraints` instead.
+        leave_out: What is left out of the file: elements and attributes by "<parent>/<name>", as
+            "joint/stiffness" or "equality/weld". Drake reads not all that a file says; what of it
+            changes the equations is an error until it is named here. Besides, inertia: impossible
+            moments of inertia, which the nearest possible ones replace; empty_limits: position
+            limits that are empty intervals, such as 0 to 0.
         payloads: Masses attached to the robot, known to plant and law.
     """
 
@@ -132,7 +156,7 @@ class Robot:
     base: Annotated[RobotPlacement, Form()] | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Actuators = None
-    leave_out: list[LeftOut] = field(default_factory=list)
+    leave_out: list[Annotated[str, pydantic.AfterValidator(_part)]] = field(default_factory=list)
     description: str = ""
     payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
 
