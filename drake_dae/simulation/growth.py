@@ -199,7 +199,7 @@ def _diverged(what: str, times: tuple[float, float], state: FloatArray) -> Simul
         f"the run diverges: at t = {time:.6g} s {what}, and it has grown since {since:.4g} s. The "
         "loop is unstable, or the robot cannot do what is asked: choose slower gains, a shorter "
         "period and delay of the law, or a plant that is nearer to the law's model. With "
-        "may_diverge the run goes on all the same",
+        "judgement.may_diverge the run goes on all the same",
         time,
         state,
     )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pydrake.geometry import SceneGraph
-from runs import run_scenario, scenario_validator
+from runs import run_scenario, scenario_validator, untagged
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
@@ -93,7 +93,8 @@ constraints:
   point_b: [0.0, 0.0, 0.0]
   length: 0.7
 outputs: [!PointCoordinates {{frame: tool, axes: z}}]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   tool.z: !Sinusoids {{offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}}
   rod.thrust: 30.0
@@ -102,7 +103,8 @@ start: {{positions: {{joint1: 1.2, joint2: -1.6}}, errors: {{tool.z: 0.02}}}}
 GEARS = f"""{TWO_LINK}
 constraints: [!JointCoupler {{follower: joint2, leader: joint1, ratio: -1.5, offset: 0.2}}]
 outputs: [!JointPositions {{joints: [joint1]}}]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   joint1: !Sinusoids {{offset: 0.9, amplitudes: [0.2], frequencies: [2.0]}}
   coupler.moment: 5.0
@@ -121,7 +123,8 @@ constraints:
 outputs:
 - !PointCoordinates {frame: tool, axes: yz}
 - !JointPositions {joints: [joint3, joint7]}
-gains: !Poles {all: [-4.0]}
+law:
+  gains: !Poles {all: [-4.0]}
 references:
   tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [2.0]}
   tool.z: 0.55
@@ -133,7 +136,8 @@ start: {positions: {joint2: -0.6, joint4: -1.7, joint6: 0.5}, errors: {tool.z: 0
 SKATE = f"""{ROBOT}
 constraints: [!Blade {{frame: deck}}]
 outputs: [!JointPositions {{joints: [x, turn_z]}}]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   x: !Sinusoids {{offset: 0.0, amplitudes: [0.5], frequencies: [1.0]}}
   turn_z: !Sinusoids {{offset: 0.3, amplitudes: [0.2], frequencies: [2.0]}}
@@ -146,7 +150,8 @@ constraints:
 - !RollingWheel {{frame: right_wheel, radius: 0.1, holds_side: false, name: right}}
 outputs: [!PointCoordinates {{frame: deck, axes: xy, point: [0.3, 0, 0]}}]
 forces: []
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   deck.x: !Sinusoids {{offset: 0.3, amplitudes: [0.4], frequencies: [0.8]}}
   deck.y: !Sinusoids {{offset: 0.0, amplitudes: [0.3], frequencies: [1.1]}}
@@ -161,7 +166,8 @@ constraints:
   name: dome
 outputs: [!PointCoordinates {{frame: ball, axes: xy}}]
 forces: [dome.force]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   ball.x: !Sinusoids {{offset: 0.0, amplitudes: [0.2], frequencies: [1.0]}}
   ball.y: 0.1
@@ -171,7 +177,8 @@ start: {{errors: {{ball.x: 0.03}}}}
 PADS = f"""{ROBOT}
 outputs: [!JointPositions {{joints: [arm, left]}}]
 forces: []
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   arm: !Sinusoids {{offset: 0.3, amplitudes: [0.2], frequencies: [2.0]}}
   left: !Sinusoids {{offset: 0.02, amplitudes: [0.01], frequencies: [3.0]}}
@@ -257,7 +264,7 @@ def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_pat
     at once. The constraint is looked at by Drake: projection leaves round-off."""
     text, robot, holds, outputs = CASES[name]
     path = scenario_file(tmp_path, text, robot)
-    scenario_validator().validate(load_yaml(path.read_text(), "own"))
+    scenario_validator().validate(untagged(load_yaml(path.read_text(), "own")))
     loop, _, record = run_scenario(load_scenario(path))
     assert [signal.name for signal in loop.plant.dae.output_signals] == outputs
     distance = np.abs(record["tracking_error"] - loop.predicted_error(record)).max(axis=0)

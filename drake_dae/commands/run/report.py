@@ -71,7 +71,7 @@ def report_run(
     model, config = loop.plant.model, scenario.integrator
     predicted = loop.predicted_error(record)
     limits = Limits() if model is None else Limits.of(model)
-    exceeded = limits_of_run(loop, record, scenario.friction_cones)
+    exceeded = limits_of_run(loop, record, scenario.judgement.friction_cones)
     fixed = loop.plant.time_step or not config.use_error_control
     accuracy = None if fixed else config.accuracy
     reasons = _reasons(scenario, loop, record)
@@ -84,7 +84,7 @@ def report_run(
     job = judge_job(
         record,
         predicted,
-        scenario.tolerances,
+        scenario.judgement.tolerances,
         [
             *shortfalls(record, limits),
             *exceeded,
@@ -141,19 +141,19 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
     """Reasons for deviations from the prediction for an ideal run."""
     reasons = {
         "the drives were saturated": "excess" in record and bool(record["excess"].any()),
-        "parameters of the plant differ from those of the law (plant_parameters)": bool(
-            scenario.plant_parameters
+        "parameters of the plant differ from those of the law (plant.parameters)": bool(
+            scenario.plant.parameters
         ),
-        "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
+        "the plant carries payloads that the law does not know": bool(scenario.plant.payloads),
         "disturbance forces act on the plant, unknown to the law": bool(
-            scenario.plant_disturbances
+            scenario.plant.disturbances
         ),
         "the contact has friction that the law does not know (friction of its constraint)": (
             _has_unknown_friction(scenario, loop)
         ),
         "the contact is compliant": not loop.plant.is_ideal,
-        "the force is measured by a sensor": scenario.force_feedback.is_measured,
-        "the state is measured by encoders": scenario.encoders is not None,
+        "the force is measured by a sensor": scenario.sensors.force is not None,
+        "the state is measured by encoders": scenario.sensors.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }
     return [reason for reason, holds in reasons.items() if holds]

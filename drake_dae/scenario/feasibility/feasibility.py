@@ -13,7 +13,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references.reference import common_period
 from drake_dae.robots.links_behind import links_behind
@@ -105,12 +105,9 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     # The law's model, without differences of the plant.
     ideal = replace(
         scenario,
-        plant=IdealConstraints(),
-        plant_payloads=[],
-        plant_disturbances=[],
-        encoders=None,
-        observer=None,
-        identified=[],
+        plant=IdealConstraints(parameters=scenario.plant.parameters),
+        sensors=replace(scenario.sensors, encoders=None),
+        estimator=None,
     )
     loop = build_loop(ideal, model, structure)
     context = start_scenario(ideal, loop)
@@ -131,8 +128,8 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     )
     motion, slowing = analysis.motion, None
     if motion is not None and analysis.structure is not None:
-        with at("friction_cones"):
-            limits = robot_limits(model, scenario.friction_cones)
+        with at("judgement.friction_cones"):
+            limits = robot_limits(model, scenario.judgement.friction_cones)
         slowing = limits_along(analysis.structure, limits, reference, motion)
     return Feasibility(
         analysis,

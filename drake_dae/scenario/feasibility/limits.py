@@ -62,7 +62,7 @@ def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> Signa
         signals.append(
             Signal(f"the friction cone of {cone.normal}", dae.force_signals[normal].unit)
         )
-        values.append(tangents - cone.friction * force[normal])
+        values.append(tangents - cone.limit * force[normal])
         ranges.append((np.full(1, -np.inf), np.zeros(1)))
     bounds = np.array([np.concatenate(side) for side in zip(*ranges, strict=True)])
     return SignalLimits(dae, signals, ca.vertcat(*values), bounds, (control, force))

@@ -29,8 +29,8 @@ from drake_dae.scenario.robot_file.robot import Robot
 
 _REMEDIES = {
     "inertia": "it takes the nearest possible moments of inertia",
-    "friction": "write friction as a !JointFriction under known_forces",
-    "frictionloss": "write friction as a !JointFriction under known_forces",
+    "friction": "write friction as a !JointFriction under robot.known_forces",
+    "frictionloss": "write friction as a !JointFriction under robot.known_forces",
     "mimic": "write it as a !JointCoupler under constraints",
     "equality": "write it under constraints, two joints that move together as a !JointCoupler",
 }
