@@ -7,16 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.trajectories import PiecewisePolynomial
 from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, run, scenario, some
 
 from drake_dae import (
-    ConstantReference,
     ForceSensor,
     LoopSettings,
     RobotPlant,
     TrackingLaw,
-    TrajectoryReference,
     build_scenario,
     make_closed_loop,
     poles,
@@ -391,11 +388,6 @@ def test_what_cannot_be_rolled_out_is_refused():
     implicit.integration_scheme, implicit.use_error_control = "implicit_euler", False
     with pytest.raises(ModelError, match="implicit_euler"):
         rollout(loop, start, parameters, [0.0, 0.1], config=implicit)
-    path = TrajectoryReference(PiecewisePolynomial.CubicHermite([0, 1], [[0.3, 0.3]], [[0, 0]]))
-    plant = RobotPlant(loop.plant.model, structure=loop.controller.law.structure)
-    other = make_closed_loop(plant, loop.controller.law, [path, ConstantReference(10.0)])
-    with pytest.raises(ModelError, match="TrajectoryReference"):
-        rollout(other, start, parameters, [0.0, 0.1])
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
