@@ -13,8 +13,8 @@ from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import build_scenario
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
-from drake_dae.scenario.feasibility.limits import limits_of_run, robot_limits
+from drake_dae.scenario.judging import find_feasibility
+from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.simulate import simulate
 from drake_dae.systems.control.references import ReferenceGenerator
 

@@ -10,9 +10,9 @@ from scipy.optimize import brentq
 
 from drake_dae import build_scenario
 from drake_dae.cli import main
-from drake_dae.scenario.feasibility import feasibility as module
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
-from drake_dae.scenario.feasibility.report import Feasibility
+from drake_dae.scenario import judging as module
+from drake_dae.scenario.judging import find_feasibility
+from drake_dae.scenario.judging import Feasibility
 from drake_dae.simulation.summary import Limits
 
 

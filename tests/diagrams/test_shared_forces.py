@@ -6,7 +6,7 @@ from runs import run_scenario, scenario
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.shipped import find_scenario
 
 WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"

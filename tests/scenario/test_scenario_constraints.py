@@ -7,7 +7,7 @@ from runs import run_scenario, scenario_validator
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.forms.typed_yaml import load_yaml
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import find_scenario
