@@ -17,7 +17,6 @@ from drake_dae.analysis.reference_check import check_reference
 from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number
-from drake_dae.dae.references import Reference
 from drake_dae.dae.states.contact_margin import ContactMargins
 from drake_dae.dae.states.margins import RankMargin, find_margin, is_regular
 from drake_dae.dae.states.samples import Samples
@@ -38,6 +37,7 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.stability import Stability
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError
+from drake_dae.references import Reference
 
 STATEMENTS = (
     "v acts on y_i first in derivative r_i",

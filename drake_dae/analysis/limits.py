@@ -1,4 +1,4 @@
-"""Limits of signals: their ranges, which is exceeded most, and how much slower a reference helps."""
+"""Limits of signals: their ranges, which is exceeded most, and what slower references change."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

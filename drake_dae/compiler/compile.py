@@ -9,12 +9,7 @@ from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
-from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
-from drake_dae.compiler.rates import ColumnPlace, UpdateRate, appended, dense_function
-from drake_dae.compiler.trace import Expressions
-from drake_dae.compiler.wires import Port, Wires, leaf_port
-from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     DERIVATIVE,
     HELD,
     MARGINS,
@@ -24,6 +19,11 @@ from drake_dae.systems.blocks.traced import (
     Block,
     Computation,
 )
+from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
+from drake_dae.compiler.rates import ColumnPlace, UpdateRate, appended, dense_function
+from drake_dae.compiler.trace import Expressions
+from drake_dae.compiler.wires import Port, Wires, leaf_port
+from drake_dae.errors import ModelError
 
 
 @checked(ModelError)

@@ -9,13 +9,13 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.computations import HELD, Block, Update
 from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
 from drake_dae.compiler.trace import Expressions, TracedCall
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.traced import HELD, Block, Update
 
 ARGUMENTS = ("time", "state", "held", "parameters")
 """The arguments of a compiled diagram's functions; updates have a fifth one, "noise"."""

@@ -4,8 +4,8 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.computations import DrakeStepped
 from drake_dae.compiler.wires import Wires
-from drake_dae.systems.blocks.traced import DrakeStepped
 
 
 class DrakeSteps:

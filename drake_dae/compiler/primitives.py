@@ -11,10 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus, PortDataType, System
 from pydrake.systems.primitives import RandomSource
 
-from drake_dae.compiler.groups import discrete_states, numeric_parameters
-from drake_dae.errors import ModelError
-from drake_dae.symbolic import to_casadi
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     DERIVATIVE,
     HELD,
     NOISE,
@@ -26,6 +23,9 @@ from drake_dae.systems.blocks.traced import (
     Update,
     not_traced,
 )
+from drake_dae.compiler.groups import discrete_states, numeric_parameters
+from drake_dae.errors import ModelError
+from drake_dae.symbolic import to_casadi
 
 
 def primitive(system: System) -> Block:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import casadi as ca
 from pydrake.systems.framework import System
 
-from drake_dae.systems.blocks.traced import Block
+from drake_dae.blocks.computations import Block
 
 
 class ColumnPlace(NamedTuple):

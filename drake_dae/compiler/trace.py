@@ -6,11 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 from pydrake.systems.framework import Context, PortDataType, System
 
-from drake_dae.compiler.groups import discrete_states, numeric_parameters
-from drake_dae.compiler.primitives import primitive
-from drake_dae.compiler.wires import Port, Wires
-from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     DERIVATIVE,
     HELD,
     NOISE,
@@ -21,6 +17,10 @@ from drake_dae.systems.blocks.traced import (
     Computation,
     Traced,
 )
+from drake_dae.compiler.groups import discrete_states, numeric_parameters
+from drake_dae.compiler.primitives import primitive
+from drake_dae.compiler.wires import Port, Wires
+from drake_dae.errors import ModelError
 
 
 @dataclass(frozen=True, eq=False)

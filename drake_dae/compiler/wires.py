@@ -11,7 +11,7 @@ from pydrake.systems.framework import (
     System,
 )
 
-from drake_dae.systems.blocks.traced import Traced
+from drake_dae.blocks.computations import Traced
 
 Port = tuple[System, int]
 """A system and the index of one of its ports; a diagram only if it is one block (`Traced`)."""

@@ -8,9 +8,9 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 from pydrake.systems.primitives import Adder, MatrixGain
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.references import ConstantReference, Reference
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import WiringError
+from drake_dae.references import ConstantReference, Reference
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant

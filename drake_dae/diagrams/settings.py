@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.dae.references import Reference
 from drake_dae.errors import WiringError
+from drake_dae.references import Reference
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.encoders import Encoders

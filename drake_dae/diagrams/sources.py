@@ -6,11 +6,11 @@ from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder, System
 from pydrake.systems.primitives import RandomSource
 
-from drake_dae.dae.references import Reference
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import WiringError
+from drake_dae.references import Reference
 from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.references import ReferenceGenerator

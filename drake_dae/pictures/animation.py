@@ -51,9 +51,9 @@ from drake_dae.pictures.scene.view import (
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.surfaces.surface import axes_along
+from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.records.phases import PhaseSpan, phase_spans
 from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.limits import robot_limits
 
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
 _CONE = Rgba(0.95, 0.6, 0.15, 0.35)

@@ -93,7 +93,9 @@ def _contacts(record: Record) -> Iterator[RunEvent]:
 def _limits(record: Record, limits: SignalLimits) -> Iterator[RunEvent]:
     """Yields when a control or a joint reaches its limit."""
     controls = [signal.name for signal in record.signals["control"].signals]
-    columns = zip(limits.kinds, limits.signals, limited_values(limits, record).T, limits.bounds.T)
+    columns = zip(
+        limits.kinds, limits.signals, limited_values(limits, record).T, limits.bounds.T, strict=True
+    )
     for kind, signal, values, (low, high) in columns:
         if kind in (LimitKind.FORCE, LimitKind.CONE):
             continue

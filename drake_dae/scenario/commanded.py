@@ -10,9 +10,9 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.dae.references import ConstantReference
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.references import ConstantReference
 from drake_dae.robots.constraints.points import PointOnSurface
 from drake_dae.robots.known_forces import KnownWrench
 from drake_dae.scenario.build import build_completed

@@ -7,8 +7,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from drake_dae import references
 from drake_dae.arguments import checked
-from drake_dae.dae import references
 from drake_dae.errors import ScenarioError
 from drake_dae.files import read_text
 from drake_dae.scenario.forms.typed_yaml import (
@@ -95,7 +95,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
             return replace(
                 value, **{f.name: located(getattr(value, f.name)) for f in fields(value)}
             )
-        return value.beside(here) if isinstance(value, references.Reference) else value
+        return value.in_folder(here) if isinstance(value, references.Reference) else value
 
     task = scenario.task
     return replace(

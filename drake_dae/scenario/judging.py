@@ -21,8 +21,6 @@ from drake_dae.analysis.limits import (
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import Reference
-from drake_dae.dae.references.reference import common_period
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
@@ -30,6 +28,8 @@ from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
+from drake_dae.references import Reference
+from drake_dae.references.reference import common_period
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.links_behind import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel
@@ -363,9 +363,7 @@ def judge_run(
     behind = []
     for link in links_behind(model, record.time, record["state"], own):
         numbers = Signal(link.link, "m"), link.depth, 0.0, link.time
-        behind.append(
-            RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE)
-        )
+        behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
     is_paced = any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
     remedies = _slower(loop, model, limits, record) if is_paced else []
     notes = [constraint.remark for constraint in model.constraints]
@@ -396,9 +394,7 @@ def judge_run(
     return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy)
 
 
-def _slower(
-    loop: ClosedLoop, model: RobotModel, limits: SignalLimits, record: Record
-) -> list[str]:
+def _slower(loop: ClosedLoop, model: RobotModel, limits: SignalLimits, record: Record) -> list[str]:
     """How much slower the references of a run must be to keep its limits."""
     dae, law = model.dae, loop.controller.law
     if loop.generator is None or dae.exogenous.moving:

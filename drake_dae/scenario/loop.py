@@ -7,8 +7,6 @@ import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
 
 from drake_dae.arrays import FloatArray, positive
-from drake_dae.dae.references import ConstantReference, Reference
-from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import outputs_named
 from drake_dae.dae.system.system import DaeSystem
@@ -19,6 +17,8 @@ from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
+from drake_dae.references import ConstantReference, Reference
+from drake_dae.references.by_name import assign, in_order
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.controllers.task_controller import task_controller
 from drake_dae.scenario.forms.keys import at
@@ -191,7 +191,7 @@ def _references(references: Mapping[str, Reference | float], law: TrackingLaw) -
     for name, reference in references.items():
         with at(f"references.{name}"):
             degrees = law.layout.reference_degrees
-            smooth.append(assigned(name, reference, outputs, degrees))
+            smooth.append(assign(name, reference, outputs, degrees))
     with at("references"):
         return in_order(smooth, outputs)
 

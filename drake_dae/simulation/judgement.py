@@ -26,6 +26,10 @@ ROUND_OFF = 1e-13
 """A number below this, relative to the largest one in its unit, is round-off."""
 
 
+PURE = {"": 1.0, "rad": 1.0}
+"""The least size of numbers without a unit, and of angles."""
+
+
 class Outcome(StrEnum):
     """Whether a run succeeded."""
 
@@ -207,7 +211,8 @@ def _of_contacts(record: Record, pushing: set[str]) -> Iterator[RunFinding]:
     for signal, values in zip(forces.signals, forces.values.T, strict=True):
         if signal.name not in pushing:
             continue
-        touches, decides, first = np.flatnonzero(values > 0.0), Outcome.BAD, float(times[0])
+        touches, first = np.flatnonzero(values > 0.0), float(times[0])
+        decides: Outcome | None = Outcome.BAD
         text = f"{signal.name} is 0 all the time"
         if touches.size:
             lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
@@ -304,10 +309,18 @@ def qualities(
     found = []
     for i, signal in enumerate(signals.signals):
         values, tolerance = error[:, i], tolerances.get(signal.name, float(default[i]))
-        largest, off = np.max(np.abs(values)), np.max(np.abs(values - predicted[:, i]))
-        numbers = map(float, (values[0], largest, values[-1], late[i], off))
-        since = within_since(times, values, tolerance)
-        found.append(OutputQuality(signal, *numbers, tolerance, since))
+        found.append(
+            OutputQuality(
+                signal,
+                start=float(values[0]),
+                largest=float(np.max(np.abs(values))),
+                final=float(values[-1]),
+                late_rms=float(late[i]),
+                off_prediction=float(np.max(np.abs(values - predicted[:, i]))),
+                tolerance=tolerance,
+                within_since=within_since(times, values, tolerance),
+            )
+        )
     return found
 
 
@@ -324,9 +337,11 @@ def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
     return sizes
 
 
-def unit_sizes(*groups: tuple[Sequence[Signal], FloatArray]) -> dict[str, float]:
-    """Unit -> the largest finite number in it, of signals with rows of values; 1 for angles."""
-    sizes = {"": 1.0, "rad": 1.0}
+def unit_sizes(
+    *groups: tuple[Sequence[Signal], FloatArray], least: Mapping[str, float] = PURE
+) -> dict[str, float]:
+    """Unit -> the largest finite number in it, of signals with rows of values."""
+    sizes = dict(least)
     for signals, values in groups:
         largest = np.max(np.nan_to_num(np.abs(values), posinf=0.0), axis=0, initial=0.0)
         for signal, size in zip(signals, largest.tolist(), strict=False):

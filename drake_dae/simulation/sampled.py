@@ -11,6 +11,8 @@ from pydrake.systems.framework import Context, Diagram, PortDataType, System, Tr
 from pydrake.systems.primitives import VectorLogSink
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.computations import Traced
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.compiler.called import BufferedFunction
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.compiled import CompiledDiagram
@@ -18,8 +20,6 @@ from drake_dae.compiler.groups import discrete_states
 from drake_dae.compiler.stepped import NO_EVENTS, Sample, SteppedDiagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.errors import DrakeDaeError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.systems.blocks.traced import Traced
 from drake_dae.systems.plants.contract import Plant
 
 EVERY = 32

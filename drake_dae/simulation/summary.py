@@ -89,8 +89,7 @@ class RunSummary:
             "outputs": [_named(asdict(output)) for output in judgement.outputs],
             "forces_and_controls": [
                 {"kind": str(r.kind), **r.to_dict(), "cut_off": self._cut_off(r)}
-                for r in judgement.ranges
-                if r.kind in _FORCES
+                for r in self._limited
             ],
             "phases": [asdict(change) for change in self.changes],
             "residual": self.residual,
@@ -119,14 +118,20 @@ class RunSummary:
             rows.append([q.signal.name, q.signal.unit or "1", *texts, f"{q.tolerance:.2g}"])
         off = [f.cause for f in self.judgement.findings if f.kind is FindingKind.PREDICTION]
         why = f"; as {off[0]}" if off and not self.missed else ""
-        note = "late: second half of the run; off prediction: from the error that the gains leave"
+        note = "late: in the second half; off prediction: from the error that the gains alone leave"
         head = ["tracking error", "unit", "start", "largest", "late rms", "off prediction"]
         table = Table([*head, "tolerated"], rows, left=2).lines()
         return [*table, fill(f"{note}{why}", WIDTH, subsequent_indent="  ")] if rows else []
 
+    @property
+    def _limited(self) -> list[SignalRange]:
+        """Forces of constraints, controls, and forces of joints behind their actuation."""
+        found = [r for r in self.judgement.ranges if r.kind in _FORCES]
+        return sorted(found, key=lambda r: _FORCES.index(r.kind))
+
     def _forces(self) -> list[str]:
         sizes, rows = record_sizes(self.record), []
-        for r in (r for r in self.judgement.ranges if r.kind in _FORCES):
+        for r in self._limited:
             size = sizes.get(r.signal.unit, 0.0)
             texts = [_number(value, size, 4) for value in (r.least, r.largest)]
             limit = "none" if r.high == np.inf else f"{r.high:.4g}"

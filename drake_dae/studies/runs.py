@@ -155,7 +155,10 @@ class Runner:
         except Exception as error:  # A sweep of thousands of runs goes on.
             return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
         ranges = ranges_of(_limits(loop), record)
-        figures, exceeded = figures_of(record, ranges), tuple(r.signal.name for r in ranges if r.excess)
+        figures, exceeded = (
+            figures_of(record, ranges),
+            tuple(r.signal.name for r in ranges if r.excess),
+        )
         if failure is not None:
             return RunResult(Outcome.FAILED, str(failure), figures, exceeded)
         return RunResult(Outcome.FINISHED, "", {**figures, "steps": float(steps)}, exceeded)

@@ -4,7 +4,7 @@ import casadi as ca
 from pydrake.systems.framework import BasicVector_, LeafSystem, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
+from drake_dae.blocks.computations import HELD, Block, Computation, Update
 from drake_dae.trace.functions import TracedFunction
 
 

@@ -26,6 +26,7 @@ LOOKS = {
     "simulation": ("runs and records", "#6a5bc0"),
     "compiler": ("diagrams as functions, one for each rate", "#5560c0"),
     "systems": ("Drake LeafSystems", "#4f62b8"),
+    "blocks": ("what all blocks share", "#4f70b8"),
     "robots": ("section 3: robots as DaeSystems", "#2b84b5"),
     "symbolic": ("from pydrake.symbolic", "#2a9d8f"),
     "analysis": ("what the theory says", "#4d9a4a"),

@@ -25,7 +25,9 @@ FLOORS = (
     ("arguments",),
     ("trace",),
     ("dae",),
+    ("references",),
     ("analysis", "symbolic", "robots"),
+    ("blocks",),
     ("systems",),
     ("compiler",),
     ("simulation",),
@@ -42,7 +44,7 @@ FLOORS = (
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 # The mathematics can be read, tested and used without Drake.
-WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "analysis")
+WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references", "analysis")
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
@@ -54,7 +56,6 @@ PAPER = (
     "states",
     "structure",
     "normal_form",
-    "references",
     "tracking",
     "linearization",
     "beyond",

@@ -6,13 +6,14 @@ on the choice of xi in (22).
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, show, vector
-from drake_dae.dae import references
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
@@ -29,6 +30,17 @@ from drake_dae.dae.zero_dynamics.stability import (
     without_dynamics,
 )
 from drake_dae.errors import InconsistentStateError, ModelError
+
+
+class Exogenous(Protocol):
+    """A `Reference` of an exogenous signal."""
+
+    @property
+    def size(self) -> int:
+        """The number of its signals."""
+
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
+        """Returns the function of the time with the signals and their derivatives."""
 
 
 @checked(ModelError)
@@ -88,7 +100,7 @@ class ZeroDynamics:
         times: ArrayLike,
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
-        exogenous: Sequence[references.Reference] = (),
+        exogenous: Sequence[Exogenous] = (),
     ) -> PinnedMotion:
         """Computes the motion on Z(R(t)) from a state close to the guess, until it ends.
 
@@ -259,7 +271,7 @@ class ZeroDynamics:
         motion: PinnedMotion,
         period: float,
         parameters: ArrayLike | None = None,
-        exogenous: Sequence[references.Reference] = (),
+        exogenous: Sequence[Exogenous] = (),
     ) -> StabilityAlong:
         """Judges by Floquet multipliers whether Assumption 2.2 holds along a periodic reference.
 
@@ -294,7 +306,7 @@ class ZeroDynamics:
         return motions.judge(motion)
 
     def _moving(
-        self, parameters: FloatArray, exogenous: Sequence[references.Reference]
+        self, parameters: FloatArray, exogenous: Sequence[Exogenous]
     ) -> Callable[[float], FloatArray]:
         """Returns the function t -> values of all parameters."""
         if not exogenous:
@@ -310,12 +322,16 @@ class ZeroDynamics:
             raise ModelError(
                 f"{system.name}: exogenous covers {size} signals, the system has {len(degrees)}"
             )
-        signals = references.stack_references(exogenous, degrees)
+        ends = np.cumsum([0, *(reference.size for reference in exogenous)])
+        signals = [
+            reference.derivatives(degrees[first:last])
+            for reference, (first, last) in zip(exogenous, pairwise(ends), strict=True)
+        ]
         places = system.exogenous.places(degrees)
 
         def at(time: float) -> FloatArray:
             values = parameters.copy()
-            values[places] = signals(time)
+            values[places] = np.concatenate([signal(time) for signal in signals])
             return values
 
         return at

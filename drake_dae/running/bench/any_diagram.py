@@ -16,6 +16,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.computations import Traced
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
@@ -28,7 +29,6 @@ from drake_dae.running.bench.controls import (
     sliders_of_plant,
 )
 from drake_dae.running.bench.inputs import Inputs
-from drake_dae.systems.blocks.traced import Traced
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
 

@@ -12,6 +12,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
+from drake_dae.blocks.computations import Traced
 from drake_dae.compiler.wires import leaf_inputs
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
@@ -23,7 +24,6 @@ from drake_dae.running.export.steps.integrated import write_integrated
 from drake_dae.running.export.steps.parts import LOOP
 from drake_dae.running.export.steps.words import identifiers
 from drake_dae.running.export.wasm.wasm import write_module
-from drake_dae.systems.blocks.traced import Traced
 
 WEB = Path(__file__).with_name("web")
 

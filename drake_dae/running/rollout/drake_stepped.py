@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.failures import cannot_go_on
 from drake_dae.compiler.called import BufferedFunction
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.drake_steps import DrakeSteps
@@ -14,7 +15,6 @@ from drake_dae.errors import SimulationError
 from drake_dae.running.rollout.run import LOOKED, Run, RunEnding, RunProblem, Settings
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions
 from drake_dae.running.rollout.stepping.machine import Library
-from drake_dae.systems.blocks.failures import cannot_go_on
 
 
 def run_stepped(

@@ -5,11 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
-from drake_dae.running.rollout.program import RolloutProgram
-from drake_dae.running.rollout.run import Run, RunEnding, RunProblem
-from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.failures import (
+from drake_dae.blocks.computations import HELD, PARAMETERS, STATE, TIME, Block
+from drake_dae.blocks.failures import (
     cannot_go_on,
     endless_steps,
     no_step_leads_on,
@@ -17,8 +14,11 @@ from drake_dae.systems.blocks.failures import (
     simulation_error,
     spoilt_step,
 )
-from drake_dae.systems.blocks.traced import HELD, PARAMETERS, STATE, TIME, Block
-from drake_dae.systems.blocks.trials import PACE_STEPS
+from drake_dae.blocks.trials import PACE_STEPS
+from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
+from drake_dae.running.rollout.program import RolloutProgram
+from drake_dae.running.rollout.run import Run, RunEnding, RunProblem
+from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.plants.contract import Plant
 
 STATES = (STATE, "estimated_state")

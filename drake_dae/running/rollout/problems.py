@@ -12,13 +12,13 @@ from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers
+from drake_dae.blocks.computations import Block
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout.events import Events, Seed, events_of, noise_of
 from drake_dae.running.rollout.program import RolloutProgram, program_of
 from drake_dae.running.rollout.run import RunProblem
-from drake_dae.systems.blocks.traced import Block
 
 
 @checked(ModelError)

@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references.by_name import references_by_name
-from drake_dae.dae.references.reference import stack_references
 from drake_dae.dae.structure.structure import Structure
+from drake_dae.references.by_name import references_by_name
+from drake_dae.references.reference import stack_references
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.plants import CompliantContact
 from drake_dae.scenario.scenario import Scenario

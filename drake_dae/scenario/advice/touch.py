@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import Reference
+from drake_dae.references import Reference
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.task.fade import fade

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import Reference
-from drake_dae.dae.references.by_name import meant
 from drake_dae.errors import ReferenceSignalError, ScenarioError
+from drake_dae.references import Reference
+from drake_dae.references.by_name import denoted
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.links.links import Links
 from drake_dae.scenario.completion.completion import Completed, complete, rounded, start_note
@@ -101,7 +101,7 @@ def _with_references(
     named = set[int]()
     for part in ",".join(references).split(","):
         with suppress(ReferenceSignalError):  # A force, or an output that is not yet chosen.
-            named |= {*meant(part.strip(), outputs, [2] * len(outputs))}
+            named |= {*denoted(part.strip(), outputs, [2] * len(outputs))}
     rest = {name: float(values[i]) for i, name in enumerate(outputs) if i not in named}
     return replace(scenario, task=None, references={**references, **rest})
 

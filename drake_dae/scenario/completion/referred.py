@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.references import Reference
-from drake_dae.dae.references.by_name import meant
 from drake_dae.errors import ReferenceSignalError, ScenarioError
+from drake_dae.references import Reference
+from drake_dae.references.by_name import denoted
 from drake_dae.scenario.completion.candidates import Candidates
 from drake_dae.scenario.scenario import Scenario
 
@@ -78,7 +78,7 @@ class ReferredRows:
         outputs = [*signals[: self.given], *self._forces]
         degrees = [2] * self.given + [0] * len(self._forces)
         try:
-            places = meant(name, outputs, degrees)
+            places = denoted(name, outputs, degrees)
         except ReferenceSignalError as error:
             if not self.missing:
                 raise ScenarioError((key, str(error))) from None
@@ -89,7 +89,7 @@ class ReferredRows:
         others = [*along, *(signal for signal in signals[self.given :] if signal not in along)]
         of_point = [signal for signal in along if signal.rpartition(".")[0] == name]
         try:
-            chosen = of_point or [others[k] for k in meant(name, others, [2] * len(others))]
+            chosen = of_point or [others[k] for k in denoted(name, others, [2] * len(others))]
         except ReferenceSignalError:
             text = unknown_name("output", name, [*outputs, *others])
             raise ScenarioError((key, text)) from None

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from drake_dae.dae.references import CircleReference, SinusoidReference
+from drake_dae.references import CircleReference, SinusoidReference
 from drake_dae.robots.surfaces.surface import Surface, Vector
 from drake_dae.robots.surfaces.surfaces import Cylinder, Plane, Sphere
 from drake_dae.scenario.new.places import TipPlace

@@ -8,7 +8,7 @@ import pydantic
 from casadi import SX
 from numpy.typing import ArrayLike
 
-from drake_dae.dae import references
+from drake_dae import references
 from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
 from drake_dae.robots import constraints as contact
 from drake_dae.robots.constraints import friction

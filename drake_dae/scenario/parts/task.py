@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
+from drake_dae.references import Reference
 from drake_dae.scenario.forms.forms import Choice
 from drake_dae.scenario.parts.parts import Coefficients, Matrices, Poles
 from drake_dae.systems.task.phases import Phase

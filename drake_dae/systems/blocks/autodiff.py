@@ -18,9 +18,9 @@ from pydrake.systems.framework import (
     LeafSystem_,
 )
 
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.formulas import Formula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 
 
 class AutoDiffSystem(LeafSystem_[AutoDiffXd]):

@@ -21,15 +21,15 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arrays import FloatArray, listed, numbers, vector
+from drake_dae.blocks.failures import simulation_error
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.blocks.trials import StepWatch
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.systems.blocks.autodiff import AutoDiffSystem
-from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.systems.blocks.formulas import Formula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.systems.blocks.trials import StepWatch
 from drake_dae.trace.functions import TracedFunction
 
 NO_TIME_DERIVATIVE = "it samples, and a sample has no derivative by the time"

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.failures import simulation_error
 from drake_dae.dae.system.signals import Signal
-from drake_dae.systems.blocks.failures import simulation_error
 from drake_dae.trace.functions import TracedFunction
 
 STATES = ("state", "estimated_state")

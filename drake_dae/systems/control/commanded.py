@@ -7,10 +7,10 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, Context, ContinuousState, DependencyTicket
 
 from drake_dae.arguments import checked
-from drake_dae.dae.references import Reference
+from drake_dae.blocks.computations import DERIVATIVE, PARAMETERS, STATE, TIME, Block, Computation
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ReferenceSignalError
-from drake_dae.systems.blocks.traced import DERIVATIVE, PARAMETERS, STATE, TIME, Block, Computation
+from drake_dae.references import Reference
 from drake_dae.systems.control.references import ReferenceGenerator, traced_references
 from drake_dae.trace.functions import TracedFunction
 

@@ -15,15 +15,15 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
+from drake_dae.blocks.computations import Block
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
+from drake_dae.blocks.trials import state_tickets
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.blocks.traced import Block
-from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.control.non_minimum_phase import warn_of_zero_dynamics
 from drake_dae.systems.control.traced_law import traced_law

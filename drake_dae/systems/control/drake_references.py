@@ -9,9 +9,9 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.references import Reference
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references import Reference
 
 
 @checked(ReferenceSignalError)

@@ -7,9 +7,9 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.computations import Block, Computation
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value
-from drake_dae.systems.blocks.traced import Block, Computation
 
 
 @checked(ModelError)

@@ -10,16 +10,16 @@ from pydrake.systems.framework import BasicVector, Context, DependencyTicket
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
-from drake_dae.dae.references import Reference, ReferenceRows, stack_references
-from drake_dae.dae.references.reference import not_finite, with_degrees
+from drake_dae.blocks.computations import PARAMETERS, TIME, Block, Computation
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError, ReferenceSignalError
+from drake_dae.references import Reference, ReferenceRows, stack_references
+from drake_dae.references.reference import not_finite, with_degrees
 from drake_dae.systems.blocks.along import signal_along
 from drake_dae.systems.blocks.block import DifferentiableSystem
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import PARAMETERS, TIME, Block, Computation
 from drake_dae.trace.functions import TracedFunction
 
 

@@ -9,9 +9,9 @@ from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSys
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number
+from drake_dae.blocks.computations import HELD, Block, Computation, Update
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.errors import ModelError, NonFiniteError, WiringError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import HELD, Block, Computation, Update
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""

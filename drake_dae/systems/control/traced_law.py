@@ -8,9 +8,7 @@ import numpy as np
 from pydrake.systems.framework import System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     DERIVATIVE,
     HELD,
     PARAMETERS,
@@ -20,6 +18,8 @@ from drake_dae.systems.blocks.traced import (
     Update,
     zero,
 )
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.tracking.tracking import TrackingLaw
 
 
 def traced_law(

@@ -11,11 +11,11 @@ from pydrake.systems.framework import Context, EventStatus, State, ValueProducer
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
+from drake_dae.blocks.computations import HELD, PARAMETERS, TIME, Block, Computation
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.blocks.traced import HELD, PARAMETERS, TIME, Block, Computation
 from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.observing.observing_system import ObservingSystem

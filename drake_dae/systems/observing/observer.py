@@ -8,11 +8,11 @@ from pydrake.systems.framework import Context, EventStatus, State
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.computations import HELD, PARAMETERS, Block, Computation
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.blocks.traced import HELD, PARAMETERS, Block, Computation
 from drake_dae.systems.observing.observer_functions import ObserverFunctions
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.observing.observing_system import ObservingSystem

@@ -7,12 +7,12 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, DependencyTicket
 
 from drake_dae.arrays import FloatArray, numbers, positive
+from drake_dae.blocks.computations import PARAMETERS, Block, Computation, Update, zero
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.blocks.block import NO_TIME_DERIVATIVE, ParameterizedSystem
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value
-from drake_dae.systems.blocks.traced import PARAMETERS, Block, Computation, Update, zero
 from drake_dae.systems.observing.observed import Observed
 from drake_dae.systems.observing.observer_rates import Observing
 

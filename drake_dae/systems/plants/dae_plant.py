@@ -15,6 +15,16 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.blocks.computations import Block
+from drake_dae.blocks.failures import (
+    assembled_otherwise,
+    jammed_contact,
+    off_manifold,
+    off_start,
+    singular_configuration,
+)
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
+from drake_dae.blocks.trials import state_tickets
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.shared_forces import manifold_of_left_out
 from drake_dae.dae.structure.singular import dependent_constraints
@@ -22,17 +32,7 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError, SingularityError
 from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.failures import (
-    assembled_otherwise,
-    jammed_contact,
-    off_manifold,
-    off_start,
-    singular_configuration,
-)
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.blocks.traced import Block
-from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.traced_plant import traced_plant
 from drake_dae.trace.functions import TracedFunction

@@ -6,13 +6,13 @@ from dataclasses import replace
 import casadi as ca
 
 from drake_dae.arguments import checked
+from drake_dae.blocks.computations import PARAMETERS, STATE, Block, Computation
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import PARAMETERS, STATE, Block, Computation
 from drake_dae.systems.plants.dae_plant import DaePlant
 from drake_dae.systems.plants.robot_ports import RobotPorts
 from drake_dae.trace.functions import TracedFunction

@@ -6,11 +6,11 @@ import casadi as ca
 from pydrake.systems.framework import Context, DependencyTicket, LeafSystem
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.lifetime import port_value
+from drake_dae.blocks.trials import state_tickets
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.lifetime import port_value
-from drake_dae.systems.blocks.trials import state_tickets
 from drake_dae.trace.functions import TracedFunction
 
 

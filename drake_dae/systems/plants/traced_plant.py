@@ -5,10 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import casadi as ca
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     DERIVATIVE,
     PARAMETERS,
     STATE,
@@ -16,6 +13,9 @@ from drake_dae.systems.blocks.traced import (
     Computation,
     Projection,
 )
+from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae.system.signals import Signal
 from drake_dae.systems.plants.contract import Plant
 
 

@@ -9,9 +9,9 @@ from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSys
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number, numbers, positive
+from drake_dae.blocks.computations import HELD, TIME, Block, Computation, Update
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import HELD, TIME, Block, Computation, Update
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""

@@ -7,11 +7,7 @@ from pydrake.systems.framework import BasicVector, Context, ContinuousState
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
-from drake_dae.errors import ModelError, NonFiniteError
-from drake_dae.systems.blocks.block import DifferentiableSystem
-from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     DERIVATIVE,
     HELD,
     PARAMETERS,
@@ -21,7 +17,11 @@ from drake_dae.systems.blocks.traced import (
     Computation,
     Update,
 )
-from drake_dae.systems.blocks.trials import StepWatch, state_tickets
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
+from drake_dae.blocks.trials import StepWatch, state_tickets
+from drake_dae.errors import ModelError, NonFiniteError
+from drake_dae.systems.blocks.block import DifferentiableSystem
+from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.trace.functions import TracedFunction
 
 

@@ -7,10 +7,10 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.references import ConstantReference, Reference, stack_references
-from drake_dae.dae.references.by_name import assigned, in_order
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
+from drake_dae.references import ConstantReference, Reference, stack_references
+from drake_dae.references.by_name import assign, in_order
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.task.contacts.open_contact import (
     CONTACT,
@@ -247,7 +247,7 @@ def _goals(
     assignments, degrees = [], law.degrees
     for name, reference in phase.goals(names[contact.main]).items():
         try:
-            assignments.append(assigned(name, reference, names, degrees))
+            assignments.append(assign(name, reference, names, degrees))
         except ReferenceSignalError as error:
             raise ModelError(f"{task.plan.where(index)}: reference '{name}': {error}") from error
     named = tuple(i for assignment in assignments for i in assignment.places)
@@ -255,10 +255,10 @@ def _goals(
         for place in contact.others:
             if place not in named:
                 reference = ConstantReference(0.0) if closed else assignment.reference
-                assignments.append(assigned(names[place], reference, names, degrees))
+                assignments.append(assign(names[place], reference, names, degrees))
                 named += (place,)
     rest = [name for i, name in enumerate(names) if i not in named]
-    assignments += [assigned(name, ConstantReference(0.0), names, degrees) for name in rest]
+    assignments += [assign(name, ConstantReference(0.0), names, degrees) for name in rest]
     try:
         references = tuple(in_order(assignments, names))
         return PhaseReferences(stack_references(references, degrees), named, references)

@@ -13,11 +13,11 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.computations import Block, Guard, Update, zero
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import SimulationError
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, Guard, Update, zero
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.task.contacts.open_contact import FREE, LAWS, ContactLaws
 from drake_dae.systems.task.contacts.outputs import TaskOutputs

@@ -7,14 +7,14 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     HELD,
     MARGINS,
     PARAMETERS,
     TIME,
     Computation,
 )
+from drake_dae.errors import ModelError
 from drake_dae.systems.control.contract import SIGNAL
 from drake_dae.systems.control.references import traced_references
 from drake_dae.systems.task.contacts.force_filter import ForceFilter

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     HELD,
     PARAMETERS,
     TIME,

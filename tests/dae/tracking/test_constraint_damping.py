@@ -29,8 +29,8 @@ from drake_dae import (
     poles,
     simulate,
 )
-from drake_dae.dae.references import stack_references
 from drake_dae.errors import AdviceWarning, GainError, ModelError, ScenarioError
+from drake_dae.references import stack_references
 from drake_dae.scenario.shipped import find_scenario
 
 STIFFNESS, MASS = 1e4, 2.0

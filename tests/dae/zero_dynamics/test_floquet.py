@@ -12,18 +12,18 @@ from scipy.optimize import fsolve
 
 from drake_dae import analyze
 from drake_dae.analysis.findings import Finding
-from drake_dae.dae.references import (
-    CircleReference,
-    ConstantReference,
-    ExpressionReference,
-    SinusoidReference,
-)
-from drake_dae.dae.references.reference import common_period
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.floquet import StabilityAlong
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError
+from drake_dae.references import (
+    CircleReference,
+    ConstantReference,
+    ExpressionReference,
+    SinusoidReference,
+)
+from drake_dae.references.reference import common_period
 
 Array = np.ndarray
 

@@ -36,7 +36,6 @@ from drake_dae import (
     simulate,
     start_values,
 )
-from drake_dae.dae.references import stack_references
 from drake_dae.dae.system.contacts import (
     MOST,
     Contacts,
@@ -47,6 +46,7 @@ from drake_dae.dae.system.contacts import (
 )
 from drake_dae.dae.system.signals import Parameter, Signal
 from drake_dae.errors import ModelError, PainleveError
+from drake_dae.references import stack_references
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction

@@ -24,7 +24,6 @@ from drake_dae import (
     simulate,
     start_values,
 )
-from drake_dae.dae.references.pieces import UNROLLED
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import (
     InconsistentStateError,
@@ -32,6 +31,7 @@ from drake_dae.errors import (
     ModelError,
     SimulationError,
 )
+from drake_dae.references.polynomials import UNROLLED
 from drake_dae.running.rollout.program import program_of
 from drake_dae.running.rollout.rollout import run_loop
 from drake_dae.scenario.rolled import roll_scenario

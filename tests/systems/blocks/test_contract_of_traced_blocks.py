@@ -31,12 +31,12 @@ from drake_dae import (
     poles,
     with_disturbance,
 )
+from drake_dae.blocks.computations import DERIVATIVE, HELD, Traced
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
-from drake_dae.systems.blocks.switch import LawSwitch
-from drake_dae.systems.blocks.traced import DERIVATIVE, HELD, Traced
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.control.switch import LawSwitch
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 

@@ -20,9 +20,9 @@ from drake_dae import (
     Release,
     Retreat,
 )
+from drake_dae.blocks.computations import HELD as NUMBERS
+from drake_dae.blocks.computations import PARAMETERS, TIME, Computation
 from drake_dae.errors import SimulationError
-from drake_dae.systems.blocks.traced import HELD as NUMBERS
-from drake_dae.systems.blocks.traced import PARAMETERS, TIME, Computation
 
 TOUCH, PRESS = Approach(SPEED, over=OVER, name="touch"), Press(10.0, over=0.05)
 GENTLE = Condition("force", above=8.0)

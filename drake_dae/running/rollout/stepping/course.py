@@ -8,10 +8,10 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.trials import LEAST_PROGRESS, PACE_STEPS
 from drake_dae.errors import InconsistentStateError
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem, Tableau
 from drake_dae.running.rollout.stepping.functions import DiagramFunctions
-from drake_dae.systems.blocks.trials import LEAST_PROGRESS, PACE_STEPS
 
 DOP = Tableau(DOP853.A, DOP853.B, DOP853.C)
 

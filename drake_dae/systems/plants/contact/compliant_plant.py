@@ -15,15 +15,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError
-from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.failures import simulation_error
-from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.systems.blocks.traced import (
+from drake_dae.blocks.computations import (
     DERIVATIVE,
     HELD,
     PARAMETERS,
@@ -32,7 +24,15 @@ from drake_dae.systems.blocks.traced import (
     Computation,
     Update,
 )
-from drake_dae.systems.blocks.trials import state_tickets
+from drake_dae.blocks.failures import simulation_error
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
+from drake_dae.blocks.trials import state_tickets
+from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.model import RobotModel
+from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.systems.blocks.formulas import Formula, TracedFormula
 from drake_dae.systems.plants.contact.compliance import CompliantEquations
 from drake_dae.systems.plants.contact.contact_checks import changed_parameters
 from drake_dae.systems.plants.contact.contact_forces import contact_force_signals

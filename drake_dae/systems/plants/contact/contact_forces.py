@@ -10,11 +10,11 @@ from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.constraint_wrenches import contact_normals
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, port_value
 
 
 class ContactForces(LeafSystem):

@@ -12,10 +12,10 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief, number, positive
-from drake_dae.dae.references import ExpressionReference
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.errors import ModelError
+from drake_dae.references import ExpressionReference
 from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
 
 
 @checked(ModelError)

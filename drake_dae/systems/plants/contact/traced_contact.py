@@ -6,8 +6,8 @@ import casadi as ca
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.computations import HELD, Block, Computation, DrakeStepped
 from drake_dae.robots.constraint_wrenches import contact_normals
-from drake_dae.systems.blocks.traced import HELD, Block, Computation, DrakeStepped
 from drake_dae.systems.plants.contact.contact_forces import ContactForces
 from drake_dae.systems.plants.contract import Plant
 

@@ -8,8 +8,8 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
-from drake_dae.dae.references import LineReference, PathLimits, Reference
 from drake_dae.errors import ModelError
+from drake_dae.references import LineReference, PathLimits, Reference
 from drake_dae.systems.task.phases.phase import Moment, Phase
 
 _SPEED = 0.05

@@ -10,8 +10,8 @@ from typing import ClassVar, Literal
 import casadi as ca
 
 from drake_dae.arrays import positive
-from drake_dae.dae.references import Reference
 from drake_dae.errors import ModelError
+from drake_dae.references import Reference
 from drake_dae.systems.task.phases.condition import Condition
 
 Outcome = Literal["success", "guard", "late", "lost"]

@@ -12,10 +12,10 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, number_in, positive, unknown_name
-from drake_dae.dae.references.paths import check_order
-from drake_dae.dae.references.splines import MOST_POINTS, SplineReference, TimeSpline, rounded_up
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.files import read_text
+from drake_dae.references.reference import check_order
+from drake_dae.references.splines import MOST_POINTS, SplineReference, TimeSpline, rounded_up
 
 MOST = 1e15
 """Larger numbers are refused: a double has no useful digits left."""
@@ -65,13 +65,13 @@ class CsvReference(SplineReference):
         if self.smoothing is not None:
             positive("smoothing", self.smoothing, ReferenceSignalError)
         positive("tolerance", self.tolerance, ReferenceSignalError)
-        check_order(self.order)
+        check_order(self.order, 2, 12)
 
     @property
     def size(self) -> int:
         return len(self.columns)
 
-    def beside(self, folder: Path) -> Self:
+    def in_folder(self, folder: Path) -> Self:
         return replace(self, file=os.path.abspath(folder / self.file))
 
     @cached_property
@@ -86,10 +86,12 @@ class CsvReference(SplineReference):
             spline = self._smoothed(self.smoothing)
         else:
             spline = self._smoothed(max(float(np.median(np.diff(times))), times[-1] / MOST_POINTS))
-            while self._excess(spline) > 1.0 and 2 * len(spline.points) < MOST_POINTS:
+            while (
+                np.any(self._off(spline) > self._allowed) and 2 * len(spline.points) < MOST_POINTS
+            ):
                 spline = self._smoothed(spline.step / 2)
-        if self._excess(spline) > 1.0:
-            off = self._off(spline)
+        off = self._off(spline)
+        if np.any(off > self._allowed):
             worst = int(np.argmax(off / self._allowed))
             raise ReferenceSignalError(
                 f"'{self.file}': smoothed over {spline.step:.3g} s the reference is off its rows "
@@ -101,7 +103,7 @@ class CsvReference(SplineReference):
         return spline
 
     def _smoothed(self, step: float) -> TimeSpline:
-        """Returns the spline with a spacing of its points in s."""
+        """Returns the spline whose points are `step` seconds apart."""
         times = self.table[:, 0]
         count = float(np.ceil(times[-1] / step - 1e-9)) + 1
         if count > MOST_POINTS + 1:
@@ -131,80 +133,51 @@ class CsvReference(SplineReference):
         )
 
     def _off(self, spline: TimeSpline) -> FloatArray:
-        """The largest deviation of a spline from the rows, shape (size,)."""
-        fitted = spline.pieces([0] * self.size).at_all(self.start_time + self.table[:, 0])
+        """The largest deviation of a spline from each column, shape (size,)."""
+        fitted = spline.pieces([0] * self.size).at(self.start_time + self.table[:, 0])
         return np.abs(fitted - self.table[:, 1:]).max(axis=0)
-
-    def _excess(self, spline: TimeSpline) -> float:
-        """The largest ratio of deviation to tolerance."""
-        return float(np.max(self._off(spline) / self._allowed))
 
     @cached_property
     def _allowed(self) -> FloatArray:
-        """The allowed deviation of each column, shape (size,)."""
+        """The allowed deviation of each column; of a constant one, round-off. Shape (size,)."""
         values = self.table[:, 1:]
-        # Round-off for a constant column.
         least = 1e-12 * np.abs(values).max(axis=0) + np.finfo(float).tiny
         return np.maximum(self.tolerance * np.ptp(values, axis=0), least)
 
 
 def _read(file: Path, names: Sequence[str]) -> FloatArray:
     """Reads columns of a file, the first one increasing from 0, shape (k, len(names))."""
-    header, cells = read_cells(file)
-    for name in names:
-        if name not in header:
-            raise ReferenceSignalError(f"'{file}': {unknown_name('column', name, header)}")
-    values = numbers_of(file, header, cells, names)
-    steps = np.diff(values[:, 0])
-    if not np.all(steps > 0):
-        row = int(np.argmin(steps > 0))
-        raise ReferenceSignalError(
-            f"'{file}': {names[0]} must increase, row {row + 3} has {values[row + 1, 0]:g} "
-            f"after {values[row, 0]:g}"
-        )
-    values[:, 0] -= values[0, 0]
-    return values
-
-
-def read_cells(file: Path) -> tuple[list[str], list[list[str]]]:
-    """Reads the names of the columns of a file, and its other rows that are not empty.
-
-    Raises:
-        ReferenceSignalError: It cannot be read.
-    """
     try:
         lines = read_text(file).splitlines()
         delimiter = max(",;\t", key=lines[0].count if lines else len)
-        cells = [row for row in csv.reader(lines, delimiter=delimiter) if any(row)]
+        header, *rows = [row for row in csv.reader(lines, delimiter=delimiter) if any(row)] or [[]]
     except (OSError, ValueError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
         raise ReferenceSignalError(f"cannot read '{file}': {reason}") from error
-    return [name.strip() for name in cells[0]] if cells else [], cells[1:]
-
-
-def numbers_of(
-    file: Path, header: Sequence[str], cells: Sequence[Sequence[str]], names: Sequence[str]
-) -> FloatArray:
-    """Converts columns to numbers, shape (k, len(names)) with k >= 2.
-
-    Raises:
-        ReferenceSignalError: A cell is no number, or there are too few rows.
-    """
-    places = [header.index(name) for name in names]
-    values = np.empty((len(cells), len(names)))
-    for index, row in enumerate(cells):
-        for column, index_in_row in enumerate(places):
-            cell = row[index_in_row] if index_in_row < len(row) else ""
-            values[index, column] = _number(cell, f"'{file}', row {index + 2}, {names[column]}")
+    header = [name.strip() for name in header]
+    for name in names:
+        if name not in header:
+            raise ReferenceSignalError(f"'{file}': {unknown_name('column', name, header)}")
+    values = np.empty((len(rows), len(names)))
+    for i, row in enumerate(rows):
+        for j, name in enumerate(names):
+            place = header.index(name)
+            cell = row[place] if place < len(row) else ""
+            value = number_in(cell)
+            if value is None or abs(value) > MOST:
+                expected = "a number" if value is None else f"a number of at most {MOST:g}"
+                raise ReferenceSignalError(
+                    f"'{file}', row {i + 2}, {name}: expected {expected}, got '{cell[:40]}'"
+                )
+            values[i, j] = value
     if len(values) < 2:
         raise ReferenceSignalError(f"'{file}' has {len(values)} rows of numbers, 2 are needed")
+    steps = np.diff(values[:, 0])
+    if not np.all(steps > 0):
+        i = int(np.argmin(steps > 0))
+        raise ReferenceSignalError(
+            f"'{file}': {names[0]} must increase, row {i + 3} has {values[i + 1, 0]:g} "
+            f"after {values[i, 0]:g}"
+        )
+    values[:, 0] -= values[0, 0]
     return values
-
-
-def _number(cell: str, where: str) -> float:
-    """Converts a cell of the table to a finite number."""
-    value = number_in(cell)
-    if value is None or abs(value) > MOST:
-        expected = "a number" if value is None else f"a number of at most {MOST:g}"
-        raise ReferenceSignalError(f"{where}: expected {expected}, got '{cell[:40]}'")
-    return value

@@ -13,13 +13,14 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import vector
-from drake_dae.dae.references.reference import (
+from drake_dae.errors import ReferenceSignalError
+from drake_dae.references.reference import (
     FormulaReference,
     Reference,
     check_continuity,
+    check_order,
     common_period,
 )
-from drake_dae.errors import ReferenceSignalError
 from drake_dae.trace.given import result_of
 
 
@@ -38,7 +39,7 @@ class ConstantReference(FormulaReference):
     values: ArrayLike
 
     def __post_init__(self) -> None:
-        settle(self, "values")
+        as_columns(self, "values")
 
     @property
     def size(self) -> int:
@@ -75,7 +76,7 @@ class SinusoidReference(FormulaReference):
     size = 1
 
     def __post_init__(self) -> None:
-        settle(self, "amplitudes", "frequencies", "phases")
+        as_columns(self, "amplitudes", "frequencies", "phases")
 
     @property
     def repeats(self) -> float | None:
@@ -112,13 +113,12 @@ class PointToPointReference(FormulaReference):
     order: int = 2
 
     def __post_init__(self) -> None:
-        settle(self, "start", "end")
+        as_columns(self, "start", "end")
+        check_order(self.order, 0, 30)
         if not self.end_time > self.start_time:
             raise ReferenceSignalError(
                 f"end_time {self.end_time} must be after start_time {self.start_time}"
             )
-        if not 0 <= self.order <= 30:
-            raise ReferenceSignalError(f"order must be from 0 to 30, got {self.order}")
 
     @property
     def size(self) -> int:
@@ -134,7 +134,7 @@ class PointToPointReference(FormulaReference):
         first, last = np.asarray(self.start), np.asarray(self.end)
         return ca.vertcat(*[a + (b - a) * blend for a, b in zip(first, last, strict=True)])
 
-    def _check(self, degrees: Sequence[int]) -> None:
+    def check_smoothness(self, degrees: Sequence[int]) -> None:
         check_continuity(self, self.order, degrees)
 
 
@@ -200,31 +200,19 @@ class ExpressionReference(FormulaReference):
             ) from error
 
 
-def settle(reference: Reference, *names: str) -> None:
-    """Converts fields to tuples of the same length; a single number is repeated.
-
-    Raises:
-        ReferenceSignalError: They are not finite numbers, are empty, or have different lengths.
-    """
-    listed = ", ".join(names)
-    values = {name: getattr(reference, name) for name in names}
-    try:
-        arrays = {name: np.asarray(value, dtype=float) for name, value in values.items()}
-    except (TypeError, ValueError):
-        shown = next(iter(values.values())) if len(values) == 1 else values
-        raise ReferenceSignalError(f"{listed}: must be numbers, got {shown!r}") from None
+def as_columns(reference: Reference, *names: str) -> None:
+    """Converts fields to tuples of the same length; a single number is repeated."""
+    arrays = {name: np.asarray(getattr(reference, name), dtype=float) for name in names}
     for name, array in arrays.items():
-        if not array.size:
-            raise ReferenceSignalError(f"{name}: empty, at least one number is needed")
-        if array.ndim > 1 or not np.isfinite(array).all():
+        if array.ndim > 1 or not array.size:
             raise ReferenceSignalError(
-                f"{name} must be finite numbers, shape (k,), got {values[name]!r}"
+                f"{name} must be one number or more, shape (k,), got {getattr(reference, name)!r}"
             )
     lengths = {name: array.size for name, array in arrays.items() if array.ndim}
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ReferenceSignalError(
-            f"{listed} need the same number of entries, or one number for all: {counts}"
+            f"{', '.join(names)} need as many entries, or one number for all: {counts}"
         )
     length = next(iter(lengths.values()), 1)
     for name, array in arrays.items():

@@ -1,18 +1,16 @@
 """References: desired values over time with all derivatives that a law needs."""
 
-from drake_dae.dae.references.by_name import ReferenceRows, references_by_name
-from drake_dae.dae.references.csv_file import CsvReference
-from drake_dae.dae.references.formulas import (
+from drake_dae.references.by_name import ReferenceRows, references_by_name
+from drake_dae.references.csv_file import CsvReference
+from drake_dae.references.formulas import (
     ConstantReference,
     ExpressionReference,
     PointToPointReference,
     SinusoidReference,
 )
-from drake_dae.dae.references.paths import CircleReference, LineReference, SpiralReference
-from drake_dae.dae.references.reference import Reference, stack_references
-from drake_dae.dae.references.splines import PolylineReference
-from drake_dae.dae.references.travel import PathLimits
-from drake_dae.dae.references.waypoints import WaypointsReference
+from drake_dae.references.paths import CircleReference, LineReference, PathLimits, SpiralReference
+from drake_dae.references.reference import Reference, stack_references
+from drake_dae.references.splines import PolylineReference, WaypointsReference
 
 __all__ = [
     "CircleReference",

@@ -2,20 +2,116 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from math import copysign, tau
+from math import comb, copysign, factorial, inf, sqrt, tau
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import positive, vector
-from drake_dae.dae.references.formulas import settle
-from drake_dae.dae.references.reference import FormulaReference, check_continuity
-from drake_dae.dae.references.travel import PathLimits, Travel, rest_to_rest
+from drake_dae.arrays import FloatArray, positive, vector
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references.formulas import as_columns
+from drake_dae.references.reference import FormulaReference, check_continuity, check_order
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True)
+class PathLimits:
+    """The largest speed, acceleration and jerk along a path: Euclidean norms over its outputs.
+
+    They limit the whole motion, so that a curve is slower than a line. The outputs must have one
+    unit.
+
+    Attributes:
+        speed: The largest |r'|, in the outputs' unit per s.
+        acceleration: The largest |r''|, in the outputs' unit per s^2.
+        jerk: The largest |r'''|, in the outputs' unit per s^3; None for no limit.
+
+    Raises:
+        ReferenceSignalError: A limit is not positive.
+    """
+
+    speed: float
+    acceleration: float
+    jerk: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "acceleration", "jerk"):
+            if getattr(self, name) is not None:
+                positive(name, getattr(self, name), ReferenceSignalError)
+
+    @property
+    def values(self) -> tuple[float, float, float]:
+        """Speed, acceleration and jerk, infinite without a limit."""
+        return self.speed, self.acceleration, inf if self.jerk is None else self.jerk
+
+
+@dataclass(frozen=True)
+class Travel:
+    """The distance along a path over time, from rest at 0 to rest at `length`.
+
+    The speed rises during `ramp` seconds, is constant, and falls in the same way:
+
+        s'(t) = speed S(t / ramp),   S(x) = x^order sum_k binom(order - 1 + k, k) (1 - x)^k,
+
+    where S, with k < order, is the polynomial from 0 to 1 whose first order - 1 derivatives vanish
+    at both ends. So s has `order` continuous derivatives; order 2 is a double S with bounded jerk.
+    """
+
+    length: float
+    speed: float
+    ramp: float
+    order: int
+
+    @property
+    def duration(self) -> float:
+        return self.length / self.speed + self.ramp
+
+    def derivatives(self, time: ca.SX, degree: int) -> list[ca.SX]:
+        """Returns s, s', ..., s^(degree) at a time in s since the start, degree <= order."""
+        # The second half is the first one reversed: s^(k) has the sign (-1)^(k - 1) there.
+        is_first = time < self.duration / 2
+        passed = ca.fmax(ca.fmin(time, self.duration - time), 0)
+        x = ca.fmin(passed / self.ramp, 1)
+        # S by the Bernstein polynomials of degree 2 order - 1, without cancellation.
+        steps = np.repeat([0.0, 1.0], self.order)
+        integral = np.concatenate([[0.0], np.cumsum(steps) / steps.size])
+        gone = self.speed * (self.ramp * _bernstein(integral, x) + ca.fmax(passed - self.ramp, 0))
+        values = [ca.if_else(is_first, gone, self.length - gone)]
+        for k in range(degree):
+            value = self.speed / self.ramp**k * _bernstein(steps, x)
+            values.append(value if k % 2 == 0 else ca.if_else(is_first, value, -value))
+            steps = (steps.size - 1) * np.diff(steps)
+        return values
+
+    @staticmethod
+    def shortest(length: float, limits: PathLimits, order: int) -> "Travel":
+        """Returns the shortest travel along a straight line within limits.
+
+        With the peaks c1 and c2 of S' and S'' the ramp takes max(c1 v / a, sqrt(c2 v / j)), and the
+        speed v is the largest with which both ramps fit into the length.
+        """
+        speed, acceleration, jerk = limits.values
+        m = order - 1
+        scale = factorial(2 * m + 1) / factorial(m) ** 2  # S' = scale (x (1 - x))^m
+        first = scale / 4**m
+        second = scale * m * ((m - 1) / (4 * m - 2)) ** (m - 1) / sqrt(2 * m - 1)
+        fastest = min(
+            speed, sqrt(length * acceleration / first), (length**2 * jerk / second) ** (1 / 3)
+        )
+        ramp = max(first * fastest / acceleration, sqrt(second * fastest / jerk))
+        return Travel(length, fastest, ramp, order)
+
+
+def _bernstein(coefficients: FloatArray, x: ca.SX) -> ca.SX:
+    """sum_j c_j binom(n, j) x^j (1 - x)^(n - j)."""
+    n = coefficients.size - 1
+    return ca.SX(0) + sum(
+        float(c) * comb(n, j) * x**j * (1 - x) ** (n - j) for j, c in enumerate(coefficients) if c
+    )
 
 
 class PathReference(FormulaReference):
@@ -23,9 +119,7 @@ class PathReference(FormulaReference):
 
     s is a `Travel` with `order` continuous derivatives, as many as the law needs. If the
     curve makes acceleration or jerk too large, the whole motion is slowed until both are within
-    limits.
-
-    A member has p(s) with |dp/ds| <= 1, for 0 <= s <= `length`.
+    limits. A member has p(s) with |dp/ds| <= 1, for 0 <= s <= `length`.
     """
 
     limits: PathLimits | None
@@ -43,14 +137,10 @@ class PathReference(FormulaReference):
 
     @cached_property
     def travel(self) -> Travel:
-        """The distance along the path over time after the start.
-
-        Raises:
-            ReferenceSignalError: The reference has no limits, since it never rests.
-        """
+        """The distance along the path over time after the start."""
         if self.limits is None:
             raise ReferenceSignalError("this reference is periodic and has no limits")
-        travel = rest_to_rest(self.length, self.limits, self.order)
+        travel = Travel.shortest(self.length, self.limits, self.order)
         time = ca.SX.sym("t")
         _, *derivatives = self._derivatives(travel.derivatives(time, 3))
         peaks = ca.Function("peaks", [time], [ca.norm_2(derivative) for derivative in derivatives])
@@ -62,14 +152,16 @@ class PathReference(FormulaReference):
         largest = [float(np.max(values.full())) for values in peaks(ca.DM(moments).T)]
         excess = [peak / limit for peak, limit in zip(largest, self.limits.values, strict=True)]
         slower = max(excess[0], excess[1] ** (1 / 2), excess[2] ** (1 / 3))
-        # The error between the samples is below 0.1 %.
-        return travel if slower <= 1.0 + 1e-9 else travel.slower(1.001 * slower)
+        if slower <= 1.0 + 1e-9:
+            return travel
+        slower *= 1.001  # The error between the samples is below 0.1 %.
+        return replace(travel, speed=travel.speed / slower, ramp=travel.ramp * slower)
 
     def rows(self, time: ca.SX) -> ca.SX:
         return self.point(self.travel.derivatives(time - self.start_time, 0)[0])
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
-        self._check(degrees)
+        check_continuity(self, self.order, degrees)
         along = self.travel.derivatives(time - self.start_time, max(degrees))
         values = self._derivatives(along)
         return ca.vertcat(*[values[k][i] for i, mu in enumerate(degrees) for k in range(mu + 1)])
@@ -81,20 +173,6 @@ class PathReference(FormulaReference):
         for _ in along[1:]:
             values.append(ca.jtimes(values[-1], s, ca.vertcat(s[1:], 0)))
         return [ca.substitute(value, s, ca.vertcat(*along)) for value in values]
-
-    def _check(self, degrees: Sequence[int]) -> None:
-        if self.limits is not None:
-            check_continuity(self, self.order, degrees)
-
-
-def check_order(order: int, most: int = 12) -> None:
-    """Checks the number of continuous derivatives of a path.
-
-    Raises:
-        ReferenceSignalError: It is not from 2 to `most`.
-    """
-    if not 2 <= order <= most:
-        raise ReferenceSignalError(f"order must be from 2 to {most}, got {order}")
 
 
 @checked(ReferenceSignalError)
@@ -120,8 +198,8 @@ class LineReference(PathReference):
     order: int = 4
 
     def __post_init__(self) -> None:
-        settle(self, "start", "end")
-        check_order(self.order)
+        as_columns(self, "start", "end")
+        check_order(self.order, 2, 12)
         if not self.length:
             raise ReferenceSignalError(f"start and end must differ, both are {self.start!r}")
 
@@ -173,9 +251,9 @@ class CircleReference(PathReference):
     size = 2
 
     def __post_init__(self) -> None:
-        _settle_center(self)
+        _check_center(self)
         positive("radius", self.radius, ReferenceSignalError)
-        check_order(self.order)
+        check_order(self.order, 2, 12)
         if (self.period is None) == (self.limits is None):
             raise ReferenceSignalError(
                 "a circle takes either a period, for periodic motion, or limits, for motion from "
@@ -247,9 +325,9 @@ class SpiralReference(PathReference):
     size = 2
 
     def __post_init__(self) -> None:
-        _settle_center(self)
+        _check_center(self)
         positive("pitch", self.pitch, ReferenceSignalError)
-        check_order(self.order)
+        check_order(self.order, 2, 12)
         if min(self.start_radius, self.end_radius) < 0 or self.start_radius == self.end_radius:
             raise ReferenceSignalError(
                 "start_radius and end_radius must differ and not be negative, got "
@@ -272,6 +350,6 @@ class SpiralReference(PathReference):
         return ca.DM(self.center) + b * a * ca.vertcat(ca.cos(angle), ca.sin(angle))
 
 
-def _settle_center(reference: CircleReference | SpiralReference) -> None:
+def _check_center(reference: CircleReference | SpiralReference) -> None:
     center = vector("center", reference.center, 2, ReferenceSignalError)
     object.__setattr__(reference, "center", tuple(center.tolist()))

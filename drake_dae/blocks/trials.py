@@ -27,9 +27,9 @@ from pydrake.systems.framework import (
 )
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.failures import endless_steps, no_step_leads_on, spoilt_step
+from drake_dae.blocks.lifetime import weakly
 from drake_dae.errors import SimulationError
-from drake_dae.systems.blocks.failures import endless_steps, no_step_leads_on, spoilt_step
-from drake_dae.systems.blocks.lifetime import weakly
 
 FAILURES = 1000
 """The number of failed trials in a row that ends a run. Ten shorter steps reduce a step of 0.1 s to

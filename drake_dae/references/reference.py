@@ -21,6 +21,8 @@ from drake_dae.trace.smoothness import find_flaw
 class Reference(ABC):
     """Desired values r(t) of one or several outputs, with their time derivatives.
 
+    A member has `size`, and `expression` or, if it is none, `derivatives`.
+
     1. `size`, at least 1, is the number of its outputs. It never changes.
     2. `derivatives` takes one degree mu_i >= 0 per output, and returns a function of the time in s
        with the values r_1, r_1', ..., r_1^(mu_1), r_2, ...: output-major, shape
@@ -29,14 +31,14 @@ class Reference(ABC):
        output are continuous.
     4. A value depends only on time, not on the other degrees or on other calls, and is an array of
        its own.
-    5. `derivatives` refuses an output that is not smooth enough for its degree, with the row and a
-       remedy. The function refuses a time without a value.
-    6. A reference that is an expression of time returns it in `expression`, so that all references
-       are traced as one function. The values are the same.
+    5. `derivatives` and `expression` refuse an output that is not smooth enough for its degree,
+       with the row and a remedy. The function refuses a time without a value.
+    6. `expression` has the same values at a symbolic time, so that all references are traced as
+       one function; None if there is no such expression.
     7. Numbers that a study changes in a context are `parameters`, and `with_parameters` is the same
        reference with other values, or with symbols. Most references have none.
-    8. A reference with a file reads it when it is used. `beside` makes its path absolute. `remark`
-       describes approximations of the file's data.
+    8. A reference with a file reads it when it is used. `in_folder` makes its path absolute.
+       `remark` describes approximations of the file's data.
     """
 
     parameters: Mapping[str, Any] = MappingProxyType({})
@@ -47,16 +49,20 @@ class Reference(ABC):
     def size(self) -> int:
         """The number of its outputs."""
 
-    @abstractmethod
     def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
         """Returns the function t -> (r_1, r_1', ..., r_1^(mu_1), r_2, ...), with t in s.
 
         Args:
-            degrees: The degree mu of each covered output.
+            degrees: The degree mu of each output.
 
         Raises:
             ReferenceSignalError: The reference is not smooth enough for these degrees.
         """
+        time = ca.SX.sym("t")
+        rows = self.expression(degrees, time)
+        assert rows is not None, f"{type(self).__name__} has neither expression nor derivatives"
+        value = function_of_time(time, rows)
+        return lambda time: value(time).copy()
 
     def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX | None:
         """Returns the values at a symbolic time, shape (sum (mu_i + 1), 1), or None.
@@ -70,7 +76,7 @@ class Reference(ABC):
         """Returns the same reference with other values of its parameters, or columns of symbols."""
         return self
 
-    def beside(self, folder: Path) -> Self:
+    def in_folder(self, folder: Path) -> Self:
         """Returns the same reference with its file relative to a folder."""
         return self
 
@@ -86,14 +92,23 @@ class Reference(ABC):
 
 
 class FormulaReference(Reference):
-    """A reference that is a CasADi expression of time; differentiated exactly."""
+    """A reference r(t) that CasADi differentiates."""
 
     @abstractmethod
     def rows(self, time: ca.SX) -> ca.SX:
         """Returns r(t), shape (size, 1)."""
 
-    def _check(self, degrees: Sequence[int]) -> None:
-        """Checks that the reference has derivatives up to the degrees."""
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        self.check_smoothness(degrees)
+        values = []
+        for row, degree in zip(ca.vertsplit(self.rows(time)), degrees, strict=True):
+            values.append(row)
+            for _ in range(degree):
+                values.append(ca.jacobian(values[-1], time))
+        return ca.vertcat(*values)
+
+    def check_smoothness(self, degrees: Sequence[int]) -> None:
+        """Raises ReferenceSignalError if a row has no derivatives up to its degree."""
         time = ca.SX.sym("t")
         rows = self.rows(time)
         others = [symbol for symbol in ca.symvar(rows) if not ca.is_equal(symbol, time)]
@@ -105,27 +120,24 @@ class FormulaReference(Reference):
                     "derivatives of it; a move from rest to rest is a PointToPointReference"
                 )
 
-    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
-        self._check(degrees)
-        values = []
-        for row, degree in zip(ca.vertsplit(self.rows(time)), degrees, strict=True):
-            values.append(row)
-            for _ in range(degree):
-                values.append(ca.jacobian(values[-1], time))
-        return ca.vertcat(*values)
 
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        time = ca.SX.sym("t")
-        value = at_time(time, self.expression(degrees, time))
-        return lambda time: value(time).copy()
+def check_order(order: int, least: int, most: int) -> None:
+    """Raises ReferenceSignalError if `order` is out of range."""
+    if not least <= order <= most:
+        raise ReferenceSignalError(f"order must be from {least} to {most}, got {order}")
+
+
+def check_continuity(reference: Reference, order: int, degrees: Sequence[int]) -> None:
+    """Raises ReferenceSignalError if a degree exceeds the number of continuous derivatives."""
+    if max(degrees) > order:
+        raise ReferenceSignalError(
+            f"this {type(reference).__name__} has {order} continuous derivatives, the law "
+            f"needs {max(degrees)}: pass order={max(degrees)} or more"
+        )
 
 
 def common_period(periods: Sequence[float | None]) -> float | None:
-    """Returns the period of signals together; 0 if all are constant, None without one.
-
-    Args:
-        periods: The period of each in s, as of `Reference.repeats`.
-    """
+    """Returns the period in s of signals together; 0 if all are constant, None without one."""
     moving = np.array([period for period in periods if period], dtype=float)
     if None in periods or not moving.size:
         return None if None in periods else 0.0
@@ -136,28 +148,10 @@ def common_period(periods: Sequence[float | None]) -> float | None:
     return None
 
 
-def check_continuity(reference: Reference, order: int, degrees: Sequence[int]) -> None:
-    """Checks that degrees do not exceed the number of continuous derivatives.
-
-    Raises:
-        ReferenceSignalError: A degree is above `order`.
-    """
-    if max(degrees) > order:
-        raise ReferenceSignalError(
-            f"this {type(reference).__name__} has {order} continuous derivatives, the law "
-            f"needs {max(degrees)}: pass order={max(degrees)} or more"
-        )
-
-
 def with_degrees(
     references: Sequence[Reference], degrees: Sequence[int]
 ) -> list[tuple[Reference, Sequence[int]]]:
-    """Returns each reference with the degrees of its outputs.
-
-    Args:
-        references: The references, in the order of the outputs.
-        degrees: The degrees mu_1, ..., mu_p of all outputs.
-    """
+    """Returns each reference with the degrees of its outputs."""
     ends = np.cumsum([0, *[reference.size for reference in references]])
     return list(zip(references, [degrees[a:b] for a, b in pairwise(ends)], strict=True))
 
@@ -178,7 +172,7 @@ def stack_references(
     time = ca.SX.sym("t")
     rows = [reference.expression(part, time) for reference, part in parts]
     if all(row is not None for row in rows):
-        return at_time(time, ca.vertcat(*rows))
+        return function_of_time(time, ca.vertcat(*rows))
     functions = [reference.derivatives(part) for reference, part in parts]
 
     def evaluate(time: float) -> FloatArray:
@@ -190,11 +184,8 @@ def stack_references(
     return evaluate
 
 
-def at_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
-    """Compiles an expression of time to a function of a float.
-
-    The function reuses its result array: copy it to keep it.
-    """
+def function_of_time(time: ca.SX, rows: ca.SX) -> Callable[[float], FloatArray]:
+    """Returns an expression of time as a function, which reuses its array."""
     function = TracedFunction("reference", {"time": time}, {"R": rows})
 
     def evaluate(time: float) -> FloatArray:

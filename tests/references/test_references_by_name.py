@@ -12,8 +12,8 @@ from drake_dae import (
     TrajectoryReference,
     references_by_name,
 )
-from drake_dae.dae.references import stack_references
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references import stack_references
 
 OUTPUTS = ["tool.x", "tool.y", "tool.z", "tool.z_axis.x", "left::joint3", "pipe.angle"]
 OUTPUTS += ["pipe.along", "pipe.force", "grip.x", "grip.y"]

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import casadi as ca
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from drake_dae.systems.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.systems.blocks.traced import Block, Computation
+from drake_dae.blocks.computations import Block, Computation
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 
 
 class LawSwitch(LeafSystem):

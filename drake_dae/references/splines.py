@@ -1,0 +1,262 @@
+"""Motions through many points: splines in time, within limits."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from math import factorial
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, numbers, positive, vector
+from drake_dae.errors import ReferenceSignalError
+from drake_dae.references.paths import PathLimits
+from drake_dae.references.polynomials import PiecewisePolynomials, PiecewiseReference
+from drake_dae.references.reference import check_order
+
+MOST_POINTS = 20_000
+"""The largest number of points; more would take longer to prepare than to follow."""
+
+
+@dataclass(frozen=True, eq=False)
+class TimeSpline:
+    """r(t) = sum_k c_k N((t - start_time) / step - k), N the uniform B-spline of order + 1.
+
+    The points c_k have shape (n, k). Before, it rests at the first one and after, at the last;
+    `order` derivatives are continuous. They are averages of differences of neighbouring points,
+    and so bounded: |r^(j)| <= max |Delta^j c| / step^j.
+    """
+
+    points: FloatArray
+    step: float
+    start_time: float
+    order: int
+
+    @property
+    def duration(self) -> float:
+        return (len(self.points) + self.order - 1) * self.step
+
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
+        """Returns the polynomials of r_1, ..., r_1^(mu_1), r_2, ..., for degrees mu <= order."""
+        order, spans = self.order, len(self.points) + self.order - 1
+        difference = np.pad(self.points, ((order, order), (0, 0)), mode="edge")
+        factors = np.zeros((spans, sum(degrees) + len(degrees), order + 2))
+        places = [(i, j) for i, degree in enumerate(degrees) for j in range(degree + 1)]
+        for j in range(max(degrees) + 1):  # Delta^j c / step^j times B-splines of order + 1 - j.
+            windows = sliding_window_view(difference, order + 2 - j, axis=0)
+            values = windows @ basis_pieces(order + 1 - j).T
+            for row, place in enumerate(places):
+                if place[1] == j:
+                    factors[:, row, : order + 2 - j] = values[:, place[0]]
+            difference = np.diff(difference, axis=0) / self.step
+        breaks = self.start_time + self.step * np.arange(spans + 1, dtype=np.float64)
+        return PiecewisePolynomials(breaks, factors)
+
+
+def basis_pieces(degree: int) -> FloatArray:
+    """Returns the uniform B-splines on a span: entry (i, k) is the factor of x^i for point k."""
+    pieces = np.ones((1, 1))
+    for p in range(1, degree + 1):  # The recursion of Cox and de Boor.
+        higher = np.zeros((p + 1, p + 1))
+        for k in range(p + 1):
+            for constant, slope, source in ((p - k, 1, k - 1), (k + 1, -1, k)):
+                if 0 <= source < p:
+                    higher[:p, k] += constant / p * pieces[:, source]
+                    higher[1:, k] += slope / p * pieces[:, source]
+        pieces = higher
+    return pieces
+
+
+class SplineReference(PiecewiseReference):
+    """A reference that is a `TimeSpline`."""
+
+    @property
+    @abstractmethod
+    def spline(self) -> TimeSpline:
+        """The spline."""
+
+    @property
+    def size(self) -> int:
+        return int(self.spline.points.shape[1])
+
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
+        return self.spline.pieces(degrees)
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True)
+class PolylineReference(SplineReference):
+    """A path of straight edges between points, with rounded corners, from rest to rest.
+
+    It leaves an edge at the distance `corner` before its end, and joins the next one at the same
+    distance. It is a uniform B-spline over points on the edges, 2 corner / order apart: the speed
+    is constant on straight parts and lower at corners. It is the largest speed within all limits,
+    so that larger corners are faster.
+
+    Attributes:
+        points: The points, in the outputs' unit, shape (n, k).
+        limits: The largest speed, acceleration and jerk.
+        corner: The distance from a point at which the path leaves the edges, in the outputs' unit.
+        start_time: The start of the motion, in s.
+        order: The number of continuous derivatives, from 2 to 12; at least mu of the outputs.
+
+    Raises:
+        ReferenceSignalError: A number is not valid, there are fewer than two points, two in a row
+            are the same, or they are too many.
+    """
+
+    points: Sequence[Sequence[float]]
+    limits: PathLimits
+    corner: float
+    start_time: float = 0.0
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        corners = _check_points(self)
+        positive("corner", self.corner, ReferenceSignalError)
+        check_order(self.order, 2, 12)
+        length = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
+        least = length * self.order / 2 / MOST_POINTS
+        if self.corner < least:
+            raise ReferenceSignalError(
+                f"corner must be {rounded_up(least)} or more for a path of length {length:.3g}, "
+                f"got {self.corner:g}"
+            )
+
+    @cached_property
+    def spline(self) -> TimeSpline:
+        corners, order = np.array(self.points), self.order
+        spacing = 2 * self.corner / order
+        edges = [corners[:1]]
+        for first, last in pairwise(corners):
+            count = int(np.ceil(np.linalg.norm(last - first) / spacing - 1e-9))
+            edges.append(first + np.linspace(0.0, 1.0, count + 1)[1:, None] * (last - first))
+        points = np.concatenate(edges)
+        padded = np.pad(points, ((order, order), (0, 0)), mode="edge")
+        steps = [
+            (np.linalg.norm(np.diff(padded, j, axis=0), axis=1).max() / limit) ** (1 / j)
+            for j, limit in enumerate(self.limits.values, start=1)
+        ]
+        return TimeSpline(points, float(max(steps)), self.start_time, order)
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True)
+class WaypointsReference(PiecewiseReference):
+    """The smoothest curve through points at given times, from rest to rest.
+
+    It minimizes the integral of |r^(order + 1)|^2, the jerk with order 2 and the snap with order 3:
+    a spline of degree 2 order + 1. Between points it may overshoot, more so with uneven times; a
+    `PolylineReference` does not.
+
+    With limits the times are in proportion to the distances between the points, and as short as
+    the limits allow.
+
+    Attributes:
+        points: The points, in the outputs' unit, shape (n, k).
+        times: The time at each point, in s after `start_time`, shape (n,); None with limits.
+        limits: The largest speed, acceleration and jerk; None with times.
+        start_time: The start of the motion, in s.
+        order: The number of continuous derivatives, which vanish at both ends, from 2 to 6; at
+            least mu of the outputs.
+
+    Raises:
+        ReferenceSignalError: A number is not valid, there are fewer than two points, two in
+            succession are equal, times do not increase, or there are both times and limits, or
+            none.
+    """
+
+    points: Sequence[Sequence[float]]
+    times: ArrayLike | None = None
+    limits: PathLimits | None = None
+    start_time: float = 0.0
+    order: int = 4
+
+    def __post_init__(self) -> None:
+        points = _check_points(self)
+        check_order(self.order, 2, 6)
+        if (self.times is None) == (self.limits is None):
+            raise ReferenceSignalError(
+                "waypoints take either times, or limits from which these follow, got "
+                f"{'none' if self.times is None else 'both'}"
+            )
+        if self.times is not None:
+            times = vector("times", self.times, len(points), ReferenceSignalError)
+            if not np.all(np.diff(times) > 0) or times[0] < 0:
+                raise ReferenceSignalError(
+                    f"times must increase from 0 or later, got {self.times!r}"
+                )
+            object.__setattr__(self, "times", tuple(times.tolist()))
+
+    @property
+    def size(self) -> int:
+        return len(self.points[0])
+
+    @property
+    def duration(self) -> float:
+        """The time at the last point, in s after `start_time`."""
+        return float(self._moments[-1])
+
+    @cached_property
+    def _moments(self) -> FloatArray:
+        """The time at each point, after the start, shape (n,)."""
+        if self.limits is None:
+            return np.array(self.times)
+        edges = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
+        moments = np.concatenate([[0.0], np.cumsum(edges)]) / edges.mean()
+        samples = np.linspace(0.0, moments[-1], 200 * len(edges) + 1)
+        values = self._through(moments, [3] * self.size).at(samples)
+        peaks = np.linalg.norm(values.reshape(-1, self.size, 4)[:, :, 1:], axis=1).max(axis=0)
+        # The error between the samples is below 0.1 %.
+        powers = 1.0 / np.arange(1, 4)
+        return 1.001 * moments * max((peaks / self.limits.values) ** powers)
+
+    def pieces(self, degrees: Sequence[int]) -> PiecewisePolynomials:
+        return self._through(self.start_time + self._moments, degrees)
+
+    def _through(self, times: FloatArray, degrees: Sequence[int]) -> PiecewisePolynomials:
+        """The spline through the points at times, and its derivatives, as polynomials."""
+        from scipy.interpolate import make_interp_spline  # It takes long to load.
+
+        # In a time unit with spacing about 1: derivatives of all orders have similar sizes.
+        scale = (times[-1] - times[0]) / (len(times) - 1)
+        knots, degree = (times - times[0]) / scale, 2 * self.order + 1
+        rest = [(j, np.zeros(self.size)) for j in range(1, self.order + 1)]
+        spline = make_interp_spline(knots, np.array(self.points), degree, bc_type=(rest, rest))
+        widths = np.diff(knots)[:, None]
+        table = [spline(knots[:-1], nu=m) / factorial(m) for m in range(degree + 1)]
+        rows = []
+        for column, mu in enumerate(degrees):
+            for j in range(mu + 1):
+                row = np.zeros((len(widths), degree + 1))
+                for m in range(j, degree + 1):
+                    grown = factorial(m) / factorial(m - j) / scale**j
+                    row[:, m - j] = table[m][:, column] * widths[:, 0] ** (m - j) * grown
+                rows.append(row)
+        return PiecewisePolynomials(times, np.stack(rows, axis=1))
+
+
+def _check_points(reference: PolylineReference | WaypointsReference) -> FloatArray:
+    """Converts the field `points` to a tuple of rows, and returns it as an array, shape (n, k)."""
+    points = numbers("points", reference.points, ReferenceSignalError)
+    if points.ndim != 2 or len(points) < 2 or not points.size:
+        raise ReferenceSignalError(
+            f"points must be two or more, as a list of rows, got shape {points.shape}"
+        )
+    rows = tuple(map(tuple, points.tolist()))
+    object.__setattr__(reference, "points", rows)
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    if not lengths.all():
+        i = int(np.argmin(lengths))
+        raise ReferenceSignalError(f"points {i} and {i + 1} are the same, {rows[i]}")
+    return points
+
+
+def rounded_up(value: float) -> str:
+    """Formats a positive number with three digits, rounded up."""
+    text = f"{value:.3g}"
+    return text if float(text) >= value else f"{1.01 * value:.3g}"
