@@ -22,7 +22,7 @@ from .dae.normal_form.normal_form import NormalForm as NormalForm
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure
 from .dae.structure.constrained import find_constraint_structure as find_constraint_structure
 from .dae.structure.redundancy import drop_constraints as drop_constraints
-from .dae.structure.shared_forces import share_forces as share_forces
+from .dae.structure.redundancy import share_forces as share_forces
 from .dae.structure.structure import Structure as Structure
 from .dae.structure.structure import find_structure as find_structure
 from .dae.system.signals import Parameter as Parameter

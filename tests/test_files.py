@@ -334,7 +334,7 @@ def test_a_robot_that_includes_itself_is_refused(files, chain, tmp_path):
     [
         'constraints.0.name="\\ud800"',
         'description="half \\udfff of a letter"',
-        'plant_parameters={"\\udc80.mass": 1}',
+        'plant.parameters={"\\udc80.mass": 1}',
     ],
 )
 def test_a_name_that_no_file_can_hold_is_refused(setting):

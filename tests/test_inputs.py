@@ -205,8 +205,8 @@ def test_a_context_of_another_system_is_refused():
 
 
 def test_one_number_does_not_fill_a_position():
-    with pytest.raises(ScenarioError, match=r"plant_parameters: .*wall\.position' .*3"):
-        build_scenario(scenario("two_link_wall", "plant_parameters={wall.position: [0.5]}"))
+    with pytest.raises(ScenarioError, match=r"plant.parameters: .*wall\.position' .*3"):
+        build_scenario(scenario("two_link_wall", "plant.parameters={wall.position: [0.5]}"))
 
 
 @pytest.mark.parametrize("start", [np.nan, np.inf, 1e18])
@@ -218,9 +218,7 @@ def test_a_start_from_which_time_does_not_go_on_is_refused(start):
 
 
 def test_a_lag_that_is_none_ends_the_run_and_leaves_a_finite_record():
-    chosen = scenario(
-        "two_link_wall", "force_feedback=!MeasuredForce {time_constant: 1e-300}", "duration=0.1"
-    )
+    chosen = scenario("two_link_wall", "sensors.force={time_constant: 1e-300}", "duration=0.1")
     loop, context = build_scenario(chosen)
     with pytest.raises((NonFiniteError, DrakeDaeError)):
         simulate(loop.diagram, context, chosen.duration, fixed_step())

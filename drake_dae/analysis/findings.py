@@ -14,7 +14,7 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.floquet import StabilityAlong
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import Stability, Verdict
 
 

@@ -13,8 +13,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 
 SLACK, CLOSE = 1e-9, 1e-6
 """The share by which a limit may be passed, since a start may be on it; and the relative accuracy

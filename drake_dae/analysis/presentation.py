@@ -11,9 +11,9 @@ from drake_dae.analysis.findings import Finding, Findings
 from drake_dae.analysis.tables import Part, Table, count_of, named_values
 from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.structure.structure import why_no_law
-from drake_dae.dae.system.sharing import ForceSharing
 from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
+from drake_dae.dae.system.system import ForceSharing
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Stability, Verdict
 
 

@@ -271,9 +271,9 @@ def _add_sweep(commands: Any, scenario: CommandParser) -> None:
         "--vary",
         "KEY=VALUES",
         'what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
-        '"gains.all=[[-4], [-8]]" (these), "plant_parameters.link1.mass=9.5..10.5" with --random, '
-        '"plant_parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
-        '"force_feedback.seed=1..20:20"; may be repeated',
+        '"law.gains.all=[[-4], [-8]]" (these), "plant.parameters.link1.mass=9.5..10.5" with '
+        '--random, "plant.parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
+        '"sensors.force.seed=1..20:20"; may be repeated',
         required=True,
     )
     chosen = study.add_mutually_exclusive_group()

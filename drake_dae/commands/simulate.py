@@ -134,7 +134,7 @@ def _step(run: _CommandRun) -> RunStatistics:
         run.scenario.integrator,
         progress=True,
         look=run.writer.update if run.scenario.write.record else None,
-        may_diverge=run.scenario.may_diverge,
+        may_diverge=run.scenario.judgement.may_diverge,
     )
 
 

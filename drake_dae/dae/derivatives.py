@@ -21,7 +21,6 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system.agreement import agree
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.blocks import block_stages, saddle_point_solver
@@ -83,7 +82,7 @@ class Derivatives:
         balance, self._constraint_rate = self._first_order(constraint)
         self._balance = balance[self._rows] - ca.mtimes(h[self._rows, :], self.control)  # (1)
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
-        if agree(system, gradient, g_rows):
+        if system.agree(gradient, g_rows):
             gradient = g_rows
         self._matrix = ca.blockcat(
             mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
@@ -272,8 +271,8 @@ class Derivatives:
         if system.exogenous:  # `implicit` has the part of the state alone.
             shorter = ca.vertcat(shorter[: system.num_states], constraint_rate)
         longer = ca.vertcat(balance, constraint_rate)
-        if shorter.shape != longer.shape or not agree(
-            system, shorter, longer, self._symbols[1], self.control
+        if shorter.shape != longer.shape or not system.agree(
+            shorter, longer, self._symbols[1], self.control
         ):
             raise ModelError(
                 f"{system.name}: 'implicit' is not (E x' - f - g v, c') near the nominal state"
@@ -338,7 +337,7 @@ def _factors_of(system: DaeSystem, rows: list[int]) -> Factors:
         right = ca.SX.sym("right", len(rows))
         solutions = other.solve(right), triangle.solve(right)
         counts = [count_operations(solution) for solution in solutions]
-        if counts[0] < counts[1] and agree(system, *solutions, right):
+        if counts[0] < counts[1] and system.agree(*solutions, right):
             chosen = other
     _CHOSEN[factorize] = rows, mass, chosen
     return chosen

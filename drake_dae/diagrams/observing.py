@@ -67,8 +67,8 @@ def add_observer(
     if controller.HasOutputPort("contact_reference") and not controller.law.measured_force:
         raise WiringError(
             "the observer of a task needs the measured force, since the model's force is that of a "
-            "closed contact: make the law with measured_force=True (in a scenario: force_feedback: "
-            "!MeasuredForce {sample_period: ...})"
+            "closed contact: make the law with measured_force=True (in a scenario: sensors.force: "
+            "{sample_period: ...})"
         )
     late = 0.0 if sampling is None else sampling.delay + step
     lag, delay = control_lag(plant, sampling), late + period / 2.0

@@ -104,7 +104,7 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
     """
     if scenario.plant.material is not None:
         return scenario
-    for part, what in ((scenario.task, "a task"), (scenario.observer, "an observer")):
+    for part, what in ((scenario.task, "a task"), (scenario.estimator, "an estimator")):
         if part is not None:
             return (
                 f"none, since {what} does not know how a surface moves, and an ideal contact needs "
@@ -144,7 +144,8 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
         for body in bodies
         if plant.GetVisualGeometriesForBody(body) and not plant.IsAnchored(body)
     ]
-    return replace(scenario, known_forces=[*scenario.known_forces, *pushes])
+    robot = scenario.robot
+    return replace(scenario, robot=replace(robot, known_forces=[*robot.known_forces, *pushes]))
 
 
 _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {

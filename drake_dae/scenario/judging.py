@@ -24,7 +24,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
@@ -233,12 +233,9 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     # The law's model, without differences of the plant.
     ideal = replace(
         scenario,
-        plant=IdealConstraints(),
-        plant_payloads=[],
-        plant_disturbances=[],
-        encoders=None,
-        observer=None,
-        identified=[],
+        plant=IdealConstraints(parameters=scenario.plant.parameters),
+        sensors=replace(scenario.sensors, encoders=None),
+        estimator=None,
     )
     loop = build_loop(ideal, model, structure)
     context = start_scenario(ideal, loop)
@@ -260,8 +257,8 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
     motion = analysis.motion
     if motion is None or not motion.times.size:
         return Feasibility(analysis, scenario.duration, is_resolved=is_resolved, gains=gains)
-    with at("friction_cones"):
-        limits = robot_limits(model, scenario.friction_cones)
+    with at("judgement.friction_cones"):
+        limits = robot_limits(model, scenario.judgement.friction_cones)
     rows = zip(
         motion.states, motion.controls, _forces(model.dae, motion), motion.parameters, strict=True
     )
@@ -358,7 +355,7 @@ def judge_run(
         failure: Why it ended early; empty if it did not.
     """
     model, changes = loop.plant.robot("a scenario"), loop.changes(context)
-    limits = robot_limits(model, scenario.friction_cones)
+    limits = robot_limits(model, scenario.judgement.friction_cones)
     ranges, own = ranges_of(limits, record), loop.plant_parameters(record, context)
     behind = []
     for link in links_behind(model, record.time, record["state"], own):
@@ -383,7 +380,7 @@ def judge_run(
         record,
         loop.predicted_error(record),
         ranges,
-        tolerances=scenario.tolerances,
+        tolerances=scenario.judgement.tolerances,
         changes=changes,
         ended=ended,
         accuracy=accuracy,
@@ -463,13 +460,13 @@ def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
     rubs = material is not None and bool(material.friction) and any(of_plant_alone)
     reasons = {
         "the drives were saturated": "excess" in record and bool(record["excess"].any()),
-        "parameters of the plant differ from those of the law": bool(scenario.plant_parameters),
-        "the plant carries payloads that the law does not know": bool(scenario.plant_payloads),
-        "disturbances act on the plant, unknown to the law": bool(scenario.plant_disturbances),
+        "parameters of the plant differ from those of the law": bool(scenario.plant.parameters),
+        "the plant carries payloads that the law does not know": bool(scenario.plant.payloads),
+        "disturbances act on the plant, unknown to the law": bool(scenario.plant.disturbances),
         "the contact has friction that the law does not know": rubs,
         "the contact is compliant": not loop.plant.is_ideal,
-        "the force is measured by a sensor": scenario.force_feedback.is_measured,
-        "the state is measured by encoders": scenario.encoders is not None,
+        "the force is measured by a sensor": scenario.sensors.force is not None,
+        "the state is measured by encoders": scenario.sensors.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }
     return [reason for reason, holds in reasons.items() if holds]

@@ -24,6 +24,7 @@ from drake_dae.scenario.controllers.task_controller import task_controller
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.observed import latency_of, observed_structure
 from drake_dae.scenario.own_model import check_disturbances, own_model
+from drake_dae.scenario.parts.parts import Poles
 from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -42,7 +43,7 @@ def build_loop(
     """Builds the closed loop of a scenario's robot.
 
     Args:
-        scenario: A completed scenario with gains, from `advised`.
+        scenario: A completed scenario, from `advised`.
         model: The scenario's robot, by `scenario_model`.
         structure: The structure of the model's system.
         scene_graph: The scene graph of the robot's geometry; needed to draw it.
@@ -60,7 +61,7 @@ def build_loop(
     law = _law(scenario, observed, latency_of(scenario, model))
     references = [] if task is not None else _references(scenario.references, law)
     exogenous = []
-    if scenario.observer is None:
+    if scenario.estimator is None:
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
     limits = _limits(scenario, model)
 
@@ -75,14 +76,15 @@ def build_loop(
     plant = plant or make_plant(scenario, model, structure)
 
     # The parts between plant and law; errors get the key of the part.
-    with at("force_feedback"):
-        sensor = scenario.force_feedback.sensor(model.dae.num_constraints)
+    force = scenario.sensors.force
+    with at("sensors.force"):
+        sensor = None if force is None else force.sensor(model.dae.num_constraints)
     settings = LoopSettings(
         sensor=sensor,
-        encoders=scenario.encoders,
+        encoders=scenario.sensors.encoders,
         sampling=sampling,
         control_limits=limits,
-        observer=scenario.observer,
+        observer=scenario.estimator,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
         signals={} if task is None or commanded else task.signals,
@@ -90,9 +92,9 @@ def build_loop(
         start_time=scenario.integrator.start_time,
     )
     _check_parts(settings, plant)
-    with at("tolerances"):
-        outputs_named(scenario.tolerances, model.dae.output_signals)
-        for name, error in scenario.tolerances.items():
+    with at("judgement.tolerances"):
+        outputs_named(scenario.judgement.tolerances, model.dae.output_signals)
+        for name, error in scenario.judgement.tolerances.items():
             positive(name, error)
 
     # The connections.
@@ -102,8 +104,8 @@ def build_loop(
             return wire_loop(
                 plant, controller, None, settings, scene_graph=scene_graph, meshcat=meshcat
             )
-    keys = ["observer"] if scenario.observer is not None else []
-    keys += ["force_feedback"] if scenario.force_feedback.is_measured or keys else []
+    keys = ["estimator"] if scenario.estimator is not None else []
+    keys += ["sensors.force"] if force is not None or keys else []
     with at(" or ".join(keys) or "start.positions"):
         return make_closed_loop(
             plant, law, references, settings, scene_graph=scene_graph, meshcat=meshcat
@@ -125,13 +127,13 @@ def make_plant(
     Raises:
         ScenarioError: The robot cannot be simulated so; the message names the key.
     """
-    check_disturbances(scenario.plant_disturbances, model.links)
+    check_disturbances(scenario.plant.disturbances, model.links)
     robot = RobotToSimulate(
         model,
         structure,
-        partial(add_robot, scenario.robot, payloads=scenario.plant_payloads),
-        scenario.plant_parameters,
-        scenario.plant_disturbances,
+        partial(add_robot, scenario.robot, payloads=scenario.plant.payloads),
+        scenario.plant.parameters,
+        scenario.plant.disturbances,
     )
     try:
         return scenario.plant.plant(robot)
@@ -141,25 +143,25 @@ def make_plant(
 
 def _law(scenario: Scenario, structure: Structure, latency: float) -> TrackingLaw:
     """The law of a scenario for a system, with a latency in s."""
-    force, damping = scenario.force_feedback, scenario.constraint_damping
-    keys = ["force_feedback", "gains"] if force.is_measured else ["gains"]
-    keys += [key for key in ("constraint_damping", "integral") if getattr(scenario, key)]
-    if scenario.contact_stiffness is not None:
-        keys = ["contact_stiffness", *keys]
+    law, is_measured = scenario.law, scenario.sensors.force is not None
+    damping = law.constraint_damping
+    keys = ["sensors.force", "law.gains"] if is_measured else ["law.gains"]
+    keys += [f"law.{key}" for key in ("constraint_damping", "integral") if getattr(law, key)]
+    if law.contact_stiffness is not None:
+        keys = ["law.contact_stiffness", *keys]
         if scenario.task is not None:
             text = "is not for scenarios with `task`; leave it out"
-            raise ScenarioError(("contact_stiffness", text))
+            raise ScenarioError(("law.contact_stiffness", text))
     with at(" or ".join(keys)):
-        assert scenario.gains is not None  # advised.
         return TrackingLaw(
             structure.system,
-            scenario.gains.design(),
+            (law.gains or Poles(all=[-4.0])).design(),
             structure=structure,
-            measured_force=force.is_measured,
-            force_gain=force.gain,
+            measured_force=is_measured,
+            force_gain=law.force_gain,
             constraint_damping=None if damping is None else damping.design(),
-            integral=scenario.integral or (),
-            contact_stiffness=scenario.contact_stiffness,
+            integral=law.integral or (),
+            contact_stiffness=law.contact_stiffness,
             latency=latency,
         )
 
@@ -170,7 +172,7 @@ def _check_parts(settings: LoopSettings, plant: Plant) -> None:
         with at("sampling"):
             hold_before(plant, settings.sampling)
     if settings.encoders is not None:
-        with at("encoders"):
+        with at("sensors.encoders"):
             make_sensor(plant, settings.encoders, settings.period(plant.time_step))
 
 

@@ -112,9 +112,9 @@ def completed_model(
             built.stages,
             scenario.forces,
             tuple(scenario.exogenous),
-            built.known_forces,
+            scenario.robot.known_forces,
             scenario.compliances,
-            scenario.control_weights or None,
+            scenario.law.control_weights or None,
             scenario.compiled,
         )
     with at("parameters"):
@@ -132,7 +132,6 @@ class _BuiltRobot:
     links: MultibodyExpressions
     constraints: Sequence[Constraint]
     stages: Sequence[Stage]
-    known_forces: Sequence[Load]
     completed: Completed
 
 
@@ -158,16 +157,16 @@ def _build(
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
     _check_forces(scenario.forces, bound, links)
     _check_compliances(scenario.compliances or {}, bound)
-    known_forces = scenario.known_forces
-    each("known_forces", known_forces, lambda force: force.reaction(links.kinematics()))
-    with at("control_weights"):
-        choice = control_choice(name, scenario.control_weights or None, actuators)
+    known_forces = scenario.robot.known_forces
+    each("robot.known_forces", known_forces, lambda force: force.reaction(links.kinematics()))
+    with at("law.control_weights"):
+        choice = control_choice(name, scenario.law.control_weights or None, actuators)
     _check_exogenous(scenario.exogenous, links, [*constraints, *known_forces], stages, choice)
 
     # The completion.
     completing = complete if scenario.task is None else complete_task
     completed = completing(scenario, links, constraints, plant_constraints(links), guess)
-    return _BuiltRobot(name, links, constraints, stages, known_forces, completed)
+    return _BuiltRobot(name, links, constraints, stages, completed)
 
 
 def scenario_structure(model: RobotModel) -> Structure:

@@ -1,5 +1,6 @@
 """The system on which the law of a scenario is based."""
 
+from drake_dae.arrays import unknown_name
 from drake_dae.dae.beyond.disturbance import with_disturbance
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.errors import ModelError, ScenarioError
@@ -27,27 +28,22 @@ def observed_structure(scenario: Scenario, model: RobotModel, structure: Structu
     Raises:
         ScenarioError: The observer does not fit; the message names its key.
     """
-    observer = scenario.observer
-    if observer is None:
-        if scenario.identified:
-            text = "needs an observer; give `observer`, or leave `gains` out with Drake's contact"
-            raise ScenarioError(("identified", text))
+    estimator = scenario.estimator
+    if estimator is None:
         return structure
-    with at("observer"):
+    if estimator.rate is None:
+        text = "needed, since no gains are computed; leave `law.gains` out with Drake's contact"
+        raise ScenarioError(("estimator.rate", text))
+    with at("estimator"):
         if scenario.exogenous:
             raise ModelError("not beside exogenous signals, whose port it feeds")
-        frictional = {
-            c.name: c.friction_parameter for c in model.constraints if c.friction_parameter
-        }
-        for name in observer.identify_friction:
-            if name not in frictional:
-                raise ModelError(
-                    f"identify_friction: '{name}' is not a constraint with friction; give it "
-                    "friction: 0.0 if it is unknown. With friction: "
-                    f"{', '.join(frictional) or 'none'}"
-                )
+        known = [parameter.name for parameter in model.dae.parameters]
+        for name in estimator.identify:
+            if name not in known:
+                hint = "; give the constraint friction: 0.0 if it is unknown"
+                text = unknown_name("parameter", name, known)
+                raise ModelError(f"identify: {text}{hint * name.endswith('.friction')}")
         velocities = [signal.name for signal in model.links.velocity_signals]
-        frictions = [frictional[name] for name in observer.identify_friction]
-        with at("identified"):
-            observed = with_disturbance(model.dae, velocities, [*frictions, *scenario.identified])
+        with at("estimator.identify"):
+            observed = with_disturbance(model.dae, velocities, estimator.identify)
         return find_structure(observed)

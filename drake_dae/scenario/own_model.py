@@ -50,7 +50,7 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     Raises:
         ScenarioError: Something does not fit; the message names its key.
     """
-    payloads, disturbances = scenario.plant_payloads, scenario.plant_disturbances
+    payloads, disturbances = scenario.plant.payloads, scenario.plant.disturbances
     if scenario.plant.carries or not (payloads or disturbances):
         return None
     check_disturbances(disturbances, links)
@@ -64,7 +64,7 @@ def own_model(scenario: Scenario, links: Links) -> OwnModel | None:
     }
     of_plant = replace(
         scenario,
-        known_forces=[*scenario.known_forces, *known_forces],
+        robot=replace(scenario.robot, known_forces=[*scenario.robot.known_forces, *known_forces]),
         exogenous={**scenario.exogenous, **moving},
     )
     scene_graph = SceneGraph()
@@ -85,10 +85,10 @@ def begin_own_model(scenario: Scenario, plant: Plant, context: Context) -> None:
     if scenario.plant.carries:
         return
     numbers: list[tuple[str, str, ArrayLike]] = [
-        *(("plant_payloads", f"{p.name}.mass", p.mass) for p in scenario.plant_payloads),
+        *(("plant.payloads", f"{p.name}.mass", p.mass) for p in scenario.plant.payloads),
         *(
-            ("plant_disturbances", f"{_name(index)}.force", disturbance.force)
-            for index, disturbance in enumerate(scenario.plant_disturbances)
+            ("plant.disturbances", f"{_name(index)}.force", disturbance.force)
+            for index, disturbance in enumerate(scenario.plant.disturbances)
         ),
     ]
     values = plant.parameters(context)
@@ -111,4 +111,4 @@ def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -
         if disturbance.frame == "world":
             raise ModelError("a disturbance on the world moves nothing; name a frame of the robot")
 
-    each("plant_disturbances", disturbances, check)
+    each("plant.disturbances", disturbances, check)

@@ -2,9 +2,9 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import ClassVar, cast
+from typing import Annotated, ClassVar, cast
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
@@ -15,7 +15,11 @@ from drake_dae.arrays import brief
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
+from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.forms.values import Triple
+from drake_dae.scenario.robot_file.payloads import Payload
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
@@ -42,6 +46,7 @@ class RobotToSimulate:
     disturbances: Sequence[DisturbanceForce]
 
 
+@dataclass(frozen=True, kw_only=True)
 class ScenarioPlant(ABC):
     """The contract of the key `plant` of a scenario.
 
@@ -54,8 +59,19 @@ class ScenarioPlant(ABC):
     5. With `adjusts`, the parameters of the plant can be set in a context. `in_context` are the
        keys of numbers that `begin` sets in a context, even if the plant was made with other
        numbers.
+
+    Attributes:
+        parameters: Parameter name -> the plant's value, unknown to the law's model; one number for
+            all entries, or a list. A surface can be tilted if it has the key `rpy`.
+        payloads: Additional masses on the plant, unknown to the law's model.
+        disturbances: Disturbance forces on the plant, unknown to the law.
     """
 
+    parameters: dict[str, float | list[float]] = field(default_factory=dict)
+    payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
+    disturbances: list[Annotated[DisturbanceForce, Form({Vector: Triple})]] = field(
+        default_factory=list
+    )
     carries: ClassVar[bool] = False
     adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
@@ -118,10 +134,11 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
     def rolled(self) -> ScenarioPlant:
         if self.contact_model != "point":
             return self
-        return CompliantContact(**{f.name: getattr(self, f.name) for f in fields(PointMaterial)})
+        names = [f.name for f in (*fields(PointMaterial), *fields(ScenarioPlant))]
+        return CompliantContact(**{name: getattr(self, name) for name in names})
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        with at("plant or plant_parameters"):
+        with at("plant or plant.parameters"):
             return ContactPlant(
                 robot.model,
                 robot.add_robot,
@@ -154,7 +171,7 @@ class CompliantContact(PointMaterial, ScenarioPlant):
         cast(CompliantPlant, plant).set_contact(context, self)
 
     def plant(self, robot: RobotToSimulate) -> Plant:
-        with at("plant or plant_parameters"):  # Whose numbers are set in a context.
+        with at("plant or plant.parameters"):  # Whose numbers are set in a context.
             return CompliantPlant(robot.model, self, structure=robot.structure)
 
 

@@ -41,9 +41,10 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
         return scenario, ""
     name, before = type(plant).__name__, type(scenario.plant).__name__
     viscous = [c for c in scenario.constraints if getattr(c, "viscous_friction", None)]
-    parameters = {**scenario.plant_parameters, **_without_viscous(c.name for c in viscous)}
+    parameters = {**plant.parameters, **_without_viscous(c.name for c in viscous)}
+    plant = replace(plant, parameters=parameters)
     # One of the scenario's own plants, as the contract says.
-    return replace(scenario, plant=plant, plant_parameters=parameters), (  # type: ignore[arg-type]
+    return replace(scenario, plant=plant), (  # type: ignore[arg-type]
         f"the rollout runs !{name} in place of !{before}: the same equations of contact, traced. "
         "Drake's solver stops at a relative residual of 1e-6, and joints stop at their limits in "
         "Drake's plant alone"
@@ -128,10 +129,10 @@ def roll_scenario(
 def _seeds(scenario: Scenario) -> dict[str, int]:
     """The seed of each source of noise."""
     seeds = {}
-    if scenario.force_feedback.is_measured:
-        seeds["force_noise"] = scenario.force_feedback.seed
-    if scenario.encoders is not None:
-        seeds[ENCODER_NOISE] = encoder_seed(scenario.encoders.seed)
+    if scenario.sensors.force is not None:
+        seeds["force_noise"] = scenario.sensors.force.seed
+    if scenario.sensors.encoders is not None:
+        seeds[ENCODER_NOISE] = encoder_seed(scenario.sensors.encoders.seed)
     return seeds
 
 
@@ -145,7 +146,7 @@ class _RolloutWatch:
         look: Callable[[RecordAfter], bool] = lambda record: False,
     ) -> None:
         self._watch = DivergenceWatch(loop.plant, scenario.duration)
-        self._look, self._may_diverge = look, scenario.may_diverge
+        self._look, self._may_diverge = look, scenario.judgement.may_diverge
         self._time: float | None = None
         self._next = time.perf_counter() + PERIOD
         self._failure: SimulationError | None = None

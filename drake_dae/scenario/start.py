@@ -17,7 +17,7 @@ from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.model import index_of, start_guess
 from drake_dae.scenario.own_model import begin_own_model
-from drake_dae.scenario.parts.families import Gains
+from drake_dae.scenario.parts.parts import Gains
 from drake_dae.scenario.scenario import Scenario
 
 _SLACK = 1e-6
@@ -32,12 +32,12 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     """A context of a closed loop at a scenario's start.
 
     The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
-    references plus the errors, with outputs as in its model, where `plant_parameters` may differ,
+    references plus the errors, with outputs as in its model, where `plant.parameters` may differ,
     and on the plant's constraints; a task at start.positions, in contact if its first phase needs
     it.
 
     Args:
-        scenario: The scenario of the loop; start, plant_parameters, integrator, the numbers of
+        scenario: The scenario of the loop; start, plant.parameters, integrator, the numbers of
             uncoupled gains, and the seed of the sensor may be others than those it was built with.
         loop: What `build_completed` made.
 
@@ -65,23 +65,25 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
     plant, controller = loop.plant, loop.controller
     at_plant = plant.GetMyMutableContextFromRoot(context)
     if not scenario.plant.carries:
-        with at("plant_parameters"):
-            for name, numbers in scenario.plant_parameters.items():
+        with at("plant.parameters"):
+            for name, numbers in scenario.plant.parameters.items():
                 plant.set_parameter(at_plant, name, numbers)
     begin_own_model(scenario, plant, at_plant)
     with at("plant"):
         scenario.plant.begin(plant, at_plant)
-    if loop.sensor is not None:
-        with at("force_feedback"):
+    force, encoders = scenario.sensors.force, scenario.sensors.encoders
+    if loop.sensor is not None and force is not None:
+        with at("sensors.force"):
             at_sensor = loop.sensor.GetMyMutableContextFromRoot(context)
-            scenario.force_feedback.begin(loop.sensor, at_sensor)
-    if scenario.gains is not None and not controller.takes_over:  # Advised gains are in the law.
-        with at("gains"):
+            loop.sensor.set_errors(at_sensor, force.bias, force.noise_deviation, force.drift)
+    gains = scenario.law.gains
+    if gains is not None and not controller.takes_over:  # Advised gains are in the law.
+        with at("law.gains"):
             at_controller = controller.GetMyMutableContextFromRoot(context)
-            controller.set_gains(at_controller, _designed(scenario.gains, loop))
-    loop.set_seed(context, scenario.force_feedback.seed)
-    if loop.encoders is not None and scenario.encoders is not None:
-        loop.encoders.set_seed(context, scenario.encoders.seed)
+            controller.set_gains(at_controller, _designed(gains, loop))
+    loop.set_seed(context, 0 if force is None else force.seed)
+    if loop.encoders is not None and encoders is not None:
+        loop.encoders.set_seed(context, encoders.seed)
 
 
 def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:

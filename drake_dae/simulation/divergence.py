@@ -145,8 +145,8 @@ class DivergenceWatch:
             f"{abs(value) / size:.2g} times the {size:.3g}{unit} that it is large in use, and it "
             f"has grown since {growth.since[i]:.4g} s. The loop is unstable, or the robot cannot "
             "do what is asked: choose slower gains, a shorter period and delay of the law, or a "
-            "plant that is nearer to the law's model. With may_diverge the run goes on all the "
-            "same",
+            "plant that is nearer to the law's model. With judgement.may_diverge the run goes on "
+            "all the same",
             time,
             record["state"][row],
         )

@@ -66,7 +66,7 @@ def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> Signa
         normal = names.index(cone.normal)
         tangents = ca.norm_2(force[[names.index(name) for name in cone.tangents]])
         signal = Signal(f"the friction cone of {cone.normal}", dae.force_signals[normal].unit)
-        value = tangents - cone.friction * force[normal]
+        value = tangents - cone.limit * force[normal]
         add(LimitKind.CONE, [signal], value, np.array([-np.inf]), np.zeros(1))
     return SignalLimits(
         dae, signals, kinds, ca.vertcat(*values), np.hstack(bounds), (control, force)

@@ -27,7 +27,7 @@ from drake_dae.errors import (
 from drake_dae.running.rollout.program import program_of
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import varied_data
-from drake_dae.scenario.parts.parts import Coefficients, Poles
+from drake_dae.scenario.parts.parts import Matrices
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.scenario.start import start_scenario
@@ -77,8 +77,8 @@ class RunResult:
 
 
 _OF_A_RUN = re.compile(
-    r"description|duration|may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?|"
-    r"encoders\.seed|force_feedback\.(seed|bias|drift)"
+    r"description|duration|judgement\.may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?|"
+    r"sensors\.(encoders\.seed|force\.(seed|bias|drift))"
 )
 """Keys whose values are set in a context, for any scenario."""
 
@@ -101,22 +101,24 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
         in_context.add("plant.friction")
     patterns = [_OF_A_RUN, re.compile("|".join(map(re.escape, in_context)) or "$^")]
     if not plant.carries:
-        patterns.append(re.compile(r"plant_parameters(\..+)?"))
+        patterns.append(re.compile(r"plant\.parameters(\..+)?"))
         if plant.adjusts:
             patterns.append(
-                re.compile(r"plant_(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
+                re.compile(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
             )
-    if isinstance(base.gains, Poles | Coefficients) and not task:
-        patterns.append(re.compile(r"gains\..+"))
-        if np.any(np.asarray(getattr(base.force_feedback, "noise_deviation", 0.0))):
-            patterns.append(re.compile(r"force_feedback\.noise_deviation"))
+    couples = isinstance(base.law.gains, Matrices)
+    if not (couples or base.is_advised or task):
+        patterns.append(re.compile(r"law\.gains\..+"))
+        if np.any(base.sensors.force_noise):
+            patterns.append(re.compile(r"sensors\.force\.noise_deviation"))
     own = {
         key: value
         for key, value in variation.items()
         if not any(pattern.fullmatch(key) for pattern in patterns)
     }
     # Another kind of plant may set other values in a context.
-    return variation if any(re.match(r"plant(\.|$)", key) for key in own) else own
+    of_kind = re.compile(r"plant(\.(?!parameters|payloads|disturbances)|$)")
+    return variation if any(map(of_kind.match, own)) else own
 
 
 class Runner:
@@ -215,7 +217,7 @@ class Runner:
                 context,
                 scenario.duration,
                 scenario.integrator,
-                may_diverge=scenario.may_diverge,
+                may_diverge=scenario.judgement.may_diverge,
             )
             steps = run.steps
             if run.interrupted:

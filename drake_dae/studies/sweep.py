@@ -65,7 +65,7 @@ def sweep(
     twenty variations are checked before the first run, and up to three are built until one is
     valid.
 
-    Runs that differ only in start, duration, integrator, plant_parameters, seeds, or gains that
+    Runs that differ only in start, duration, integrator, plant.parameters, seeds, or gains that
     couple no outputs, share one closed loop in each process.
 
     Args:

@@ -36,11 +36,7 @@ def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]
 def saddle_point_solver(
     inertia: Factors, g: ca.SX, gradient: ca.SX
 ) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
-    """Returns a solver of [[E, -g], [c, 0]] (w, v) = -(balance, rate), from factors of E, g, c^T.
-
-    Returns:
-        The solver, A = c E^-1 g, and a scalar that is 0 exactly where A is singular.
-    """
+    """Returns a solver of [[E, -g], [c, 0]] (w, v) = -(balance, rate), by factors of E."""
     half = inertia.forward(g)
     coupling: Factorization | PositiveDefiniteFactorization
     if gradient is g:  # A = g^T E^-1 g, as J M^-1 J^T

@@ -30,9 +30,6 @@ def cache_folder() -> Path:
 
     Otherwise drake_dae in the user's folder for caches: $XDG_CACHE_HOME, or ~/Library/Caches on
     macOS and ~/.cache elsewhere.
-
-    Raises:
-        MachineCodeError: The user has no home.
     """
     if os.environ.get("DRAKE_DAE_CACHE"):
         return Path(os.environ["DRAKE_DAE_CACHE"]).absolute()
@@ -49,14 +46,7 @@ def cache_folder() -> Path:
 
 
 def open_cache(create: bool = False) -> Path | None:
-    """Returns the folder of the cache if it can be trusted; None if it does not exist.
-
-    Args:
-        create: Makes one where there is none, mode 0700.
-
-    Raises:
-        MachineCodeError: It belongs to another user, or others can write it; or it cannot be made.
-    """
+    """Returns the folder of the cache if it can be trusted; None if it does not exist."""
     folder = cache_folder()
     with _explained(folder):
         if create:
@@ -89,9 +79,6 @@ def find(key: str) -> Path | None:
 
     Warns:
         MachineCodeWarning: The file is damaged, and was removed.
-
-    Raises:
-        MachineCodeError: The cache cannot be trusted or read.
     """
     folder = open_cache()
     if folder is None:
@@ -107,11 +94,7 @@ def find(key: str) -> Path | None:
 
 @contextmanager
 def workplace() -> Iterator[Path]:
-    """Creates a temporary folder in the cache and removes it at the end.
-
-    Raises:
-        MachineCodeError: The cache cannot be trusted or written.
-    """
+    """Creates a temporary folder in the cache and removes it at the end."""
     folder = open_cache(create=True)
     with _explained(cache_folder()):
         temporary = tempfile.mkdtemp(prefix="new-", dir=folder)
@@ -130,11 +113,7 @@ def store(key: str, file: Path) -> Path:
 
 
 def contents() -> list[Path]:
-    """Returns the files of the cache, and the temporary folders of killed processes.
-
-    Raises:
-        MachineCodeError: The cache cannot be trusted or read.
-    """
+    """Returns the files of the cache, and the temporary folders of killed processes."""
     folder = open_cache()
     with _explained(cache_folder()):
         paths = sorted(folder.iterdir()) if folder is not None else []
@@ -142,11 +121,7 @@ def contents() -> list[Path]:
 
 
 def clear() -> None:
-    """Removes everything from the cache; running processes keep the code that they loaded.
-
-    Raises:
-        MachineCodeError: The cache cannot be trusted or written.
-    """
+    """Removes everything from the cache; running processes keep the code that they loaded."""
     for path in contents():
         with _explained(path):
             if path.is_dir() and not path.is_symlink():

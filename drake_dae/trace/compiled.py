@@ -50,24 +50,14 @@ SLOWEST = 10.0
 
 
 class CompilationAttempt(NamedTuple):
-    """When to try to get machine code, and whether to compile.
-
-    Attributes:
-        calls: The number of calls since the last attempt.
-        make: Whether to compile if the cache has no code.
-    """
+    """When to try to get machine code, and whether to compile."""
 
     calls: int
     make: bool
 
 
 def attempts(compiled: Compiled, operations: int) -> list[CompilationAttempt]:
-    """Returns the attempts to get machine code for a function.
-
-    Args:
-        compiled: The choice.
-        operations: The number of operations of the function.
-    """
+    """Returns the attempts to get machine code for a function."""
     if compiled != "auto":
         return [CompilationAttempt(1, True)] if compiled else []
     if not operations:
@@ -80,11 +70,7 @@ def attempts(compiled: Compiled, operations: int) -> list[CompilationAttempt]:
 
 
 def check_choice(owner: str, compiled: Any) -> None:
-    """Checks the value of the option `compiled`.
-
-    Raises:
-        ModelError: It is neither True, False nor "auto".
-    """
+    """Checks the value of the option `compiled`."""
     if not (isinstance(compiled, bool) or (isinstance(compiled, str) and compiled == "auto")):
         raise ModelError(f"{owner}: compiled must be True, False or 'auto', got {brief(compiled)}")
 
@@ -93,11 +79,6 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     """Returns a function as machine code; None if there is none.
 
     It writes all results unconditionally: call it by its `buffer()`, with an array bound to each.
-
-    Args:
-        function: The function.
-        compiled: The choice, True or "auto".
-        make: Whether to make it where the cache has none.
 
     Warns:
         MachineCodeWarning: Machine code is requested and cannot be made.
@@ -118,13 +99,6 @@ def library(
     source: str, operations: int, compiled: Compiled, make: bool, options: Sequence[str] = ()
 ) -> Path | None:
     """Returns a shared library in the cache, compiled from C source; None if there is none.
-
-    Args:
-        source: The source.
-        operations: The approximate number of operations, for the expected time to compile.
-        compiled: The choice, True or "auto".
-        make: Whether to make it where the cache has none.
-        options: Options of the compiler, which override others.
 
     Warns:
         MachineCodeWarning: Machine code is requested and cannot be made.

@@ -62,13 +62,7 @@ once."""
 
 
 class Compiler(NamedTuple):
-    """A C compiler: its command, its identity and its options.
-
-    Attributes:
-        command: The command that starts it.
-        identity: Its identity: its version text and its target machine.
-        target: The options that choose the processor.
-    """
+    """A C compiler: its command, its identity and its options."""
 
     command: tuple[str, ...]
     identity: str
@@ -77,12 +71,7 @@ class Compiler(NamedTuple):
     def compile(
         self, source: str, file: Path, level: str, seconds: float, more: tuple[str, ...] = ()
     ) -> None:
-        """Writes C source to file.c and compiles it to file.so.
-
-        Raises:
-            MachineCodeError: The compiler fails, or takes longer than some seconds.
-            OSError: A file cannot be written.
-        """
+        """Writes C source to file.c and compiles it to file.so."""
         code = file.with_suffix(".c")
         code.write_text(source)
         target = (*self.target, *more)
@@ -96,11 +85,7 @@ class Compiler(NamedTuple):
         seconds: float,
         target: Sequence[str] = (),
     ) -> None:
-        """Compiles source files to one shared library, by default for any processor of this kind.
-
-        Raises:
-            MachineCodeError: The compiler fails, or takes longer than some seconds.
-        """
+        """Compiles sources to one shared library, by default for any processor of this kind."""
         options = [*FLAGS, *target, level, *map(str, sources), "-o", str(library), "-lm"]
         done = _run([*self.command, *options], seconds)
         if done.returncode or not library.exists():
@@ -119,9 +104,6 @@ def find_compiler() -> Compiler:
     """Returns the C compiler named by CC, or else `cc`, or else that of the package ziglang.
 
     The last is `python -m ziglang cc`, the optional group "compiler".
-
-    Raises:
-        MachineCodeError: There is none.
     """
     compiler = _find_compiler(os.environ.get("CC", ""), os.environ.get("PATH", ""))
     if isinstance(compiler, str):
@@ -218,9 +200,6 @@ def compile_webassembly(sources: Sequence[Path], file: Path) -> None:
     """Compiles C sources to a WebAssembly module that imports nothing, by the zig of ziglang.
 
     The first call on a machine compiles zig's C library as well, which takes half a minute.
-
-    Raises:
-        MachineCodeError: There is no ziglang, or it fails.
     """
     if find_spec("ziglang") is None:
         raise MachineCodeError(

@@ -21,14 +21,6 @@ class Factorization:
 
     A right side is orthogonalized along with the columns of A (modified Gram-Schmidt), so that the
     error grows with the condition of A and not, as by Q^T B, with its square.
-
-    Args:
-        matrix: A, shape (n, n), regular where the expressions are evaluated; for `shortest` it may
-            have more rows, shape (l, n), and independent columns.
-
-    Attributes:
-        pivot: The smallest sine of the angle between a column of A and the span of the columns
-            before it: 0 exactly where A is singular, 1 where it is orthogonal.
     """
 
     def __init__(self, matrix: ca.SX) -> None:
@@ -88,15 +80,6 @@ def nearest_solution(
 
     With W = R^T R it is u_0 + R^-1 x for the shortest x of (B R^-1) x = b - B u_0, so that nothing
     is squared.
-
-    Args:
-        matrix: B, shape (p, l), with independent rows.
-        right: b, shape (p, 1).
-        metric: W, shape (l, l), symmetric positive definite.
-        goal: u_0, shape (l, 1).
-
-    Returns:
-        u, shape (l, 1), and a scalar that is 0 exactly where the rows of B depend on each other.
     """
     root = ca.chol(metric)
     factors = Factorization(ca.solve(root.T, ca.densify(matrix.T)))
@@ -105,16 +88,7 @@ def nearest_solution(
 
 
 class PositiveDefiniteFactorization:
-    """A factorization A = L D L^T of a symmetric positive definite matrix, for many right sides.
-
-    Args:
-        matrix: A, shape (n, n); its structural zeros are used.
-
-    Attributes:
-        pivot: A holds the products of some vectors; the smallest squared sine of the angle between
-            one of them and the span of those before it: 0 exactly where A is singular.
-        lengths: The length of each of these vectors orthogonal to those before it.
-    """
+    """A factorization A = L D L^T of a symmetric positive definite matrix, for many right sides."""
 
     def __init__(self, matrix: ca.SX) -> None:
         self._identity = ca.is_equal(matrix, ca.SX.eye(matrix.shape[0]))
@@ -163,11 +137,7 @@ class Factors(Protocol):
 
 
 class BlockFactors:
-    """The factors of a block-diagonal matrix, from those of its blocks.
-
-    Args:
-        blocks: The factors of each block, with its size.
-    """
+    """The factors of a block-diagonal matrix, from those of its blocks."""
 
     def __init__(self, blocks: Sequence[tuple[Factors, int]]) -> None:
         self._factors = [factors for factors, _ in blocks]

@@ -47,13 +47,6 @@ def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
 
     It may have numbers, the symbols, pi, + - * / **, brackets, and sin, cos, tan, asin, acos, atan,
     atan2, sinh, cosh, tanh, asinh, acosh, atanh, exp, log, sqrt, erf.
-
-    Args:
-        text: The formula.
-        symbols: Name -> its symbol or expression, a scalar.
-
-    Raises:
-        ModelError: The text is not a formula; the message has the place.
     """
     if len(text) > MOST_LETTERS:
         raise ModelError(f"a formula has at most {MOST_LETTERS} letters, this one {len(text)}")
@@ -75,11 +68,7 @@ def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
 
 
 def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:
-    """Checks that a formula can use names of parameters.
-
-    Raises:
-        ModelError: A name is not an identifier, or is reserved.
-    """
+    """Checks that a formula can use names of parameters."""
     for name in names:
         if not name.isidentifier():
             raise ModelError(f"parameter '{name}': a name is a word such as r_1")

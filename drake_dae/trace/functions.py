@@ -37,16 +37,7 @@ class FailureKind(Enum):
 
 @dataclass(frozen=True)
 class Failure:
-    """The reason why the last values of a function are not valid.
-
-    Attributes:
-        function: The function's name.
-        fault: The kind of failure.
-        inputs: Name of an input -> its entries that are not finite, or beyond `HUGE`; empty unless
-            `fault` is INPUT or OVERFLOW.
-        singular: The matrix that must be regular, which is singular if `fault` is SINGULAR; or why
-            the function does not hold, if it is OUTSIDE.
-    """
+    """The reason why the last values of a function are not valid."""
 
     function: str
     fault: FailureKind
@@ -68,27 +59,6 @@ class TracedFunction:
     whether its values are valid, see `is_valid`. Only here it is decided whether a function is
     interpreted or compiled, by the choice `compiled` of the caller. CasADi's function is made when
     it is first needed: many blocks run as parts of a whole, and a report needs few.
-
-    Args:
-        name: The name of the function in messages.
-        inputs: Name -> symbol column, in the order of the call's arguments.
-        outputs: Name -> expression; a column becomes an array of shape (k,), anything else an
-            array of its own shape.
-        pivot: A scalar that is 0 where a matrix that must be regular is singular, such as
-            `Factorization.pivot`; None if there is no such matrix.
-        regular: The name of that matrix in messages.
-        often: Whether it is called so often that removing common subexpressions and compiling pay.
-        lean: Whether common subexpressions have been removed already.
-        compiled: Whether a function that is called often becomes machine code; see
-            `trace.compiled`.
-        doubt: A scalar that is negative where the values are not valid though the pivot is large
-            enough; the caller may have other values there, see `is_regular`.
-        outside: Why values are not valid where the doubt is negative, for messages; if it is empty
-            the matrix is called singular there.
-
-    Attributes:
-        sizes: The number of entries of each input.
-        is_machine_code: Whether calls currently run machine code.
     """
 
     def __init__(
@@ -179,17 +149,7 @@ class TracedFunction:
         return arrays
 
     def evaluate(self, *arguments: FloatArray | float) -> tuple[FloatArray, ...]:
-        """Evaluates the function without allocation.
-
-        Args:
-            arguments: Arrays of the sizes of the inputs, in their order.
-
-        Returns:
-            The outputs. The next call from this thread overwrites them; copy values to keep them.
-
-        Raises:
-            TypeError: The number of arguments is wrong.
-        """
+        """Evaluates the function without allocation."""
         if len(arguments) != self._num_inputs:
             raise TypeError(f"{self.name} takes {self.input_names}, got {len(arguments)} arguments")
         if self._attempts is None or self._attempts:
@@ -269,12 +229,7 @@ class TracedFunction:
         )
 
     def __call__(self, *arguments: ArrayLike) -> tuple[FloatArray, ...]:
-        """Evaluates the function and returns new arrays.
-
-        Raises:
-            ModelError: The number of arguments is wrong, or one has a wrong shape or is not
-                numeric.
-        """
+        """Evaluates the function and returns new arrays."""
         if len(arguments) == self._num_inputs and all(map(_fits, arguments, self.sizes)):
             return tuple(output.copy() for output in self.evaluate(*arguments))  # type: ignore
         if len(arguments) != self._num_inputs:

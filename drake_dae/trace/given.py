@@ -16,13 +16,7 @@ def result_of(
     *arguments: Any,
     error: Callable[[str], Exception] = ModelError,
 ) -> Any:
-    """Calls a user's function; a failure is raised as an error of the argument.
-
-    Args:
-        what: The name of the function in messages.
-        function: The function, with its arguments.
-        error: Makes the exception from a text. Errors of the library are not changed.
-    """
+    """Calls a user's function; a failure is raised as an error of the argument."""
     try:
         return function(*arguments)
     except DrakeDaeError:
@@ -34,11 +28,7 @@ def result_of(
 
 @contextmanager
 def numpy_explained(what: str) -> Iterator[None]:
-    """Replaces CasADi's long warning about NumPy functions of symbols by one line, once.
-
-    Args:
-        what: The name of the function in the warning.
-    """
+    """Replaces CasADi's long warning about NumPy functions of symbols by one line, once."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield

@@ -4,28 +4,10 @@ import casadi as ca
 
 
 def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:
-    """Returns L_f k = (dk/dx) f, by one forward sweep.
-
-    Args:
-        expression: k, shape (a, 1).
-        field: f, shape (n, 1).
-        state: x, shape (n, 1).
-
-    Returns:
-        L_f k, shape (a, 1).
-    """
+    """Returns L_f k = (dk/dx) f, by one forward sweep."""
     return ca.jtimes(expression, state, ca.densify(field))
 
 
 def lie_derivative_along(expression: ca.SX, fields: ca.SX, state: ca.SX) -> ca.SX:
-    """Returns [L_g1 k, ..., L_gm k] with structural zeros.
-
-    Args:
-        expression: k, shape (a, 1).
-        fields: g = [g_1, ..., g_m], shape (n, m).
-        state: x, shape (n, 1).
-
-    Returns:
-        The derivatives, shape (a, m), sparse.
-    """
+    """Returns [L_g1 k, ..., L_gm k] with structural zeros."""
     return ca.sparsify(ca.mtimes(ca.jacobian(expression, state), fields))

@@ -9,15 +9,12 @@ import scipy.linalg
 from scipy.linalg.lapack import dgeqrf, dorgqr, dpotrs, dtrtrs
 
 from drake_dae.arrays import FloatArray
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.round_off import DEPENDENT
 
 T = TypeVar("T")
 
 ROUND_OFF = 1e-12
 """A Newton step below this, relative to the state, is within the round-off of the residual."""
-
-DEPENDENT = 1e-9
-"""Gradients of length one with a smallest singular value below this are dependent."""
 
 CONVERGED = 1e-8
 """A Newton step below this, relative to the state, that stops decreasing is round-off."""
@@ -36,15 +33,7 @@ LENGTHS = tuple(0.5**k for k in range(30))
 
 
 class NewtonModel(NamedTuple):
-    """Equations that are linearized at an iterate.
-
-    Attributes:
-        step: x -> the Newton step from x by the matrix of the iterate, shape (n,).
-        is_regular: Whether that matrix has full rank, so that solutions are isolated up to the
-            number of free variables.
-        measure: The function x -> nonnegative number that a step must decrease; if None, the length
-            of the next step.
-    """
+    """Equations that are linearized at an iterate."""
 
     step: Callable[[FloatArray], FloatArray]
     is_regular: bool
@@ -63,14 +52,6 @@ def newton(
     depend on the units of the equations (Deuflhard, 2004, section 3.3). Steps
     are measured relative to the start, or to 1 if that is larger. A solution is then improved as
     long as steps decrease, which does not depend on units.
-
-    Args:
-        start: The first iterate, shape (n,).
-        linearize: The linearization at an iterate, None if it is not finite, or has no steps.
-        iterations: The largest number of steps; few if there are other guesses.
-
-    Returns:
-        The last iterate, and whether it is a regular solution up to round-off.
     """
     x, unit = start, np.maximum(1.0, np.abs(start))
 
@@ -108,11 +89,7 @@ def newton(
 
 
 def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
-    """Returns a function with a memory of its last value, since `newton` calls it repeatedly.
-
-    Args:
-        function: The function; its iterates are never written over.
-    """
+    """Returns a function with a memory of its last value, since `newton` calls it repeatedly."""
     at: FloatArray | None = None
     value: Any = None
 
@@ -153,10 +130,6 @@ def shortest_steps(
 
     The rows are scaled to length one. If they are dependent, for example at the start of a search,
     dx is the least-squares solution.
-
-    Args:
-        gradients: C, shape (k, n).
-        residual: A function x -> residual of shape (k,).
     """
     # Methods of arrays and sums of squares: NumPy's functions of the same name take twice as long.
     if not np.isfinite(gradients).all():
@@ -189,13 +162,7 @@ def _orthogonalized(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 def steps_along(
     gradients: FloatArray, directions: FloatArray, residual: Callable[[FloatArray], FloatArray]
 ) -> NewtonModel | None:
-    """Returns the Newton model of steps D y with C D y = -residual(x); None if y is not determined.
-
-    Args:
-        gradients: C, shape (k, n).
-        directions: D, shape (n, k), such that C D is symmetric and positive definite.
-        residual: A function x -> residual of shape (k,).
-    """
+    """Returns the Newton model of steps D y, C D y = -residual(x), if y is determined."""
     matrix = gradients @ directions
     size = np.sqrt(np.abs(np.diag(matrix)))
     if not (np.all(np.isfinite(matrix)) and np.all(size > 0.0)):
@@ -210,15 +177,3 @@ def steps_along(
     return NewtonModel(
         lambda x: -along @ dpotrs(factors[0], residual(x) / size, lower=factors[1])[0], True
     )
-
-
-def are_dependent(gradients: FloatArray) -> bool:
-    """Whether rows, whose lengths do not matter, are linearly dependent."""
-    if not np.all(np.isfinite(gradients)):
-        return True
-    # By their largest entries first: their squares may be too large for a number.
-    rows = gradients / positive(np.abs(gradients).max(axis=1, keepdims=True, initial=0.0))
-    length = np.linalg.norm(rows, axis=1, keepdims=True)
-    if rows.shape[0] > rows.shape[1] or not np.all(length > 0.0):
-        return True
-    return bool(np.linalg.svd(rows / length, compute_uv=False)[-1] < DEPENDENT)

@@ -15,6 +15,9 @@ FLOOR = 1e-14
 """An entry below this, relative to the largest of its whole matrix, is round-off: scaled to length
 one, such a row would count as any other."""
 
+DEPENDENT = 1e-9
+"""Rows of length one with a smallest singular value below this are dependent."""
+
 SINGULAR = 1e-6
 """A matrix with a singular value below this, its rows and columns scaled, is singular."""
 
@@ -26,14 +29,7 @@ Sized = tuple[FloatArray, FloatArray]
 def multiply(
     left: FloatArray, right: Sized, scale: FloatArray, negligible: float = NEGLIGIBLE
 ) -> Sized:
-    """Multiplies matrices; entries that are only round-off are set to zero.
-
-    Args:
-        left: The left factor, shape (a, k).
-        right: The right factor, shape (k, b).
-        scale: The scales of the columns of `left` and the rows of `right`, shape (k,).
-        negligible: A factor below this, relative to the others in its row or column, is zero.
-    """
+    """Multiplies matrices; entries that are only round-off are set to zero."""
     value, size = right
     row, column = np.abs(left) * scale, size / scale[:, None]
     row_noise = negligible * np.max(row, axis=1, keepdims=True, initial=0.0)
@@ -45,12 +41,7 @@ def multiply(
 
 
 def without_round_off(value: FloatArray, size: FloatArray) -> Sized:
-    """Sets those entries of a sum of products to zero that are only round-off.
-
-    Args:
-        value: The sum, shape (a, b).
-        size: The sum of the sizes of its terms, shape (a, b).
-    """
+    """Sets those entries of a sum of products to zero that are only round-off."""
     return np.where(np.abs(value) > ZERO * size, value, 0.0), size
 
 
@@ -75,15 +66,22 @@ def significant(matrix: FloatArray) -> FloatArray:
     return np.where(sizes > FLOOR * np.max(sizes, initial=0.0), matrix, 0.0)
 
 
-def rank_of(matrix: FloatArray, least: float) -> int:
-    """Returns the rank of a matrix: its rows and columns scaled, above its round-off.
-
-    Args:
-        matrix: The matrix.
-        least: Singular values below this, relative to the largest, are zero.
-    """
+def rank_of(matrix: FloatArray) -> int:
+    """Returns the rank of a matrix, its rows and columns scaled, above its round-off."""
     matrix = significant(matrix)
-    return int(np.linalg.matrix_rank(equilibrated(matrix), least)) if matrix.size else 0
+    return int(np.linalg.matrix_rank(equilibrated(matrix), DEPENDENT)) if matrix.size else 0
+
+
+def are_dependent(gradients: FloatArray) -> bool:
+    """Whether rows, whose lengths do not matter, are linearly dependent, or not finite."""
+    if not np.all(np.isfinite(gradients)):
+        return True
+    # By their largest entries first: their squares may be too large for a number.
+    largest = np.abs(gradients).max(axis=1, keepdims=True, initial=0.0)
+    rows = unit_rows(gradients / positive(largest))
+    if rows.shape[0] > rows.shape[1] or not rows.any(axis=1).all():
+        return True
+    return smallest_singular_value(rows) < DEPENDENT
 
 
 def equilibrated(matrix: FloatArray) -> FloatArray:

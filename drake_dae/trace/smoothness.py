@@ -48,22 +48,13 @@ def as_constant(expression: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class SmoothnessFlaw:
-    """The reason why an expression cannot be differentiated.
-
-    Attributes:
-        operation: The operation that is not smooth; empty if the reason is a constant.
-        constant: A constant that is not finite; 0 if the reason is an operation.
-    """
+    """The reason why an expression cannot be differentiated."""
 
     operation: str
     constant: float = 0.0
 
     def describe(self, variable: str) -> str:
-        """Returns the text for an error message: the non-smooth expression and how to repair it.
-
-        Args:
-            variable: The name of the variable in messages.
-        """
+        """Returns the text for an error message: the non-smooth expression and how to repair it."""
         if self.operation:
             return (
                 f"is not smooth: it takes {self.operation} of {variable}. Derivatives would be "
@@ -75,16 +66,7 @@ class SmoothnessFlaw:
 
 
 def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX) -> SmoothnessFlaw | None:
-    """Returns a constant that is not finite, or an operation that is not smooth, if there is one.
-
-    Args:
-        expression: A function of the variable and of others.
-        variable: The symbols in which it must be smooth.
-        other: All other symbols, below each other.
-
-    Returns:
-        The first flaw; None if there is none.
-    """
+    """Returns a constant that is not finite or an operation that is not smooth, or None."""
     function = ca.Function("f", [variable, other], [expression])
     if not _may_have_flaw(function):
         return None

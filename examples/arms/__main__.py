@@ -51,7 +51,7 @@ def settings() -> list[str]:
         "constraints.0.surface.point=[0.45, 0.0, 0.2]",
         "constraints.0.surface.normal=[0.0, 0.0, 1.0]",
         f"outputs=[{outputs}]",
-        "plant_parameters={part.position: [0.4526, 0.003, 0.203], part.rpy: [0.056, 0.06, 0.03]}",
+        "plant.parameters={part.position: [0.4526, 0.003, 0.203], part.rpy: [0.056, 0.06, 0.03]}",
         "bounds.part.position=[[0.44, -0.01, 0.19], [0.46, 0.01, 0.21]]",
         f"task.phases.3.references={{{EIGHT}, part.force: 10.0}}",
         f"task.phases.4.references={{{EIGHT}, part.force: {force}}}",

@@ -36,7 +36,7 @@ ROUGHNESS = 0.4  # N m from one sample to the next.
 LATE = "sampling={period: 0.001, delay: 0.001}"
 POINT = "plant=!MultibodyPlant {time_step: 0.001, stiffness: 1.0e5, friction: 0.3}"
 UNKNOWN = (
-    "gains=",
+    "law.gains=",
     "constraints.0.friction=0.0",
     POINT,
     LATE,
@@ -66,15 +66,17 @@ STOPS = (
     " tool.z: 0.7, tool.z_axis: 0.0, 'joint3, joint7': 0.0,"
     " wall.force: !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}}",
 )
-FORCE_SENSOR = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.3}"
-FINE, COARSE = ((f"encoders={{resolution: {size}}}", FORCE_SENSOR) for size in ("1.0e-5", "1.0e-4"))
-FAINT = ("encoders={position_noise: 5.0e-6, velocity_noise: 1.0e-3}", FORCE_SENSOR)
-NOISY = ("encoders={position_noise: 5.0e-5, velocity_noise: 0.01}", FORCE_SENSOR)
-DIFFERENCES = ("encoders={resolution: 1.0e-4, velocity_bandwidth: 200}", FORCE_SENSOR)
+FORCE_SENSOR = "sensors.force={sample_period: 0.001, noise_deviation: 0.3}"
+FINE, COARSE = (
+    (f"sensors.encoders={{resolution: {size}}}", FORCE_SENSOR) for size in ("1.0e-5", "1.0e-4")
+)
+FAINT = ("sensors.encoders={position_noise: 5.0e-6, velocity_noise: 1.0e-3}", FORCE_SENSOR)
+NOISY = ("sensors.encoders={position_noise: 5.0e-5, velocity_noise: 0.01}", FORCE_SENSOR)
+DIFFERENCES = ("sensors.encoders={resolution: 1.0e-4, velocity_bandwidth: 200}", FORCE_SENSOR)
 GAINS_ALONE = (
     *NOISY,
-    "largest_roughness=2",
-    "observer={rate: 10.7, force_rate: 1.88, friction_rate: 2.67, identify_friction: [wall]}",
+    "law.largest_roughness=2",
+    "estimator={rate: 10.7, force_rate: 1.88, friction_rate: 2.67, identify: [wall.friction]}",
 )
 
 
@@ -107,7 +109,7 @@ TUNED = (
     Condition("hydroelastic, 1e8 Pa", "wall_hydroelastic", ("plant.modulus=1.0e8",)),
     Condition("hydroelastic, 1e7 Pa", "wall_hydroelastic", force=0.05),
     Condition(
-        "wall 2 mm farther", settings=("plant_parameters={wall.position: [0.702, 0.0, 0.0]}",)
+        "wall 2 mm farther", settings=("plant.parameters={wall.position: [0.702, 0.0, 0.0]}",)
     ),
     Condition("0.5 kg more in the tool", load=0.5, position=0.1),
 )
@@ -136,7 +138,9 @@ OTHERS = (
     Condition("flexible joints", "wall_flexible_contact"),
     Condition("the ideal plant", is_ideal=True),
 )
-FIRST = Condition("version 0.1", settings=("gains={all: [-8.0]}",), position=np.inf, force=np.inf)
+FIRST = Condition(
+    "version 0.1", settings=("law.gains={all: [-8.0]}",), position=np.inf, force=np.inf
+)
 
 
 @dataclass(frozen=True)
@@ -157,7 +161,7 @@ def closed_loop(condition: Condition) -> tuple[Scenario, dd.ClosedLoop]:
     scenario = completed.scenario
     if condition.is_ideal:
         friction = {"wall.friction": scenario.plant.friction}
-        ideal = replace(scenario, plant=IdealConstraints(), plant_parameters=friction)
+        ideal = replace(scenario, plant=IdealConstraints(parameters=friction))
         return ideal, build_completed(ideal)[1]
     return scenario, loop
 

@@ -153,7 +153,8 @@ outputs: [!JointPositions {joints: [tray_x, tray_z]}]
 forces: []
 references: {tray_x: !Sinusoids {offset: 0, amplitudes: [0.2], frequencies: [5]}, tray_z: 0.5}
 start: {positions: {tray_x: 0.0, tray_z: 0.5, block_x: 0.0, block_z: 0.5}}
-friction_cones: [{normal: grip.fz, tangents: [grip.fx], friction: 0.3}]
+judgement:
+  friction_cones: [{normal: grip.fz, tangents: [grip.fx], limit: 0.3}]
 duration: 2
 write: {record: false, plots: false, animation: false}
 """
@@ -193,7 +194,7 @@ def test_a_friction_cone_of_a_scenario(tray):
 
 def test_a_cone_of_a_force_that_is_not_there_is_refused(tray):
     with pytest.raises(ScenarioError, match=r"grip\.fy"):
-        find_feasibility(load_scenario(tray, ["friction_cones.0.tangents=[grip.fy]"]))
+        find_feasibility(load_scenario(tray, ["judgement.friction_cones.0.tangents=[grip.fy]"]))
 
 
 def test_slower_references_are_not_examined_beside_zero_dynamics():

@@ -67,7 +67,7 @@ CONDITIONS = (
     Condition("hydro 1e8 Pa", "wall_hydroelastic", ("plant.modulus=1e8",)),
     Condition(
         "wall +2 mm",
-        settings=("plant.stiffness=1e5", "plant_parameters={wall.position: [0.702, 0, 0]}"),
+        settings=("plant.stiffness=1e5", "plant.parameters={wall.position: [0.702, 0, 0]}"),
     ),
     Condition("tool +0.5 kg", load=0.5),
     Condition("noise", noise=1.0),
@@ -314,7 +314,7 @@ def ours(condition: Condition, friction: float):
     settings = [
         f"plant.friction={FRICTION}",
         f"constraints.0.friction={friction}",
-        f"force_feedback=!MeasuredForce {sensor}",
+        f"sensors.force={sensor}",
         f"duration={DURATION}",
         *condition.settings,
     ]
@@ -324,7 +324,7 @@ def ours(condition: Condition, friction: float):
     scenario = advised(given, model, structure).scenario
     if condition.noise:  # Its gains are those for sensors without noise.
         noisy = Encoders(position_noise=ANGLE_NOISE, velocity_noise=RATE_NOISE, seed=1)
-        scenario = replace(scenario, encoders=noisy)
+        scenario = replace(scenario, sensors=replace(scenario.sensors, encoders=noisy))
     plant = MeasuredPlant(make_plant(scenario, model, structure), 0.0)
     loop = build_loop(scenario, model, structure, plant=plant)
     return loop, start_scenario(scenario, loop), scenario
@@ -368,7 +368,7 @@ def wired(law: Rival, plant: MeasuredPlant, loop, scenario):
     builder = DiagramBuilder()
     reference = ReferenceGenerator(loop.reference.references, loop.reference.degrees)
     hold = ControlHold(7, scenario.sampling)
-    sensor = scenario.force_feedback.sensor(1)
+    sensor = scenario.sensors.force.sensor(1)
     for system in (plant, law, reference, hold, sensor):
         builder.AddSystem(system)
     builder.Connect(plant.GetOutputPort("state"), law.GetInputPort("estimated_state"))

@@ -49,7 +49,7 @@ VALUES = {
 
 SIGNED = re.compile(
     r"values|offset|amplitudes|frequencies|phases|goal|start_time|positions|errors|point|normal|"
-    r"start\.\d|end\.\d|center|axis|translation|rpy_deg|bias|gain$|plant_parameters|seed|torque_constant|gear_ratio|geometry"
+    r"start\.\d|end\.\d|center|axis|translation|rpy_deg|bias|gain$|plant\.parameters|seed|torque_constant|gear_ratio|geometry"
 )
 """Keys where zero or a negative number is as good as any other."""
 
@@ -108,8 +108,8 @@ def attempt(seed: int, folder: Path) -> Outcome:
 
 def _is_exact(scenario: Scenario) -> bool:
     """Whether the plant is what the law's model says, at all times, so that (30) and (31) hold."""
-    measured = scenario.force_feedback.is_measured or scenario.sampling is not None
-    return not (scenario.plant_parameters or measured)
+    measured = scenario.sensors.force is not None or scenario.sampling is not None
+    return not (scenario.plant.parameters or measured)
 
 
 # One mistake each, and why what it makes may run.
@@ -144,9 +144,9 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
         return "it is what it was"
     if path.startswith(("references.", "exogenous.")) and _is_constant(after):
         return "a number is a constant reference" if abs(after) <= 1e15 else LOST
-    if path.startswith("gains.") and before == after:
+    if path.startswith("law.gains.") and before == after:
         return "it is what it was"
-    if path.startswith("gains.") and isinstance(before, float) and after == -1.0:
+    if path.startswith("law.gains.") and isinstance(before, float) and after == -1.0:
         return "another pole, or a gain that is refused where it makes errors grow"
     if after is None and path.split(".")[-1] in _OR_NOTHING:
         return "nothing is its default"
@@ -166,7 +166,7 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
     return ""
 
 
-_OR_NOTHING = ("gains", "integral", "observer", "task", "forces", "effort_limit", "friction")
+_OR_NOTHING = ("gains", "integral", "estimator", "task", "forces", "effort_limit", "friction")
 """Keys that may hold nothing."""
 
 

@@ -46,7 +46,7 @@ sampling: {{period: 0.001, delay: 0.001}}
 start: {{positions: {{joint1: 1.1653, joint2: -1.8326}}}}
 duration: 6
 plant: {plant}
-force_feedback: !MeasuredForce {sensor}
+sensors: {{force: {sensor}{encoders}}}
 {settings}
 task:
   tare_time: {tare}
@@ -63,23 +63,23 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     sensor = f"{{sample_period: 0.001, noise_deviation: {noise}, bias: {bias}, drift: {drift}}}"
     settings, moved = [], False
     stiffness, friction = 10 ** draw.uniform(4.0, 6.0), draw.uniform(0.0, 0.6)
-    plant = f"!CompliantContact {{radius: 1e-5, stiffness: {stiffness}, friction: {friction}}}"
+    plant = f"radius: 1e-5, stiffness: {stiffness}, friction: {friction}"
     of_velocity = "{position_noise: 1e-5, velocity_noise: 0.005}"
     kinds = ("", "{position_noise: 1e-5}", "{resolution: 2e-5}", of_velocity)
-    settings.append(f"encoders: {encoders}" if (encoders := draw.choice(kinds)) else "")
+    encoders, unknown = draw.choice(kinds), []
     if draw.random() < 0.4:
         force = [draw.uniform(-60.0, 20.0), 0.0, draw.uniform(-15.0, 15.0)]
         start, end = draw.uniform(0.0, 2.0), draw.uniform(2.0, 3.0)
         push = f"frame: tool, force: {force}, start_time: {start}, end_time: {end}"
-        settings.append(f"plant_disturbances: [{{{push}}}]")
+        unknown.append(f"disturbances: [{{{push}}}]")
         moved = True
     if draw.random() < 0.3:
         mass = draw.uniform(0.05, 0.6)
-        settings.append(f"plant_payloads: [{{frame: tool, mass: {mass}}}]")
+        unknown.append(f"payloads: [{{frame: tool, mass: {mass}}}]")
         moved = True
     if draw.random() < 0.3:
         place = 1.2 + draw.uniform(-0.01, 0.08)
-        settings.append(f"plant_parameters: {{wall.position: [{place}, 0, 0]}}")
+        unknown.append(f"parameters: {{wall.position: [{place}, 0, 0]}}")
     if draw.random() < 0.3:
         settings.append("saturation: true")
     after_loss = (*REACTIONS, "approach", "touch", "away")
@@ -113,9 +113,10 @@ def random_task(draw: random.Random) -> tuple[str, bool]:
     ramp = f"start: [0], end: [1], start_time: {first}, end_time: {first + 0.1}"
     waits = any("ready" in phase for phase in phases)
     text = TEXT.format(
-        plant=plant,
+        plant=f"!CompliantContact {{{', '.join([plant, *unknown])}}}",
         sensor=sensor,
-        settings="\n".join(filter(None, settings)),
+        encoders=f", encoders: {encoders}" if encoders else "",
+        settings="\n".join(settings),
         tare=0.1 if bias else draw.choice((0.0, 0.1)),
         signals=f"{{ready: !PointToPoint {{{ramp}}}}}" if waits else "{}",
         phases="\n".join(f"  - {phase}" for phase in phases),

@@ -42,7 +42,7 @@ MISSED = {
     "a contact that pulls": ["--set=references.wall.force=-5", "--set=duration=0.2"],
     # The mass is another one, to the end.
     "a plant that the law does not know": [
-        "--set=plant_parameters={link1.mass: 20}",
+        "--set=plant.parameters={link1.mass: 20}",
         "--set=duration=1",
     ],
 }
@@ -163,11 +163,11 @@ def test_a_second_run_keeps_the_first_one_and_says_where(tmp_path, capsys):
 
 def test_a_record_has_what_repeats_the_run(tmp_path):
     out = tmp_path / "run"
-    settings = ("--set=force_feedback.seed=7", *QUICK)
+    settings = ("--set=sensors.force.seed=7", *QUICK)
     assert main(["simulate", "two_link_measured_force", *settings, f"--out={out}"]) == 0
     record = Record.load(out / "record.npz")
     assert {"drake_dae", "drake", "casadi", "numpy", "python"} <= {*record.about["versions"]}
-    assert record.about["scenario"]["force_feedback"]["seed"] == 7
+    assert record.about["scenario"]["sensors"]["force"]["seed"] == 7
     # As a scenario of its own it gives the same numbers.
     again = tmp_path / "again"
     save_scenario(read_scenario(record.about["scenario"]), tmp_path / "again.yaml")

@@ -41,7 +41,7 @@ def test_it_leaves_its_files_and_prints_the_summary(tmp_path, monkeypatch, capsy
         (["--vary", "duration=1..2"], "duration: 1..2 needs the number of its values"),
         (["--vary", "duration=1..2", "--random", "0"], "count must be a whole number from 1"),
         (["--vary", "duration=1", "--workers", "0"], "workers must be a whole number from 1"),
-        (["--vary", "plant_parameters.a=1"], "plant_parameters: two_link_arm: no parameter 'a'"),
+        (["--vary", "plant.parameters.a=1"], "plant.parameters: two_link_arm: no parameter 'a'"),
     ],
 )
 def test_errors_are_reported_before_anything_runs(options, line, tmp_path, capsys):

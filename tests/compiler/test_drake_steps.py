@@ -11,7 +11,7 @@ from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.scenario.loop import make_plant
 from drake_dae.scenario.model import completed_model, scenario_structure
 
-PUSH = "plant_disturbances=[{frame: tool, force: [100, 20, 5], start_time: 0.002}]"
+PUSH = "plant.disturbances=[{frame: tool, force: [100, 20, 5], start_time: 0.002}]"
 
 
 def stepped_part(name, *settings):

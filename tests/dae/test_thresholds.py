@@ -9,7 +9,7 @@ from drake_dae import analyze
 from drake_dae.analysis.findings import Finding
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
+from drake_dae.dae.zero_dynamics.pinned_motion import EndCause
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import AssumptionError, ModelError, NegligibleWarning
 

@@ -87,7 +87,7 @@ def test_limits_of_the_actuator_are_reported_before_it_runs():
 
 
 def test_its_damping_is_a_parameter_of_plant_and_law():
-    loop, root = build_scenario(scenario(NAME, "plant_parameters={actuator.damping: [100.0]}"))
+    loop, root = build_scenario(scenario(NAME, "plant.parameters={actuator.damping: [100.0]}"))
     for block, value in ((loop.plant, 100.0), (loop.controller, 40.0)):
         context = block.GetMyContextFromRoot(root)
         assert block.get_parameter(context, "actuator.damping") == [value]

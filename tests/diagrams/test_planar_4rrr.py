@@ -107,7 +107,7 @@ def test_the_law_and_the_pins_are_those_of_newton_and_euler():
 
     To round-off: of torques up to 8 N m and forces up to 20 N, 3e-14.
     """
-    loop, _ = build_scenario(scenario(NAME, "control_weights=[1, 2, 0.5, 3]"))
+    loop, _ = build_scenario(scenario(NAME, "law.control_weights=[1, 2, 0.5, 3]"))
     plant, law, weights = loop.plant, loop.controller.law, np.array([1.0, 2.0, 0.5, 3.0])
     assert law.structure.output_degrees == (2, 2, 2)
     assert law.structure.zero_dynamics_dimension == 0
@@ -193,6 +193,6 @@ def test_what_does_not_fit_is_reported():
     with pytest.raises(ModelError, match="control_weights"):
         RobotModel(*parts, forces=[], control_weights=[1.0, 2.0, 0.0, 1.0])
     with pytest.raises(ScenarioError, match=r"control_weights: .*\(4,\)"):
-        build_scenario(scenario(NAME, "control_weights=[1, 2]"))
+        build_scenario(scenario(NAME, "law.control_weights=[1, 2]"))
     with pytest.raises(ScenarioError, match=r"exogenous: .*free_control"):
         build_scenario(scenario("planar_3rrr", "exogenous={free_control: []}"))

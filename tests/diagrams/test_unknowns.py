@@ -14,8 +14,8 @@ from drake_dae.scenario.model import scenario_model
 W = 25.0
 STILL = (
     "references={tool.z: 0.3, wall.force: 20}",
-    f"gains.all=[-{W}]",
-    "constraint_damping=!Poles {all: [-50.0]}",
+    f"law.gains.all=[-{W}]",
+    "law.constraint_damping=!Poles {all: [-50.0]}",
     "start.errors={}",
     "duration=0.6",
 )
@@ -60,7 +60,7 @@ def test_a_disturbance_leaves_the_error_of_statics(plant):
 
     It is smooth over 10 ms, and 0.5 s later the poles at -25 1/s have left 5e-5 of it.
     """
-    push = "plant_disturbances=[{frame: tool, force: [0, 0, 5], start_time: 0.1}]"
+    push = "plant.disturbances=[{frame: tool, force: [0, 0, 5], start_time: 0.1}]"
     _, _, record = run_scenario(two_link(push, *plant))
     expected = left_behind([0.0, 5.0])
     assert 1e-3 < expected < 2e-2
@@ -70,7 +70,7 @@ def test_a_disturbance_leaves_the_error_of_statics(plant):
 @pytest.mark.slow
 @PLANTS
 def test_payload_that_nobody_knows_pulls_with_its_weight(plant):
-    payload = "plant_payloads=[{frame: tool, mass: 0.5}]"
+    payload = "plant.payloads=[{frame: tool, mass: 0.5}]"
     _, _, record = run_scenario(two_link(payload, *plant))
     # Its inertia adds 0.5 J^T J to M, which changes A_h in the plant; at rest the law's counts.
     assert_allclose(record["tracking_error"][-1, 0], left_behind([0.0, -0.5 * 9.81]), rtol=2e-2)
@@ -90,7 +90,7 @@ def test_payload_that_is_known_is_no_error():
 
 
 def test_contact_has_the_masses_of_its_own():
-    settings = "plant_parameters={link1.mass: 11.0}", "plant_payloads=[{frame: tool, mass: 0.5}]"
+    settings = "plant.parameters={link1.mass: 11.0}", "plant.payloads=[{frame: tool, mass: 0.5}]"
     totals = []
     for more in ((), settings):
         loop, context = build_scenario(two_link(*CONTACT, *more))
@@ -108,7 +108,7 @@ def test_surface_may_be_tilted():
     found = two_link(
         *CONTACT,
         "constraints.0.rpy=[0.0, 0.0, 0.0]",
-        f"plant_parameters={{wall.rpy: {turned}}}",
+        f"plant.parameters={{wall.rpy: {turned}}}",
         "duration=0.3",
     )
     _, _, record = run_scenario(found)
@@ -131,27 +131,27 @@ def test_a_disturbance_grows_and_fades_smoothly():
     ("settings", "message"),
     [
         (
-            "plant_disturbances=[{frame: tol, force: [0, 0, 1]}]",
-            r"plant_disturbances.0: .*'tol'",
+            "plant.disturbances=[{frame: tol, force: [0, 0, 1]}]",
+            r"plant.disturbances.0: .*'tol'",
         ),
         (
-            "plant_payloads=[{frame: tol, mass: 1}]",
-            r"plant_payloads.0: .*'tol'",
+            "plant.payloads=[{frame: tol, mass: 1}]",
+            r"plant.payloads.0: .*'tol'",
         ),
-        ("plant_payloads=[{frame: tool, mass: 0}]", r"plant_payloads.0: .*mass"),
+        ("plant.payloads=[{frame: tool, mass: 0}]", r"plant.payloads.0: .*mass"),
         (
-            "plant_payloads=[{frame: tool, mass: 1}, {frame: tool, mass: 1}]",
-            "plant_payloads.1: ",
-        ),
-        (
-            "plant_payloads=[{frame: world, mass: 1}]",
-            r"plant_payloads.0: .*'world'",
+            "plant.payloads=[{frame: tool, mass: 1}, {frame: tool, mass: 1}]",
+            "plant.payloads.1: ",
         ),
         (
-            "plant_disturbances=[{frame: world, force: [0, 0, 1]}]",
-            "plant_disturbances.0: ",
+            "plant.payloads=[{frame: world, mass: 1}]",
+            r"plant.payloads.0: .*'world'",
         ),
-        ("plant_parameters={wall.rpy: [0, 0, 0]}", "'wall.rpy'"),
+        (
+            "plant.disturbances=[{frame: world, force: [0, 0, 1]}]",
+            "plant.disturbances.0: ",
+        ),
+        ("plant.parameters={wall.rpy: [0, 0, 0]}", "'wall.rpy'"),
         ("sampling={period: 0.001}", r"sampling: .*0\.001"),
     ],
 )
@@ -164,8 +164,8 @@ def test_what_is_not_there_is_refused(settings, message):
 @pytest.mark.parametrize(
     "unknown",
     [
-        "plant_payloads=[{frame: tool, mass: 0.5}]",
-        "plant_disturbances=[{frame: tool, force: [0, 0, 10], start_time: 0.05, end_time: 0.15}]",
+        "plant.payloads=[{frame: tool, mass: 0.5}]",
+        "plant.disturbances=[{frame: tool, force: [0, 0, 10], start_time: 0.05, end_time: 0.15}]",
     ],
 )
 def test_rollouts_have_what_the_law_does_not_know(unknown):

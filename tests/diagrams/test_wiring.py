@@ -113,16 +113,14 @@ def test_a_scenario_with_another_mass_in_the_plant():
     """Feedback shrinks the force error to 1 / (1 + 4) of what it is without, within 5 %."""
     quiet = (
         "duration=2",
-        "force_feedback.noise_deviation=[0]",
-        "force_feedback.time_constant=0.002",
+        "sensors.force.noise_deviation=[0]",
+        "sensors.force.time_constant=0.002",
         "references.wall.force.frequencies=[0.5]",
     )
     loop, _, record = run_scenario(scenario("two_link_measured_force", *quiet))
     plant = loop.plant.GetMyContextFromRoot(loop.diagram.CreateDefaultContext())
     assert loop.plant.get_parameter(plant, "link2.mass") == pytest.approx([6.0])
-    *_, without = run_scenario(
-        scenario("two_link_measured_force", *quiet, "force_feedback=!ModelForce {}")
-    )
+    *_, without = run_scenario(scenario("two_link_measured_force", *quiet, "sensors.force=null"))
     errors = [np.max(np.abs(r["tracking_error"][r.time > 0.5, 1])) for r in (record, without)]
     assert errors[1] > 1.0
     assert errors[0] / errors[1] == pytest.approx(0.2, rel=0.05)
@@ -139,34 +137,34 @@ def test_a_scenario_with_another_mass_in_the_plant():
         ("two_link_motors", "actuation=[!Motor {}]", r"actuation.0: .*!Motor"),
         (
             "two_link_wall",
-            "force_feedback=!MeasuredForce {gain: 1}",
+            ["sensors.force={}", "law.force_gain=1"],
             "time_constant",
         ),
         (
             "two_link_wall",
-            "force_feedback=!MeasuredForce {sample_period: 0.01, gain: 2}",
-            "force_feedback: ",
+            ["sensors.force={sample_period: 0.01}", "law.force_gain=2"],
+            "sensors.force: ",
         ),
         (
             "two_link_wall",
-            "force_feedback=!MeasuredForce {time_constant: 0.01, gain: -1}",
+            ["sensors.force={time_constant: 0.01}", "law.force_gain=-1"],
             "force_gain",
         ),
-        ("two_link_wall", "plant_parameters={link3.mass: [1]}", "'link3.mass'"),
+        ("two_link_wall", "plant.parameters={link3.mass: [1]}", "'link3.mass'"),
         ("two_link_wall", "start.errors={wall.force: 1}", "wall.force"),
     ],
 )
 def test_refusals_name_the_key(name, setting, message):
     with pytest.raises(ScenarioError, match=message):
-        build_scenario(scenario(name, setting))
+        build_scenario(scenario(name, *([setting] if isinstance(setting, str) else setting)))
 
 
 @pytest.mark.parametrize(
     ("setting", "start"),
     [
         # The wall stands 2 cm farther than the law believes, or the springs are half as stiff.
-        ("plant_parameters={wall.position: [1.22, 0, 0]}", [1.22, 0.32]),
-        ("plant_parameters={flexible_joints.stiffness: [4e3, 4e3]}", [1.2, 0.32]),
+        ("plant.parameters={wall.position: [1.22, 0, 0]}", [1.22, 0.32]),
+        ("plant.parameters={flexible_joints.stiffness: [4e3, 4e3]}", [1.2, 0.32]),
     ],
 )
 def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
@@ -184,11 +182,9 @@ def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
 
 
 def test_a_gain_without_effect_is_refused():
-    with pytest.raises(ScenarioError, match="force_feedback or gains: "):
+    with pytest.raises(ScenarioError, match=r"sensors\.force or law\.gains: "):
         build_scenario(
-            scenario(
-                "two_link_flexible", "force_feedback=!MeasuredForce {time_constant: 0.01, gain: 2}"
-            )
+            scenario("two_link_flexible", "sensors.force.time_constant=0.01", "law.force_gain=2")
         )
 
 

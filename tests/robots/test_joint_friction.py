@@ -95,6 +95,6 @@ def test_friction_that_makes_no_sense_is_refused(joints, more, message):
 
 @pytest.mark.slow
 def test_drakes_own_plant_refuses_it_and_says_which_takes_it():
-    settings = ["known_forces=[!JointFriction {joints: [joint1], coulomb: 1}]"]
+    settings = ["robot.known_forces=[!JointFriction {joints: [joint1], coulomb: 1}]"]
     with pytest.raises(ScenarioError, match="!CompliantContact"):
         build_scenario(load_scenario("wall_point_contact", settings))

@@ -134,15 +134,15 @@ def test_a_law_that_knows_a_force_compensates_it(actuation):
 def test_frames_that_are_not_there_are_named():
     with pytest.raises(ModelError, match="'tol'"):
         pushed(frame="tol")
-    settings = ["known_forces=[{frame: tol}]"]
-    with pytest.raises(ScenarioError, match=r"known_forces.0: .*'tol'"):
+    settings = ["robot.known_forces=[{frame: tol}]"]
+    with pytest.raises(ScenarioError, match=r"robot.known_forces.0: .*'tol'"):
         build_scenario(load_scenario(find_scenario("two_link_wall"), settings))
 
 
 def test_a_scenario_has_loads():
     settings = [
-        "known_forces=[{frame: tool, name: push}]",
-        "plant_parameters={push.force: [0.0, 0.0, -5.0]}",
+        "robot.known_forces=[{frame: tool, name: push}]",
+        "plant.parameters={push.force: [0.0, 0.0, -5.0]}",
     ]
     loop, context = build_scenario(load_scenario(find_scenario("two_link_wall"), settings))
     own = loop.plant.GetMyContextFromRoot(context)

@@ -32,9 +32,12 @@ LATE = "sampling={period: 1.0e-3, delay: 1.0e-3}"
 
 
 def two_link(*settings: str) -> Scenario:
-    found = scenario("two_link_wall", "duration=0.02", PLANT, STILL, LATE, "gains=", *settings)
+    found = scenario("two_link_wall", "duration=0.02", PLANT, STILL, LATE, "law.gains=", *settings)
     found.start.errors.clear()
     return found
+
+
+FINE, ROUGH = "sensors.encoders.resolution=1.0e-5", "sensors.encoders.position_noise=1.0e-3"
 
 
 def chosen(found: Scenario) -> Scenario:
@@ -47,19 +50,19 @@ def test_what_is_left_out_is_advised_and_reported():
     completed, loop = build_completed(found)
     assert len(completed.notes) == 1
     assert "1e+05 N/m" in completed.notes[0]
-    assert "friction of: wall" in completed.notes[0]
+    assert "identifies: wall.friction" in completed.notes[0]
     model = scenario_model(found)
     structure = scenario_structure(model)
     mobility = structure.constraint_matrix(structure.states[0]).item()
     wanted = contact_gains(1e5, mobility, 1e-3, 1)
     run = completed.scenario
-    assert run.integral == ["tool.z", "wall.force"]
-    assert run.gains.outputs["tool.z"] == pytest.approx(wanted.position_gains(3), rel=1e-2)
-    assert run.gains.outputs["wall.force"] == [pytest.approx(wanted.force_gain, rel=1e-2)]
-    assert run.constraint_damping.all == [pytest.approx(-wanted.constraint_damping, rel=1e-2)]
-    assert run.observer.rate == pytest.approx(wanted.observer_rate, rel=1e-2)
-    assert run.observer.force_rate == pytest.approx(wanted.observer_force_rate, rel=1e-2)
-    assert run.force_feedback == parts.MeasuredForce(sample_period=1e-3)
+    assert run.law.integral == ["tool.z", "wall.force"]
+    assert run.law.gains.outputs["tool.z"] == pytest.approx(wanted.position_gains(3), rel=1e-2)
+    assert run.law.gains.outputs["wall.force"] == [pytest.approx(wanted.force_gain, rel=1e-2)]
+    assert run.law.constraint_damping.all == [pytest.approx(-wanted.constraint_damping, rel=1e-2)]
+    assert run.estimator.rate == pytest.approx(wanted.observer_rate, rel=1e-2)
+    assert run.estimator.force_rate == pytest.approx(wanted.observer_force_rate, rel=1e-2)
+    assert run.sensors.force == parts.MeasuredForce(sample_period=1e-3)
     assert loop.observer is not None
     assert loop.observer.friction_signals[0].name == "wall.friction"
 
@@ -67,70 +70,76 @@ def test_what_is_left_out_is_advised_and_reported():
 def test_encoders_are_estimated_at_rates_for_their_noise():
     """What is predicted is printed; coarser encoders have slower rates and larger errors."""
     fine, coarse = (
-        build_completed(two_link(f"encoders={{resolution: {size}}}"))[0]
+        build_completed(two_link(f"sensors.encoders={{resolution: {size}}}"))[0]
         for size in ("1.0e-6", "1.0e-3")
     )
     assert "estimate of the state" in fine.notes[0]
     assert "the best for one direction alone" in fine.notes[0]
-    assert fine.scenario.observer.state_rate > coarse.scenario.observer.state_rate
-    differences = chosen(two_link("encoders={resolution: 1.0e-6, velocity_bandwidth: 500}"))
-    assert differences.observer.state_rate is None
-    own = chosen(two_link("encoders={resolution: 1.0e-6}", "observer={rate: 20.0}"))
-    assert own.observer.state_rate is None
+    assert fine.scenario.estimator.state_rate > coarse.scenario.estimator.state_rate
+    differences = chosen(two_link("sensors.encoders={resolution: 1.0e-6, velocity_bandwidth: 500}"))
+    assert differences.estimator.state_rate is None
+    own = chosen(two_link("sensors.encoders={resolution: 1.0e-6}", "estimator={rate: 20.0}"))
+    assert own.estimator.state_rate is None
 
 
 @pytest.mark.slow
 def test_another_bandwidth_of_differences_is_named_if_it_is_much_better():
     """The named bandwidth has gains with the errors of the message, and no other is better."""
     wide, narrow = "velocity_bandwidth: 500", "velocity_bandwidth: 50"
-    (note,) = build_completed(two_link(f"encoders={{resolution: 1.0e-4, {wide}}}"))[0].notes
+    (note,) = build_completed(two_link(f"sensors.encoders={{resolution: 1.0e-4, {wide}}}"))[0].notes
     told = re.search(
         r"velocity_bandwidth of (\S+) rad/s in place of 500 the errors of one direction are "
         r"(\S+ mm and \S+ N)",
         note,
     )
-    better = f"encoders={{resolution: 1.0e-4, velocity_bandwidth: {told[1]}}}"
+    better = f"sensors.encoders={{resolution: 1.0e-4, velocity_bandwidth: {told[1]}}}"
     (note,) = build_completed(two_link(better))[0].notes
     assert f"the best for one direction alone: {told[2]} rms" in note
     assert "in place of" not in note
     with pytest.raises(ScenarioError, match="velocity_bandwidth") as raised:
-        chosen(two_link(f"encoders={{resolution: 1.0e-4, {narrow}}}"))
+        chosen(two_link(f"sensors.encoders={{resolution: 1.0e-4, {narrow}}}"))
     wider = re.search(r"or let velocity_bandwidth be (\S+) rad/s", str(raised.value))[1]
-    chosen(two_link(f"encoders={{resolution: 1.0e-4, velocity_bandwidth: {wider}}}"))
+    chosen(two_link(f"sensors.encoders={{resolution: 1.0e-4, velocity_bandwidth: {wider}}}"))
 
 
 def test_a_roughness_without_use_is_refused():
     with pytest.raises(ScenarioError, match="encoders"):
-        chosen(two_link("largest_roughness=1.0"))
+        chosen(two_link("law.largest_roughness=1.0"))
     with pytest.raises(ScenarioError, match="-1"):
-        chosen(two_link("encoders={resolution: 1.0e-5}", "largest_roughness=-1.0"))
+        chosen(two_link("sensors.encoders={resolution: 1.0e-5}", "law.largest_roughness=-1.0"))
 
 
 @pytest.mark.slow
 def test_a_noise_that_no_gains_smooth_is_named():
     with pytest.raises(ScenarioError, match="position"):
-        chosen(two_link("encoders={position_noise: 1.0e-3}", "largest_roughness=1.0e-4"))
+        chosen(
+            two_link("sensors.encoders={position_noise: 1.0e-3}", "law.largest_roughness=1.0e-4")
+        )
 
 
 def test_largest_errors_bound_what_is_predicted_or_say_what_forbids_them():
     free, bound = (
-        build_completed(two_link("encoders={resolution: 1.0e-5}", *more))[0]
-        for more in ((), ("largest_errors={position: 1.0e-3}",))
+        build_completed(two_link("sensors.encoders={resolution: 1.0e-5}", *more))[0]
+        for more in ((), ("law.largest_errors={position: 1.0e-3}",))
     )
-    assert bound.scenario.gains.outputs["tool.z"] < free.scenario.gains.outputs["tool.z"]
-    assert bound.scenario.largest_errors is None
+    assert bound.scenario.law.gains.outputs["tool.z"] < free.scenario.law.gains.outputs["tool.z"]
+    assert bound.scenario.law.largest_errors is None
     with pytest.raises(ScenarioError, match="gains: "):
-        chosen(two_link("encoders={resolution: 1.0e-5}", "largest_errors={position: 1.0e-7}"))
+        chosen(
+            two_link(
+                "sensors.encoders={resolution: 1.0e-5}", "law.largest_errors={position: 1.0e-7}"
+            )
+        )
     with pytest.raises(ScenarioError, match="largest_errors: "):
-        chosen(two_link("largest_errors={force: 0.1}"))
+        chosen(two_link("law.largest_errors={force: 0.1}"))
     with pytest.raises(ScenarioError, match="force"):
-        chosen(two_link("encoders={resolution: 1.0e-5}", "largest_errors={force: 0}"))
+        chosen(two_link("sensors.encoders={resolution: 1.0e-5}", "law.largest_errors={force: 0}"))
 
 
 @pytest.mark.slow
 def test_gains_that_cannot_be_computed_are_a_problem_before_a_run():
     found = find_feasibility(
-        two_link("encoders={position_noise: 1.0e-3}", "largest_roughness=1.0e-4")
+        two_link("sensors.encoders={position_noise: 1.0e-3}", "law.largest_roughness=1.0e-4")
     )
     assert any("position" in problem for problem in found.problems)
 
@@ -156,21 +165,21 @@ def test_run_reports_its_advice_and_what_it_identified(tmp_path, capsys):
     told = (out / "summary.txt").read_text()
     assert "recommended for a contact of 1e+05 N/m" in told
     assert "identified           wall.friction = " in told
-    assert load_scenario(out / "scenario.yaml").observer.identify_friction == ["wall"]
+    assert load_scenario(out / "scenario.yaml").estimator.identify == ["wall.friction"]
 
 
 def test_what_is_said_stays():
-    own = "observer={rate: 5, friction_rate: 1}", "integral=[wall.force]"
-    found = chosen(two_link(*own, "constraint_damping={all: [-40]}"))
-    assert (found.observer.rate, found.integral) == (5, ["wall.force"])
-    assert found.constraint_damping.all == [-40]
+    own = "estimator={rate: 5, friction_rate: 1}", "law.integral=[wall.force]"
+    found = chosen(two_link(*own, "law.constraint_damping={all: [-40]}"))
+    assert (found.estimator.rate, found.law.integral) == (5, ["wall.force"])
+    assert found.law.constraint_damping.all == [-40]
 
 
 def test_gains_that_are_given_leave_all_else_as_it_was():
-    found = two_link("gains={all: [-25]}")
+    found = two_link("law.gains={all: [-25]}")
     assert chosen(found) == found
-    assert found.integral == []
-    assert found.observer is None
+    assert found.law.integral is None
+    assert found.estimator is None
 
 
 def test_nothing_is_advised_behind_springs():
@@ -183,7 +192,6 @@ def test_nothing_is_advised_behind_springs():
 
 def test_ideal_plants_are_not_advised():
     found = replace(two_link(), plant=plants.IdealConstraints())
-    assert found.gains == parts.Poles(all=[-4.0])
     model = scenario_model(found)
     assert advised(found, model, scenario_structure(model)).scenario is found
 
@@ -226,15 +234,15 @@ def parameters(loop, wall):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["observer={rate: -1}"], "rate"),
+        (["estimator={rate: -1}"], "rate"),
         (
-            ["observer={rate: 5, identify_friction: [wal]}"],
-            "'wal'",
+            ["estimator={rate: 5, identify: [wal.friction]}"],
+            "'wal.friction'",
         ),
-        (["observer={rate: 5, identify_friction: [wall]}"], "friction"),
-        (["observer={rate: 5}", "gains={all: [-9]}"], "measured force"),
+        (["estimator={rate: 5, identify: [wall.friction]}"], "friction"),
+        (["estimator={rate: 5}", "law.gains={all: [-9]}"], "measured force"),
         (
-            ["observer={rate: 5}", "sampling=", "plant=!IdealConstraints {}"],
+            ["estimator={rate: 5}", "sampling=", "plant=!IdealConstraints {}"],
             "observe",
         ),
     ],
@@ -246,7 +254,7 @@ def test_observer_that_does_not_fit_is_refused(settings, message):
 
 def test_levers_and_mobilities_are_those_of_multibody_plant():
     """Of the point and of the wall; the matrices of MultibodyPlant alone, to round-off."""
-    found = two_link("encoders={resolution: 1.0e-4}")
+    found = two_link("sensors.encoders={resolution: 1.0e-4}")
     model = scenario_model(found)
     structure = scenario_structure(model)
     sensed = sensed_contact(found, model, structure, (1e-3, 1), 1e5)

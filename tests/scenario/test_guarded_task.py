@@ -24,8 +24,9 @@ constraints:
 - {name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
 outputs:
 - {frame: tool, axes: z}
-gains: {all: [-25]}
-constraint_damping: {all: [-250]}
+law:
+  gains: {all: [-25]}
+  constraint_damping: {all: [-250]}
 plant: !CompliantContact {radius: 1.0e-5}
 task:
   gains: {outputs: {wall.distance: [-8], "*": [-25]}}
@@ -197,7 +198,7 @@ def test_the_hardest_touch_is_told_with_its_phase():
 @pytest.mark.slow
 def test_a_bias_that_feels_like_a_touch_is_told_with_its_remedy(file, tmp_path, capsys):
     """3 N of bias end a move that feels for 2 N, in the air; with the bias found it touches."""
-    biased = "force_feedback=!MeasuredForce {sample_period: 0.001, bias: 3}"
+    biased = "sensors.force={sample_period: 0.001, bias: 3}"
     settings = (biased, TOLERANT)
     _, _, text = told(file, tmp_path, capsys, *settings)
     assert "task.tare_time" in text
@@ -209,7 +210,7 @@ def test_a_bias_that_feels_like_a_touch_is_told_with_its_remedy(file, tmp_path, 
 def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):
     """The bias is found within 0.1 s; from then on 10 N/s reach the 2 N of the move in 0.2 s."""
     settings = (
-        "force_feedback=!MeasuredForce {sample_period: 0.001, drift: 10}",
+        "sensors.force={sample_period: 0.001, drift: 10}",
         "task.tare_time=0.1",
         "task.phases.0.speed=0.01",
     )

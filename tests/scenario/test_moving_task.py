@@ -14,10 +14,11 @@ robot: {file: package://drake_dae_models/two_link_arm.urdf}
 constraints:
 - {name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
 outputs: [{frame: tool, axes: z}]
-gains: !Poles {all: [-20]}
+law:
+  gains: !Poles {all: [-20]}
+  constraint_damping: !Poles {all: [-250]}
 exogenous:
   wall.position: [!Sinusoids {offset: 1.2, amplitudes: [0.02], frequencies: [3.0]}, 0, 0]
-constraint_damping: !Poles {all: [-250]}
 plant: !CompliantContact {radius: 1.0e-5}
 task:
   phases:

@@ -29,12 +29,14 @@ constraints:
   friction: 0.0
 outputs:
 - {frame: tool, axes: z}
-gains: {all: [-25]}
-constraint_damping: {all: [-250]}
+law:
+  gains: {all: [-25]}
+  constraint_damping: {all: [-250]}
 sampling: {period: 0.001, delay: 0.001}
-force_feedback: !MeasuredForce {sample_period: 0.001, noise_deviation: 0.3}
+sensors:
+  force: {sample_period: 0.001, noise_deviation: 0.3}
 plant: !CompliantContact {radius: 1.0e-5, friction: 0.3}
-observer: {rate: 60, identify_friction: [wall]}
+estimator: {rate: 60, identify: [wall.friction]}
 task:
   gains: {outputs: {wall.distance: [-8], "*": [-25]}}
   phases:
@@ -49,7 +51,7 @@ task:
 start: {positions: {joint1: 1.1653, joint2: -1.8326}}
 duration: 2.0
 """
-BIASED = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.3, bias: 1.0}"
+BIASED = "sensors.force={sample_period: 0.001, noise_deviation: 0.3, bias: 1.0}"
 NO_PICTURES = ["--set", "write={plots: false, animation: false}"]
 
 
@@ -86,7 +88,7 @@ def test_an_observer_makes_a_task_robust_to_friction(file, tmp_path):
     errors = np.sqrt(np.mean(late(found) ** 2, axis=0))
     assert np.all(errors < [1e-4, 0.2])
     assert_allclose(found["friction"][-1], 0.3, rtol=0.1)
-    without = np.sqrt(np.mean(late(rolled(file, tmp_path, "observer=null")) ** 2, axis=0))
+    without = np.sqrt(np.mean(late(rolled(file, tmp_path, "estimator=null")) ** 2, axis=0))
     assert np.all(without > 5.0 * errors)
 
 
@@ -98,21 +100,21 @@ def test_an_observer_makes_a_task_robust_to_friction(file, tmp_path):
             [],
             [
                 # With the seeds 0 and 2 the first friction after the touch amplifies round-off.
-                "encoders={position_noise: 1.0e-5, velocity_noise: 0.01, seed: 1}",
-                "observer={rate: 60, state_rate: 200, identify_friction: [wall]}",
+                "sensors.encoders={position_noise: 1.0e-5, velocity_noise: 0.01, seed: 1}",
+                "estimator={rate: 60, state_rate: 200, identify: [wall.friction]}",
             ],
-            ["saturation=true", "plant_payloads=[{frame: tool, mass: 0.5}]"],
+            ["saturation=true", "plant.payloads=[{frame: tool, mass: 0.5}]"],
             [
                 BIASED,
-                "force_feedback.noise_deviation=0",
+                "sensors.force.noise_deviation=0",
                 "task.tare_time=0.0001",
                 "plant.friction=0",  # Or it sticks, with an error of the force.
             ],
             [
                 BIASED,
                 "task.tare_time=0.1",
-                "encoders={position_noise: 1.0e-5}",
-                "observer={rate: 60, state_rate: 200, identify_friction: [wall]}",
+                "sensors.encoders={position_noise: 1.0e-5}",
+                "estimator={rate: 60, state_rate: 200, identify: [wall.friction]}",
             ],
         ],
         of=3,
@@ -135,8 +137,8 @@ def test_a_rollout_is_drakes_run(file, tmp_path, settings):
 def test_a_disturbance_is_seen_whether_the_contact_is_open_or_closed(file, tmp_path):
     """A payload of 0.5 kg at rest: the generalized force J^T m g, by the virtual work of a mass at
     the tool of a planar arm with links of 1 m."""
-    settings = ["plant_payloads=[{frame: tool, mass: 0.5}]", "force_feedback.noise_deviation=0"]
-    settings += ["plant.friction=0", "observer={rate: 60}"]
+    settings = ["plant.payloads=[{frame: tool, mass: 0.5}]", "sensors.force.noise_deviation=0"]
+    settings += ["plant.friction=0", "estimator={rate: 60}"]
     resting = "task.phases=[!Move {references: {tool.z: 0.3, wall.distance: 0.02}, duration: 1}]"
     pressing = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
     for phases in (resting, pressing):
@@ -164,7 +166,7 @@ def test_the_low_pass_leaves_a_sixth_of_the_force_that_counts():
 @pytest.mark.parametrize("seed", some([1, 2, 3]))
 def test_noise_is_no_touch(file, tmp_path, seed):
     """It touches at the wall, within what 0.1 m/s goes in the seven samples of the low-pass."""
-    settings = [f"force_feedback.seed={seed}", "duration=0.4"]
+    settings = [f"sensors.force.seed={seed}", "duration=0.4"]
     _, distance = touched(rolled(file, tmp_path, *settings))
     assert abs(distance) < 1e-3
 
@@ -172,7 +174,7 @@ def test_noise_is_no_touch(file, tmp_path, seed):
 @pytest.mark.slow
 def test_a_study_varies_the_noise_that_a_task_knows(file, tmp_path):
     """Each run is that of its scenario alone: its low-pass is that of its own noise."""
-    name = "force_feedback.noise_deviation"
+    name = "sensors.force.noise_deviation"
     chosen = load_scenario(file, ["duration=0.4"])
     variations = grid_variations({name: [0.1, 0.3]})
     study = sweep(chosen, variations, tmp_path / "runs.db", workers=1, rollout=True)
@@ -198,13 +200,13 @@ def test_a_bias_is_found_before_the_touch(file, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [(), ("encoders={position_noise: 1.0e-5}", "observer={rate: 60, state_rate: 200}")],
+    [(), ("sensors.encoders={position_noise: 1.0e-5}", "estimator={rate: 60, state_rate: 200}")],
     ids=["observer", "estimator"],
 )
 def test_an_observer_takes_the_force_without_its_bias(file, tmp_path, settings):
     """1 N of bias would be seen as a disturbance of 1 N m and more, with arms of 1 m. 0.2: what
     100 samples of 0.3 N leave of the bias, and the mean of the noise since."""
-    still = ["plant.friction=0", "observer={rate: 60}", "duration=1.5", "task.tare_time=0.1"]
+    still = ["plant.friction=0", "estimator={rate: 60}", "duration=1.5", "task.tare_time=0.1"]
     only = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
     found = rolled(file, tmp_path, BIASED, *still, only, *settings)
     seen = np.mean(found["disturbance"][found.time > 1.0], axis=0)
@@ -223,9 +225,9 @@ def test_no_phase_ends_before_the_bias_is_found(file, tmp_path):
 @pytest.mark.parametrize("rollout", some([True, False]))
 def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys, rollout):
     """A push pulls with 40 N where the arm rests with 10 N; the law in contact would go on."""
-    push = "plant_disturbances=[{frame: tool, force: [-40, 0, 0], start_time: 0.8, end_time: 3}]"
+    push = "plant.disturbances=[{frame: tool, force: [-40, 0, 0], start_time: 0.8, end_time: 3}]"
     only = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
-    settings = [push, only, "observer=null", "task.patience=0.02", "duration=1.6"]
+    settings = [push, only, "estimator=null", "task.patience=0.02", "duration=1.6"]
     settings.append("plant.friction=0")
     if rollout:
         found = rolled(file, tmp_path, *settings)
@@ -243,7 +245,7 @@ def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys, rol
 @pytest.mark.slow
 def test_integrals_of_a_task_wait_for_limited_drives(file):
     """Of both laws, by the input port of the controller; else only those of the other law."""
-    chosen = load_scenario(file, ["observer=null"])
+    chosen = load_scenario(file, ["estimator=null"])
     loop, context = build_scenario(chosen)
     supervisor, controller = loop.controller.supervisor, loop.controller
     names = ("free_hold", "contact_hold")
@@ -270,7 +272,7 @@ def test_integrals_of_a_task_wait_for_limited_drives(file):
 def test_a_release_ends_though_a_bias_hides_that_the_contact_is_open(file, tmp_path):
     """Formerly the law in contact drew the arm away until it diverged."""
     phases = "task.phases=[!Press {force: 10, over: 0.1, tolerance: 3}, !Release {if_late: hold}]"
-    weak = "constraint_damping={all: [-25]}"  # Or it goes slowly.
+    weak = "law.constraint_damping={all: [-25]}"  # Or it goes slowly.
     found = rolled(file, tmp_path, BIASED, phases, weak, "duration=4")
     assert found["phase"][-1, 2] == 1.0
     assert 0.02 < found["distance"][-1, 0] < 0.05
@@ -287,7 +289,7 @@ def test_a_sensor_begins_with_its_bias(file):
 
 def test_a_start_in_contact_is_on_the_wall_of_the_plant(file):
     """The law has a disturbance besides, and takes the wall to be 50 mm nearer."""
-    moved = ["plant_parameters={wall.position: [1.25, 0, 0]}", "task.phases=[!Press {force: 10}]"]
+    moved = ["plant.parameters={wall.position: [1.25, 0, 0]}", "task.phases=[!Press {force: 10}]"]
     loop, context = build_scenario(load_scenario(file, moved))
     own = loop.plant.GetMyContextFromRoot(context)
     gap = loop.plant.GetOutputPort("constraint_residual").Eval(own)[0]
@@ -296,7 +298,7 @@ def test_a_start_in_contact_is_on_the_wall_of_the_plant(file):
 
 @pytest.mark.slow
 def test_a_contact_that_is_not_there_ends_the_approach(file):
-    settings = ["plant_parameters={wall.position: [1.3, 0, 0]}", "task.phases.0.behind=0.01"]
+    settings = ["plant.parameters={wall.position: [1.3, 0, 0]}", "task.phases.0.behind=0.01"]
     with pytest.raises(SimulationError, match=r"Approach.*0\.01"):
         run_scenario(load_scenario(file, settings))
 
@@ -305,9 +307,11 @@ def test_a_contact_that_is_not_there_ends_the_approach(file):
 def test_gains_of_a_task_are_advised(file, tmp_path, capsys):
     """With friction of 0.3 in Drake's contact: 0.02 mm and 0.05 N were asked, 3.6 mm and 3.2 N
     were; the peak of the touch stays below what was told."""
-    text = OBSERVED.replace("gains: {all: [-25]}\nconstraint_damping: {all: [-250]}\n", "")
+    text = OBSERVED.replace(
+        "law:\n  gains: {all: [-25]}\n  constraint_damping: {all: [-250]}\n", ""
+    )
     text = text.replace('  gains: {outputs: {wall.distance: [-8], "*": [-25]}}\n', "")
-    text = text.replace("observer: {rate: 60, identify_friction: [wall]}\n", "")
+    text = text.replace("estimator: {rate: 60, identify: [wall.friction]}\n", "")
     file.write_text(text.replace(", noise_deviation: 0.3", ""))
     found = rolled(file, tmp_path, "duration=2.5", "task.phases.0.speed=0.03")
     errors = late(found, after=2.0)
@@ -319,7 +323,7 @@ def test_gains_of_a_task_are_advised(file, tmp_path, capsys):
 
 def test_parameters_of_another_system_are_taken_by_name(file):
     """The law's model has a disturbance and its derivatives, the plant's a payload."""
-    payload = "plant_payloads=[{frame: tool, mass: 0.5}]"
+    payload = "plant.payloads=[{frame: tool, mass: 0.5}]"
     loop, _ = build_scenario(load_scenario(file, [payload]))
     own, law = loop.plant.dae, loop.controller.law.system
     names = {p.name for p in law.parameters} & {p.name for p in own.parameters}
@@ -336,7 +340,7 @@ def test_parameters_of_another_system_are_taken_by_name(file):
     ("change", "message"),
     [
         (
-            "force_feedback=!ModelForce {}",
+            "sensors.force=null",
             "observer",
         ),
         ("task.contact_force=0.1", r"contact_force: .*0\.3.*0\.1"),
@@ -350,8 +354,11 @@ def test_parameters_of_another_system_are_taken_by_name(file):
 )
 def test_what_does_not_fit_is_said(file, change, message):
     settings = [change]
-    if "ModelForce" in change:
-        settings += ["encoders={position_noise: 1.0e-5}", "observer={rate: 60, state_rate: 200}"]
+    if "force=null" in change:
+        settings += [
+            "sensors.encoders={position_noise: 1.0e-5}",
+            "estimator={rate: 60, state_rate: 200}",
+        ]
     with pytest.raises(ScenarioError, match=message):
         build_scenario(load_scenario(file, settings))
 

@@ -117,8 +117,11 @@ def test_every_form_reads_back_equal(tmp_path):
             DcMotors(0.1, np.array([1e-3, 2e-3]), 0.5),
             ElectrohydraulicServos(1e6, np.diag([1e-6, 2e-6]), np.eye(2)),
         ],
-        force_feedback=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0], gain=np.eye(2)),
-        gains=forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]),
+        sensors=forms.Sensors(force=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0])),
+        law=forms.Law(
+            forms.Matrices([[[[1.0, 0.5], [0.0, 2.0]], [[3.0, 0.0], [0.0, 4.0]]]]),
+            force_gain=np.eye(2),
+        ),
         references={
             "a": ConstantReference([1.0]),
             "b": SinusoidReference(1.0, [2.0], [3.0], [4.0]),
@@ -138,10 +141,10 @@ def test_every_form_reads_back_equal(tmp_path):
     assert copy.outputs == scenario.outputs
     assert copy.forces == scenario.forces
     assert copy.references == scenario.references
-    assert copy.gains == scenario.gains
-    assert copy.force_feedback.sensor(2).sample_period == 0.001
+    assert copy.law.gains == scenario.law.gains
+    assert copy.sensors.force.sensor(2).sample_period == 0.001
     pairs = list(zip(copy.actuation, scenario.actuation, strict=True))
-    for one, other in [*pairs, (copy.force_feedback, scenario.force_feedback)]:
+    for one, other in [*pairs, (copy.sensors.force, scenario.sensors.force)]:
         assert type(one) is type(other)
         for item in fields(one):
             np.testing.assert_array_equal(getattr(one, item.name), getattr(other, item.name))
@@ -154,7 +157,7 @@ def test_defaults_are_those_of_the_dataclasses(tmp_path):
     assert scenario.write == forms.Write(record=True, plots=False, animation=True)
     assert scenario.integrator.integration_scheme == "runge_kutta5"
     assert scenario.integrator.use_error_control
-    assert scenario.gains == forms.Poles(all=[-4.0])
+    assert scenario.law.gains is None
 
 
 def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
@@ -182,14 +185,17 @@ def test_packages_of_a_robot(tmp_path):
         ("write.plots=true", lambda s: s.write.plots is True),
         ("constraints.0.surface.point.0=1.1", lambda s: s.constraints[0].surface.point[0] == 1.1),
         ("constraints.0.surface.point=[1, 0, 0]", lambda s: s.constraints[0].surface.point[0] == 1),
-        ("gains=!Coefficients {all: [16, 8]}", lambda s: s.gains == forms.Coefficients([16, 8])),
+        (
+            "law.gains=!Coefficients {all: [16, 8]}",
+            lambda s: s.law.gains == forms.Coefficients([16, 8]),
+        ),
         ("references.wall.force=9", lambda s: s.references["wall.force"] == 9.0),
         ("references.wall.force.offset=9", lambda s: s.references["wall.force"].offset == 9.0),
         ("references.tool=0.3", lambda s: list(s.references) == ["tool.z", "wall.force", "tool"]),
         ("start.errors.tool.z=0.01", lambda s: s.start.errors == {"tool.z": 0.01}),
-        ("gains={outputs: {tool.z: [-3]}}", lambda s: s.gains.outputs == {"tool.z": [-3]}),
-        ("tolerances.tool.z=2", lambda s: s.tolerances == {"tool.z": 2.0}),
-        ("plant_parameters.link2.mass=[5]", lambda s: s.plant_parameters == {"link2.mass": [5]}),
+        ("law.gains={outputs: {tool.z: [-3]}}", lambda s: s.law.gains.outputs == {"tool.z": [-3]}),
+        ("judgement.tolerances.tool.z=2", lambda s: s.judgement.tolerances == {"tool.z": 2.0}),
+        ("plant.parameters.link2.mass=[5]", lambda s: s.plant.parameters == {"link2.mass": [5]}),
         ("description=a b", lambda s: s.description == "a b"),
         ("description=", None),
     ],
@@ -259,7 +265,7 @@ def test_surfaces(form, surface):
     ],
 )
 def test_gains(form, poles):
-    loop, _ = build_scenario(two_link(f"gains={form}"))
+    loop, _ = build_scenario(two_link(f"law.gains={form}"))
     # A double pole is found to the root of the round-off.
     found = np.sort_complex(loop.controller.law.gains.poles)
     np.testing.assert_allclose(found, poles, atol=1e-6)
@@ -432,6 +438,6 @@ def test_stages(form, stage):
     ],
 )
 def test_force_gain(gain, matrix):
-    force = f"force_feedback=!MeasuredForce {{time_constant: 0.01, gain: {gain}}}"
-    loop, _ = build_scenario(load_scenario(find_scenario("five_bar"), [force]))
+    settings = ["sensors.force.time_constant=0.01", f"law.force_gain={gain}"]
+    loop, _ = build_scenario(load_scenario(find_scenario("five_bar"), settings))
     np.testing.assert_array_equal(loop.controller.law.measured_force.gain, matrix)

@@ -94,7 +94,8 @@ constraints:
   point_b: [0.0, 0.0, 0.0]
   length: 0.7
 outputs: [!PointCoordinates {{frame: tool, axes: z}}]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   tool.z: !Sinusoids {{offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}}
   rod.thrust: 30.0
@@ -103,7 +104,8 @@ start: {{positions: {{joint1: 1.2, joint2: -1.6}}, errors: {{tool.z: 0.02}}}}
 GEARS = f"""{TWO_LINK}
 constraints: [!JointCoupler {{follower: joint2, leader: joint1, ratio: -1.5, offset: 0.2}}]
 outputs: [!JointPositions {{joints: [joint1]}}]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   joint1: !Sinusoids {{offset: 0.9, amplitudes: [0.2], frequencies: [2.0]}}
   coupler.moment: 5.0
@@ -122,7 +124,8 @@ constraints:
 outputs:
 - !PointCoordinates {frame: tool, axes: yz}
 - !JointPositions {joints: [joint3, joint7]}
-gains: !Poles {all: [-4.0]}
+law:
+  gains: !Poles {all: [-4.0]}
 references:
   tool.y: !Sinusoids {offset: 0.0, amplitudes: [0.1], frequencies: [2.0]}
   tool.z: 0.55
@@ -134,7 +137,8 @@ start: {positions: {joint2: -0.6, joint4: -1.7, joint6: 0.5}, errors: {tool.z: 0
 SKATE = f"""{ROBOT}
 constraints: [!Blade {{frame: deck}}]
 outputs: [!JointPositions {{joints: [x, turn_z]}}]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   x: !Sinusoids {{offset: 0.0, amplitudes: [0.5], frequencies: [1.0]}}
   turn_z: !Sinusoids {{offset: 0.3, amplitudes: [0.2], frequencies: [2.0]}}
@@ -147,7 +151,8 @@ constraints:
 - !RollingWheel {{frame: right_wheel, radius: 0.1, holds_side: false, name: right}}
 outputs: [!PointCoordinates {{frame: deck, axes: xy, point: [0.3, 0, 0]}}]
 forces: []
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   deck.x: !Sinusoids {{offset: 0.3, amplitudes: [0.4], frequencies: [0.8]}}
   deck.y: !Sinusoids {{offset: 0.0, amplitudes: [0.3], frequencies: [1.1]}}
@@ -162,7 +167,8 @@ constraints:
   name: dome
 outputs: [!PointCoordinates {{frame: ball, axes: xy}}]
 forces: [dome.force]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   ball.x: !Sinusoids {{offset: 0.0, amplitudes: [0.2], frequencies: [1.0]}}
   ball.y: 0.1
@@ -172,7 +178,8 @@ start: {{errors: {{ball.x: 0.03}}}}
 PADS = f"""{ROBOT}
 outputs: [!JointPositions {{joints: [arm, left]}}]
 forces: []
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references:
   arm: !Sinusoids {{offset: 0.3, amplitudes: [0.2], frequencies: [2.0]}}
   left: !Sinusoids {{offset: 0.02, amplitudes: [0.01], frequencies: [3.0]}}

@@ -89,9 +89,9 @@ def test_shipped_scenario_runs_from_its_start_errors(name):
     for i, signal in enumerate(loop.plant.dae.output_signals):
         wanted = scenario.start.errors.get(signal.name, 0.0)
         # With a degree of 0 the law meets the reference at once, if its model is right.
-        if loop.controller.law.degrees[i] or not scenario.plant_parameters:
+        if loop.controller.law.degrees[i] or not scenario.plant.parameters:
             assert record["tracking_error"][0, i] == pytest.approx(wanted, abs=1e-9)
-    if not scenario.plant_parameters:
+    if not scenario.plant.parameters:
         # Accuracy 1e-8 in a step; of the actuated ones see ACTUATED.
         assert np.max(distance) < 1e-5 * max(map(abs, scenario.start.errors.values()))
 

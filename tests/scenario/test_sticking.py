@@ -34,7 +34,7 @@ def creeping(step, *settings):
         f"friction: {FRICTION}, stiction_tolerance: {SLIDING}}}",
         "references={tool.z: !Sinusoids {offset: 0.3, amplitudes: [0.1], frequencies: [0.1]}, "
         f"wall.force: {FORCE}}}",
-        "gains=!Poles {all: [-20]}",
+        "law.gains=!Poles {all: [-20]}",
         "start.errors={}",
         "duration=3",
         "integrator={integration_scheme: runge_kutta3, use_error_control: false, "
@@ -116,6 +116,10 @@ def test_what_sticks_with_any_step_is_not_told(settings):
     assert not sticking_before(*parts(creeping(0.05, *settings)))
 
 
+def with_plant(chosen, parameters):
+    return replace(chosen, plant=replace(chosen.plant, parameters=parameters))
+
+
 def test_friction_and_mass_are_those_of_the_plant():
     """The friction of the constraint where the plant has none, and values that differ in it."""
     own = [
@@ -125,9 +129,9 @@ def test_friction_and_mass_are_those_of_the_plant():
     chosen, model, structure = parts(creeping(0.05, *own))
     same = sticking_before(*parts(creeping(0.05)))
     assert sticking_before(chosen, model, structure) == same
-    rough = replace(chosen, plant_parameters={"wall.friction": 2 * FRICTION})
+    rough = with_plant(chosen, {"wall.friction": 2 * FRICTION})
     assert f"{2 * FRICTION:g} and {FORCE:g} N" in sticking_before(rough, model, structure)
-    heavy = replace(chosen, plant_parameters={"link2.mass": 1e3})
+    heavy = with_plant(chosen, {"link2.mass": 1e3})
     text = sticking_note(heavy, model, structure.states[:1], np.array([[FORCE]]))
     assert not text
 

@@ -22,8 +22,9 @@ constraints:
 - {name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
 outputs:
 - {frame: tool, axes: z}
-gains: {all: [-25]}
-constraint_damping: {all: [-250]}
+law:
+  gains: {all: [-25]}
+  constraint_damping: {all: [-250]}
 plant: !CompliantContact {radius: 1.0e-5}
 task:
   gains: {outputs: {wall.distance: [-8], "*": [-25]}}
@@ -94,8 +95,8 @@ def test_analysis_of_a_task_knows_its_robot(file):
 @pytest.mark.slow
 def test_several_integrals_serve_a_task_whose_contact_opens(file):
     """The task holds them itself while the contact is open."""
-    measured = "force_feedback=!MeasuredForce {sample_period: 0.001}"
-    settings = [measured, "integral=[tool.z, wall.force]", "task.phases.1.tolerance=3"]
+    measured = "sensors.force={sample_period: 0.001}"
+    settings = [measured, "law.integral=[tool.z, wall.force]", "task.phases.1.tolerance=3"]
     loop, context, record = run_scenario(load_scenario(file, settings))
     assert loop.changes(context)[-1].phase == "done"
     assert_allclose(record["tracking_error"][-1, 1], 0.0, atol=0.05)
@@ -109,7 +110,7 @@ def test_a_touch_lasts_up_to_the_computed_speed(file, mass):
     A touch that falls between samples is felt with a force of up to k v T, which helps to keep the
     contact; so the computed speed may be below the largest one, and is not above it.
     """
-    settings = ["constraint_damping=null", "gains=null"]
+    settings = ["law.constraint_damping=null", "law.gains=null"]
     settings += ["task.gains=null", "task.phases.0.speed=null", "duration=1.5"]
     settings.append("constraints.0.surface.point=[1.183, 0, 0]")  # 3 mm before it
     if mass:
@@ -146,7 +147,7 @@ def test_a_touch_lasts_up_to_the_computed_speed(file, mass):
         ("task.gains={all: [5]}", r"task\.gains: .*Hurwitz"),
         ("references={tool.z: 0.3}", "references: "),
         ("start.errors={tool.z: 0.1}", r"start\.errors: "),
-        ("integral=[wall.force]", "integral: .*wall.force"),
+        ("law.integral=[wall.force]", "integral: .*wall.force"),
     ],
 )
 def test_what_does_not_fit_is_named_by_its_key(file, change, message):
@@ -177,10 +178,10 @@ def test_a_task_that_begins_in_contact_starts_on_it(file):
 
 @pytest.mark.slow
 def test_a_task_has_the_noise_of_its_seed(file):
-    noisy = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}"
+    noisy = "sensors.force={sample_period: 0.001, noise_deviation: 0.1}"
     found = []
     for seed in (1, 2, 1):
-        settings = [noisy, f"force_feedback.seed={seed}"]
+        settings = [noisy, f"sensors.force.seed={seed}"]
         loop, context = build_scenario(load_scenario(file, settings))
         own = loop.noise.GetMyContextFromRoot(context)
         found.append(loop.noise.get_output_port().Eval(own).item())
@@ -192,7 +193,7 @@ def test_a_link_is_heavier_in_either_plant(file):
     """The free robot sags alike; Drake's steps of 0.1 ms are off by their order, 0.1 %."""
     sagged = []
     for plant in ("!CompliantContact {time_step: 1.0e-4}", "!MultibodyPlant {time_step: 1.0e-4}"):
-        change = [f"plant={plant}", "plant_parameters={link2.mass: 13}", "duration=0.05"]
+        change = [f"plant={plant}", "plant.parameters={link2.mass: 13}", "duration=0.05"]
         found = load_scenario(file, change)
         loop, context = build_scenario(found)
         simulate(loop.diagram, context, found.duration, found.integrator)

@@ -15,7 +15,8 @@ ROBOTS = Path(__file__).parent / "robots"
 
 SINE = "{offset: %s, amplitudes: [%s], frequencies: [2]}"
 REST = """
-gains: {all: [-4]}
+law:
+  gains: {all: [-4]}
 duration: 0.3
 integrator: {max_step_size: 0.01, use_error_control: false}
 """
@@ -172,7 +173,8 @@ constraints: [!JointCoupler {follower: j1, leader: j2, ratio: 2}]
 outputs: [!JointPositions {joints: [j1]}]
 forces: []
 references: {j1: 0.3}
-gains: {all: [-4]}
+law:
+  gains: {all: [-4]}
 """
 
 

@@ -24,7 +24,11 @@ def run(name, *settings):
     case = scenario(name, *settings)
     loop, context = build_scenario(case)
     return simulate(
-        loop.diagram, context, case.duration, case.integrator, may_diverge=case.may_diverge
+        loop.diagram,
+        context,
+        case.duration,
+        case.integrator,
+        may_diverge=case.judgement.may_diverge,
     )
 
 
@@ -37,18 +41,18 @@ LATE = "sampling={period: %g, delay: %g}"
         # Read late: the law answers an error of long ago.
         (
             "two_link_wall",
-            ("gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001)),
+            ("law.gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001)),
             "wall.force",
         ),
         pytest.param(
             "five_bar",
-            ("gains=!Poles {all: [-1500.0]}", LATE % (0.002, 0.002)),
+            ("law.gains=!Poles {all: [-1500.0]}", LATE % (0.002, 0.002)),
             "pin.f",
             marks=pytest.mark.slow,
         ),
         pytest.param(
             "seven_joint_dome",
-            ("gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004)),
+            ("law.gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004)),
             "dome.force",
             marks=pytest.mark.slow,
         ),
@@ -75,7 +79,7 @@ FIXED = (
 @pytest.mark.parametrize("fixed", [(), FIXED])
 @pytest.mark.parametrize("compiled", some(["true", "false"]))
 def test_rollouts_diverge_as_simulations_do(fixed, compiled):
-    settings = ("gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001), *fixed)
+    settings = ("law.gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001), *fixed)
     case = scenario("two_link_wall", *settings, f"compiled={compiled}")
     loop, context = build_scenario(case)
     found = roll_scenario(case, loop, context)
@@ -87,7 +91,9 @@ def test_rollouts_diverge_as_simulations_do(fixed, compiled):
     errors = np.abs(found.record["tracking_error"][:, -1])
     assert errors[-1] > 1e3 * 20.0
     if fixed:  # Under error control what may diverge takes shorter and shorter steps.
-        may = scenario("two_link_wall", *settings, f"compiled={compiled}", "may_diverge=true")
+        may = scenario(
+            "two_link_wall", *settings, f"compiled={compiled}", "judgement.may_diverge=true"
+        )
         later = roll_scenario(may, *build_scenario(may)).failure  # Numbers end.
         assert "the run diverges" not in str(later)
         assert later.time > found.failure.time
@@ -99,7 +105,7 @@ def test_tasks_diverge_by_their_own_outputs():
     """By simulate; rollouts, which are looked at before they have a row, end at least."""
     free = 'task.gains=!Poles {outputs: {wall.distance: [-5.0], "*": [-25.0]}}'
     touch = ("task.phases.1.speed=0.03", "task.phases.2.over=0.5")
-    gains = ("gains=!Poles {all: [-400.0]}", free)
+    gains = ("law.gains=!Poles {all: [-400.0]}", free)
     settings = ("wall_polish", *gains, *touch, LATE % (0.004, 0.004))
     with pytest.raises(SimulationError, match=r"wall\.force") as caught:
         run(*settings)
@@ -112,11 +118,11 @@ def test_tasks_diverge_by_their_own_outputs():
 
 @pytest.mark.slow
 def test_a_run_may_diverge_where_that_is_asked_for():
-    late = ("two_link_wall", "gains=!Poles {all: [-300.0]}", LATE % (0.005, 0.005))
+    late = ("two_link_wall", "law.gains=!Poles {all: [-300.0]}", LATE % (0.005, 0.005))
     short = "duration=0.05"
     with pytest.raises(SimulationError, match="may_diverge"):
         run(*late, short)
-    assert run(*late, short, "may_diverge=true").simulated_time == pytest.approx(0.05)
+    assert run(*late, short, "judgement.may_diverge=true").simulated_time == pytest.approx(0.05)
 
 
 def unstable_inside(size, period):

@@ -18,14 +18,14 @@ from drake_dae.errors import SimulationError
 from drake_dae.simulation import sampled
 from drake_dae.simulation.sampled import SampledRun
 
-NOISE = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
+NOISE = "sensors.force={sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
 
 LOOPS = {
     "observer and integrals": ("wall_point_contact",),
     "hydroelastic contact": ("wall_hydroelastic",),
     "encoders": (
         "wall_point_contact",
-        "encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}",
+        "sensors.encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}",
     ),
     "noise": ("wall_point_contact", NOISE),
     "a control that is late": ("wall_point_contact", "sampling={period: 2.0e-3, delay: 3.0e-3}"),

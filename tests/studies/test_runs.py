@@ -21,10 +21,10 @@ NUMBERS = [
     {},
     {"start.errors.tool.z": 0.02},
     {"start.positions.joint1": 1.1},
-    {"plant_parameters.link1.mass": 11.0},
-    {"plant_parameters.link1.mass": [11.0]},
-    {"plant_parameters": {"wall.position": [1.21, 0.0, 0.0]}},
-    {"gains.all": [-8.0]},
+    {"plant.parameters.link1.mass": 11.0},
+    {"plant.parameters.link1.mass": [11.0]},
+    {"plant.parameters": {"wall.position": [1.21, 0.0, 0.0]}},
+    {"law.gains.all": [-8.0]},
     {"integrator.accuracy": 1e-4, "duration": 0.2},
     {"integrator.start_time": 0.5},
     {"write.plots": False, "description": "other"},
@@ -67,11 +67,11 @@ def test_runs_that_share_a_loop_equal_runs_alone():
 LOADED = (
     "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5, friction: 0.3}",
     "sampling={period: 0.001, delay: 0.001}",
-    "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1}",
-    "encoders={position_noise: 1.0e-5}",
-    "observer={rate: 20}",
-    "plant_payloads=[{frame: tool, mass: 0.2}]",
-    "plant_disturbances=[{frame: tool, force: [1, 0, 0]}]",
+    "sensors.force={sample_period: 0.001, noise_deviation: 0.1}",
+    "sensors.encoders={position_noise: 1.0e-5}",
+    "estimator={rate: 20}",
+    "plant.payloads=[{frame: tool, mass: 0.2}]",
+    "plant.disturbances=[{frame: tool, force: [1, 0, 0]}]",
     "duration=0.05",
     "compiled=false",
 )
@@ -83,16 +83,16 @@ LOADED = (
     [
         ("plant.friction", 0.1),
         ("plant.stiffness", 5e4),
-        ("plant_payloads.0.mass", 0.4),
-        ("plant_disturbances.0.force", [0.0, 0.0, 3.0]),
-        ("plant_disturbances.0.force.2", 2.0),
-        ("plant_parameters.wall.position", [1.201, 0.0, 0.0]),
-        ("force_feedback.seed", 3),
-        ("force_feedback.bias", 0.5),
-        ("force_feedback.drift", 0.5),
-        ("force_feedback.noise_deviation", 0.5),
-        ("encoders.seed", 3),
-        ("gains.all", [-3.0]),
+        ("plant.payloads.0.mass", 0.4),
+        ("plant.disturbances.0.force", [0.0, 0.0, 3.0]),
+        ("plant.disturbances.0.force.2", 2.0),
+        ("plant.parameters.wall.position", [1.201, 0.0, 0.0]),
+        ("sensors.force.seed", 3),
+        ("sensors.force.bias", 0.5),
+        ("sensors.force.drift", 0.5),
+        ("sensors.force.noise_deviation", 0.5),
+        ("sensors.encoders.seed", 3),
+        ("law.gains.all", [-3.0]),
     ],
 )
 @pytest.mark.parametrize("is_rollout", some([False, True]))
@@ -116,15 +116,19 @@ def test_each_value_of_a_context_is_that_of_its_run(key, value, is_rollout):
     ("settings", "variation"),
     [
         # Its geometry and its masses are built in.
-        (("plant=!MultibodyPlant {}",), {"plant_parameters.wall.position": [1.21, 0.0, 0.0]}),
+        (("plant=!MultibodyPlant {}",), {"plant.parameters.wall.position": [1.21, 0.0, 0.0]}),
         # Another kind of plant may have other values in a context.
-        ((), {"plant": {"_tag": "!CompliantContact"}, "plant_parameters.link1.mass": 11.0}),
+        ((), {"plant": {"_tag": "!CompliantContact"}, "plant.parameters.link1.mass": 11.0}),
         ((), {"references.tool.z.offset": 0.2}),
         ((), {"constraints.0.surface.point": [1.25, 0.0, 0.0]}),
         ((), {"gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}}),
         # Gains are computed for the stiffness.
         (
-            ("plant=!CompliantContact {time_step: 0.001}", "sampling={period: 0.001}", "gains="),
+            (
+                "plant=!CompliantContact {time_step: 0.001}",
+                "sampling={period: 0.001}",
+                "law.gains=",
+            ),
             {"plant.stiffness": 1e4},
         ),
     ],
@@ -167,11 +171,11 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
     cases = [
         ({"start.errors.tool.z": 3.0}, Outcome.NO_START, "tool.z"),
         ({"start.positions.joint1": 9.0}, Outcome.REFUSED, "joint1"),
-        ({"plant_parameters.link7.mass": 1.0}, Outcome.REFUSED, "link7.mass"),
+        ({"plant.parameters.link7.mass": 1.0}, Outcome.REFUSED, "link7.mass"),
         ({"gains": {"_tag": "!Coefficients", "all": [1.0]}}, Outcome.REFUSED, "gains: "),
         ({"constraints": []}, Outcome.REFUSED, ": "),
         ({"constraints": []}, Outcome.REFUSED, ": "),
-        ({"gains.all": [4.0]}, Outcome.REFUSED, "gains: "),
+        ({"law.gains.all": [4.0]}, Outcome.REFUSED, "gains: "),
         ({"duration": -1.0}, Outcome.REFUSED, "duration"),
         (far, Outcome.FAILED, "t = "),
         ({}, Outcome.FINISHED, ""),
@@ -199,8 +203,10 @@ def test_what_no_rollout_has_is_reported():
 @pytest.mark.slow
 def test_tasks_vary_as_references_do():
     """Their gains are built in, also for rollouts, which give the same figures."""
-    base = scenario("wall_polish", "duration=0.1", "compiled=false", "gains=!Poles {all: [-25.0]}")
-    slower = {"gains.all": [-20.0]}
+    base = scenario(
+        "wall_polish", "duration=0.1", "compiled=false", "law.gains=!Poles {all: [-25.0]}"
+    )
+    slower = {"law.gains.all": [-20.0]}
     assert structure_of(slower, base) == slower
     found = Runner(scenario_data(base)).run(slower)
     check(scenario_data(base), slower, found)
@@ -212,11 +218,11 @@ def test_tasks_vary_as_references_do():
 @pytest.mark.slow
 def test_a_run_of_compliant_contact_has_its_own_parameters_alone():
     """Not those of the sweep's scenario, whose plant is built with them."""
-    text = "plant=!CompliantContact {}", "plant_parameters={wall.position: [0.702, 0, 0]}"
+    text = "plant=!CompliantContact {}", "plant.parameters={wall.position: [0.702, 0, 0]}"
     base = scenario_data(scenario("wall_point_contact", "compiled=false", *text, "duration=0.01"))
     runner = Runner(base)
-    found = runner.run({"plant_parameters": {}})
-    other = Runner(varied_data(base, {"plant_parameters": {}})).run({})
+    found = runner.run({"plant.parameters": {}})
+    other = Runner(varied_data(base, {"plant.parameters": {}})).run({})
     assert runner.run({}).figures != found.figures == other.figures
 
 

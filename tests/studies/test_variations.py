@@ -82,10 +82,10 @@ def parsed(*texts, count=None, seed=0, together=False):
         ("duration=1..2:3", [1, 1.5, 2]),
         ("duration=[1, 2.5]", [1, 2.5]),
         ("duration=1.5", [1.5]),
-        ("force_feedback.seed=1..3:3", [1, 2, 3]),
+        ("sensors.force.seed=1..3:3", [1, 2, 3]),
         ("start.errors.tool.z=-1e-2..1e-2:2", [-0.01, 0.01]),
-        ("gains.all=[[-4], [-8]]", [[-4], [-8]]),
-        ("gains=[!Poles {all: [-4]}]", [{"_tag": "!Poles", "all": [-4]}]),
+        ("law.gains.all=[[-4], [-8]]", [[-4], [-8]]),
+        ("law.gains=[!Poles {all: [-4]}]", [{"_tag": "!Poles", "all": [-4]}]),
     ],
 )
 def test_values_of_an_option(text, values):
@@ -94,34 +94,34 @@ def test_values_of_an_option(text, values):
 
 
 def test_options_make_a_grid_or_go_together():
-    options = ("duration=[1, 2]", "force_feedback.seed=5..6:2")
+    options = ("duration=[1, 2]", "sensors.force.seed=5..6:2")
     assert len(parsed(*options)) == 4
     assert parsed(*options, together=True) == [
-        {"duration": 1, "force_feedback.seed": 5},
-        {"duration": 2, "force_feedback.seed": 6},
+        {"duration": 1, "sensors.force.seed": 5},
+        {"duration": 2, "sensors.force.seed": 6},
     ]
 
 
 def test_a_random_range_is_whole_where_the_key_is():
     found = parsed(
-        "force_feedback.seed=1..9", "duration=1..9", "start.errors.tool.z=[0, 1]", count=30
+        "sensors.force.seed=1..9", "duration=1..9", "start.errors.tool.z=[0, 1]", count=30
     )
-    assert {type(v["force_feedback.seed"]) for v in found} == {int}
+    assert {type(v["sensors.force.seed"]) for v in found} == {int}
     assert {type(v["duration"]) for v in found} == {float}
     assert {v["start.errors.tool.z"] for v in found} == {0, 1}
-    assert max(v["force_feedback.seed"] for v in found) <= 9
+    assert max(v["sensors.force.seed"] for v in found) <= 9
 
 
 def test_ranges_within_a_value_are_drawn_each_on_its_own():
-    option = "plant_parameters.wall.position=[[1.19..1.21, 0, 0.5..0.6], [1.3, 0, 0]]"
-    found = [v["plant_parameters.wall.position"] for v in parsed(option, count=200, seed=3)]
+    option = "plant.parameters.wall.position=[[1.19..1.21, 0, 0.5..0.6], [1.3, 0, 0]]"
+    found = [v["plant.parameters.wall.position"] for v in parsed(option, count=200, seed=3)]
     drawn = np.array([value for value in found if value != [1.3, 0, 0]])
     assert 60 < len(drawn) < 140
     assert np.all(np.abs(drawn[:, 0] - 1.2) < 0.01)
     assert np.all(np.abs(drawn[:, 2] - 0.55) < 0.05)
     assert abs(np.corrcoef(drawn[:, 0], drawn[:, 2])[0, 1]) < 0.5
     assert found[:50] == [
-        v["plant_parameters.wall.position"] for v in parsed(option, count=50, seed=3)
+        v["plant.parameters.wall.position"] for v in parsed(option, count=50, seed=3)
     ]
 
 
@@ -140,14 +140,14 @@ def test_ranges_within_a_value_are_drawn_each_on_its_own():
         (["duration=[1"], {}, "duration: line 1"),
         (["duration=1", "duration=2"], {}, "duration"),
         (
-            ["duration=[1, 2]", "force_feedback.seed=1"],
+            ["duration=[1, 2]", "sensors.force.seed=1"],
             {"together": True},
-            r"duration.*2.*force_feedback.seed",
+            r"duration.*2.*sensors.force.seed",
         ),
         (["duration=1..2"], {"count": 0}, r"count.*0"),
         (["duration=1..2"], {"count": 1, "seed": -1}, r"seed.*-1"),
         (
-            ["duration=1..2:900000", "force_feedback.seed=1..9:9"],
+            ["duration=1..2:900000", "sensors.force.seed=1..9:9"],
             {},
             r"1000000.*8100000",
         ),

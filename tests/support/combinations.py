@@ -31,9 +31,9 @@ ACTUATION = {
 }
 SENSING = {
     "exact": "",
-    "encoders": "encoders: {resolution: 1.0e-5, velocity_bandwidth: 300}\n",
-    "noise": "encoders: {position_noise: 1.0e-6, velocity_noise: 1.0e-4, seed: 3}\n",
-    "force": "force_feedback: !MeasuredForce {sample_period: 0.002, noise_deviation: 0.01}\n",
+    "encoders": "sensors: {encoders: {resolution: 1.0e-5, velocity_bandwidth: 300}}\n",
+    "noise": "sensors: {encoders: {position_noise: 1.0e-6, velocity_noise: 1.0e-4, seed: 3}}\n",
+    "force": "sensors: {force: {sample_period: 0.002, noise_deviation: 0.01}}\n",
 }
 PLANTS = {
     "ideal": "",
@@ -45,13 +45,15 @@ PLANTS = {
 """With a stiction_tolerance of 1e-4 m/s, steps of 1 ms are unstable where a tool behind springs
 sticks: they are 8.3 time constants of friction long, and round-off grows by 4.6e11 in a run; now by
 62."""
-REFERENCES = """gains: {all: [-10]}
+REFERENCES = """law:
+  gains: {all: [-10]}
 references:
   tool.z: !Sinusoids {offset: 0.3, amplitudes: [0.1], frequencies: [2.0]}
   wall.force: !Sinusoids {offset: 4.0, amplitudes: [10.0], frequencies: [60.0]}
 """
 SAMPLED = "sampling: {period: 0.002, delay: 0.001}\n"
-TASK = """gains: {all: [-10]}
+TASK = """law:
+  gains: {all: [-10]}
 task:
   phases:
   - !Press {force: 5, over: 0.01, within: 1.0}
@@ -61,12 +63,12 @@ task:
 CONTROLLERS = {
     "law": REFERENCES,
     "sampled": REFERENCES + SAMPLED,
-    "integral": REFERENCES.replace("[-10]", "[-10, -10, -10]") + SAMPLED + "integral: [tool.z]\n",
-    "observer": REFERENCES + SAMPLED + "observer: {rate: 20.0}\n",
+    "integral": REFERENCES.replace("[-10]}", "[-10, -10, -10]}\n  integral: [tool.z]") + SAMPLED,
+    "observer": REFERENCES + SAMPLED + "estimator: {rate: 20.0}\n",
     "limits": REFERENCES + "saturation: true\n",
     "task": TASK,
     "sampled task": TASK + SAMPLED,
-    "observed task": TASK + SAMPLED + "observer: {rate: 20.0}\nsaturation: true\n",
+    "observed task": TASK + SAMPLED + "estimator: {rate: 20.0}\nsaturation: true\n",
 }
 PARTS = (FRICTION, ACTUATION, SENSING, PLANTS, CONTROLLERS)
 CASES = list(product(*PARTS))

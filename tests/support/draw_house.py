@@ -30,6 +30,7 @@ LOOKS = {
     "robots": ("section 3: robots as DaeSystems", "#2b84b5"),
     "symbolic": ("from pydrake.symbolic", "#2a9d8f"),
     "analysis": ("what the theory says", "#4d9a4a"),
+    "references": ("what is wanted, over time", "#c79a1e"),
     "dae": ("sections 1 and 2, in the order of the paper", "#c77d1e"),
     "trace": ("CasADi alone: functions, derivatives, Newton", "#b8493c"),
     "arguments": ("annotations as checks", "#7a6a5a"),

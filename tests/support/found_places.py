@@ -15,10 +15,11 @@ def found_off(
     """
     dae = loop.controller.law.system
     distance = dae.trace("distance", {"value": dae.k})
-    places = {name: np.array(chosen.plant_parameters[name]) for name in chosen.identified}
+    own, sought = chosen.plant.parameters, chosen.estimator.identify
+    places = {name: np.array(own[name]) for name in sought if name in own}
     truth = dae.with_values(places).parameter_values
     names = [signal.name.partition("[")[0] for signal in record.signals["identified"].signals]
-    found = {n: record["identified"][at][[m == n for m in names]] for n in chosen.identified}
+    found = {n: record["identified"][at][[m == n for m in names]] for n in places}
     values = dae.with_values(found).parameter_values
     return np.array(
         [

@@ -49,7 +49,6 @@ WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "refe
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
     "system",
-    "kinetic_metric",
     "manifold",
     "derivatives",
     "elimination",

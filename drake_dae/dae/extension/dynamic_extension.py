@@ -100,19 +100,7 @@ def dynamic_extension(
 
 
 class _Chain:
-    """A system between the original and the extended one, with the integrators added so far.
-
-    Args:
-        system: The original one.
-        nominal: Values of its controls at the nominal state, shape (p,).
-        spread: The standard deviation of its states, as in `find_structure`.
-
-    Attributes:
-        system: The system with the integrators so far.
-        spread: The standard deviation of its states, shape (n,).
-        integrators: The number of integrators before each control.
-        offset, matrix: u of the original system is offset(x) + matrix(x) w.
-    """
+    """A system between the original and the extended one, with the integrators added so far."""
 
     def __init__(self, system: DaeSystem, nominal: FloatArray, spread: ArrayLike | None) -> None:
         self.system = system
@@ -135,13 +123,7 @@ class _Chain:
         return replace(self.system, nominal_state=beside, state_scale=self.system.scale)
 
     def integrate(self, columns: list[int], mixing: ca.SX | None = None) -> None:
-        """Puts one integrator before each of some controls.
-
-        Args:
-            columns: The columns of these controls.
-            mixing: b(x) of u_i* = u_i + sum_j b_ij(x) u_j, which takes the place of u_i first;
-                j are the other controls. Shape (len(columns), p - len(columns)).
-        """
+        """Puts one integrator before each of some controls."""
         system = self.system
         others = [j for j in range(system.num_controls) if j not in columns]
         nominal = self._nominal[columns]
@@ -176,14 +158,7 @@ class _Chain:
 
 
 def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | None] | None:
-    """Returns the controls that act in the dependent rows of B(x), and how to mix them.
-
-    Returns:
-        Columns and b(x) of `_Chain.integrate`; None if B(x) is regular.
-
-    Raises:
-        AssumptionError: No integrators help.
-    """
+    """Returns the controls that act in the dependent rows of B(x), and how to mix them."""
     system = structure.system
     samples = Samples(structure.manifold, structure.states)
     matrices = _control_matrices(structure, samples)
@@ -277,11 +252,7 @@ def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
 
 
 def _structure_at_nominal(chain: _Chain) -> Structure:
-    """The structure of the extended system, which is regular nearly everywhere.
-
-    Raises:
-        AssumptionError: B(x) is singular at the nominal state or near it.
-    """
+    """The structure of the extended system, which is regular nearly everywhere."""
     try:
         return find_structure(chain.system, spread=chain.spread)
     except AssumptionError as error:

@@ -114,11 +114,7 @@ def extend(
 
 
 def refuse_metric(system: DaeSystem) -> None:
-    """Checks that the system has no `control_metric`.
-
-    Raises:
-        ModelError: The system has a `control_metric`.
-    """
+    """Checks that the system has no `control_metric`."""
     if system.control_metric is not None:
         raise ModelError(
             f"{system.name}: control_metric compares controls, not their derivatives; leave it "
@@ -134,15 +130,7 @@ def integrated(
     nominal: FloatArray,
     mixing: ca.SX | None = None,
 ) -> DaeSystem:
-    """Puts one integrator before each of some controls, where u_i = x_i - sum_j b_ij(x) u_j.
-
-    Args:
-        system: The system (1)-(3).
-        columns: The columns of the q controls.
-        added, following: Names of the new states and controls.
-        nominal: Values of the new states, shape (q,).
-        mixing: The matrix b(x), shape (q, p - q); zero if None.
-    """
+    """Puts one integrator before each of some controls, where u_i = x_i - sum_j b_ij(x) u_j."""
     q, n, p = len(columns), system.num_states, system.num_controls
     others = [j for j in range(p) if j not in columns]
     new = ca.vertcat(*[ca.SX.sym(signal.name) for signal in added])
@@ -175,11 +163,7 @@ def integrated(
 
 
 def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> FloatArray:
-    """Returns the controls at the nominal state, shape (p,), from their names; 0 for others.
-
-    Raises:
-        ModelError: A name is not that of a control, or a value is not finite.
-    """
+    """Returns the controls at the nominal state, shape (p,), from their names; 0 for others."""
     values = values or {}
     _check_names(system, values, "nominal_control")
     controls = [values.get(s.name, 0.0) for s in system.control_signals]

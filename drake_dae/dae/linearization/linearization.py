@@ -214,14 +214,7 @@ class _PlantModel:
         forward: FloatArray,
         inputs: Sequence[Signal],
     ) -> Linearization:
-        """The linear models with du = feedback (dx, dv) + forward dw.
-
-        Args:
-            point: The operating point.
-            feedback: Shape (p, n + m).
-            forward: Shape (p, q).
-            inputs: Names and units of w.
-        """
+        """The linear models with du = feedback (dx, dv) + forward dw."""
         system, structure, symbols = self.system, self.structure, self._symbols
         n, m, p = system.num_states, system.num_constraints, system.num_controls
         x, v = system.state, symbols["constraint_input"]

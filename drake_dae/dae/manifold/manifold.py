@@ -1,6 +1,7 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
 from collections.abc import Sequence
+from functools import cached_property
 from math import isfinite
 
 import casadi as ca
@@ -8,14 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.manifold.first_steps import FOUND, STAYS, trace_first_steps
-from drake_dae.dae.manifold.residual import Residual
-from drake_dae.dae.manifold.search import CONSISTENT, ConsistentStateSearch
+from drake_dae.dae.manifold.newton_steps import FOUND, STAYS, shortest_step, trace_first_steps
 from drake_dae.dae.manifold.settling import Settling
+from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import norm
-from drake_dae.trace.round_off import positive
+from drake_dae.trace.functions import TracedFunction, count_operations
+from drake_dae.trace.newton import NewtonModel, newton, norm, shortest_steps
+from drake_dae.trace.round_off import are_dependent, positive
+
+CONSISTENT = 1e-8
+"""A state counts as consistent, and is projected without a message, if its distance from N*
+relative to its size is at most this; where gradients are dependent, if its residual is."""
 
 PROBE = 1e-4
 """The distance at which poles show, in states over their scale."""
@@ -24,23 +29,26 @@ FLOOR = 1e-12
 """A distance from N* that is round-off even if all states are zero."""
 
 
-class Manifold(Residual):
-    """The manifold N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m} (4).
-
-    Args:
-        system: The system (1)-(3).
-        chains: The chain k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint.
-
-    Attributes:
-        searched: `project` where `first_steps` did not converge; see `ConsistentStateSearch`. For
-            the other attributes see `Residual`.
-    """
+class Manifold:
+    """The manifold N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m} (4)."""
 
     def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
-        super().__init__(system, chains)
-        self._first_steps = trace_first_steps(self)
-        self.searched = ConsistentStateSearch(self, self._first_steps).searched
-        self._settling = Settling(system, self)
+        self.system, self.scale = system, system.scale
+        self.residual_expression = ca.vertcat(
+            ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains]
+        )  # (4)
+        self.layout = DerivativeLayout(tuple(len(chain) for chain in chains))
+        self.residual_signals = self.layout.chain_signals(system.constraint_output_signals)
+        self.gradient = ca.jacobian(self.residual_expression, system.state)
+        self.residual_function = system.trace("manifold", {"residual": self.residual_expression})
+        outputs = {"gradient": self.gradient}
+        self._gradient = system.trace("manifold gradient", outputs, often=False)
+        usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
+        usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
+        self._first_steps = trace_first_steps(
+            system, self.layout, self.residual_expression, self.short_gradient, usual
+        )
+        self._settling = Settling(self)
 
     @property
     def dimension(self) -> int:
@@ -48,13 +56,59 @@ class Manifold(Residual):
         return self.system.num_states - len(self.residual_signals)
 
     def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Returns the constraint outputs and their derivatives, shape (sum r_i,), constraint-major.
-
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-        """
+        """Returns k_1, k_1', ..., constraint-major, shape (sum r_i,)."""
         return self.residual_function(state, self.system.parameter_vector(parameters))[0]
+
+    def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """Returns the gradients C of the residual at a state, shape (sum r_i, n)."""
+        values = self._gradient(state, self.system.parameter_vector(parameters))[0]
+        return values.reshape(-1, self.system.num_states)
+
+    @cached_property
+    def short_gradient(self) -> ca.SX:
+        """`gradient`, in fewer operations where constraint forces are along the gradients.
+
+        Where q' = v, the forces g' are dk/dq, and the gradient of k' = (dk/dq) v is the derivative
+        of dk/dq along v beside dk/dq.
+        """
+        system = self.system
+        if set(self.layout.degrees) != {2}:
+            return self.gradient
+        slope, rate = ca.SX(system.num_constraints, system.num_states), 0 * system.state
+        forces = system.frictional_contacts.without_friction(system.g)
+        index = {entry.name(): i for i, entry in enumerate(ca.vertsplit(system.state))}
+        moved = ca.SX(*slope.shape)
+        for i, entry in enumerate(ca.vertsplit(system.f)):
+            if entry.is_symbolic() and (j := index.get(entry.name())) is not None:
+                rate[i], slope[:, i], moved[:, j] = entry, forces[j, :].T, forces[j, :].T
+        further = ca.jtimes(ca.vec(ca.densify(slope)), system.state, rate)
+        moved += ca.reshape(further, slope.shape)
+        rows = zip(ca.vertsplit(slope), ca.vertsplit(moved), strict=True)
+        short = ca.sparsify(ca.vertcat(*[row for pair in rows for row in pair]))
+        is_shorter = count_operations(short) < count_operations(self.gradient)
+        return short if is_shorter and system.agree(short, self.gradient) else self.gradient
+
+    @cached_property
+    def newton_step(self) -> TracedFunction:
+        """The Newton step of least norm from a state, divided by the scale of the states.
+
+        A function of the state, a second state at which the gradients are taken, and parameters.
+        """
+        other, state = ca.SX.sym("other", self.system.num_states), self.system.state
+        gradient = ca.substitute(self.short_gradient, state, other)
+        scale = ca.SX(self.scale)
+        step = shortest_step(gradient, scale)[0](self.residual_expression)
+        inputs = {"other": other}
+        return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
+
+    @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
+    def relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
+        """Returns the norm of the residual, each entry divided by its scaled gradient."""
+        residual = self.residual_function.evaluate(state, parameters)[0]
+        if not residual.any():
+            return 0.0
+        length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)
+        return norm(residual / positive(length))
 
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
         """Returns whether a state is on N* up to round-off: whether Newton's step is short.
@@ -74,19 +128,7 @@ class Manifold(Residual):
         state: ArrayLike,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """Returns the consistent state next to a state, to round-off, by Newton's method.
-
-        Args:
-            state: A state near N*, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-
-        Returns:
-            The consistent state, shape (n,).
-
-        Raises:
-            InconsistentStateError: Newton's method does not reach N* from there.
-            ModelError: The state has a wrong shape.
-        """
+        """Returns the consistent state next to a state, to round-off, by Newton's method."""
         start, p = self._state(state), self.system.parameter_vector(parameters)
         found = self.projected(start, p)
         if self._is_at_pole(found, p):
@@ -125,22 +167,88 @@ class Manifold(Residual):
         return moved if moved is start else moved.copy()
 
     def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
-        """Takes the first few Newton steps of `project`, without checks of arguments.
-
-        Args:
-            start: The state, shape (n,).
-            p: Values of all parameters, shape (k,).
-
-        Returns:
-            The consistent state, overwritten by the next call; `start` itself if it is consistent;
-            None if the steps do not converge, so that `searched` is needed.
-        """
+        """Takes the first few Newton steps of `project`, without checks of arguments."""
         function = self._first_steps
         sizes, moved, _ = function.evaluate(start, p)
         outcome = sizes.item(0)
         if function.is_valid and outcome == FOUND:
             return moved
         return start if outcome == STAYS and function.is_finite else None
+
+    def searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """Acts as `project` from a state from which `first_steps` did not converge."""
+        function = self._first_steps
+        sizes, moved, _ = function.evaluate(start, p)
+        is_finite = function.is_finite
+        if (
+            is_finite
+            and sizes.item(1) == 0.0
+            and not self.residual_function.evaluate(start, p)[0].any()
+        ):
+            return start
+        if is_finite and sizes.item(0) == FOUND:
+            return moved.copy()
+        scale = self.scale
+        z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
+        if not converged:
+            # Gradients are dependent or steps diverge: least squares with decreasing residual.
+            z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
+        state = scale * z
+        if converged and not np.array_equal(state, start):
+            return state
+        # Otherwise the residual is round-off in coarse units, or no state changes it.
+        if self.relative_size(state, p) <= CONSISTENT:
+            return state
+        residual = self.residual_function.evaluate(state, p)[0].copy()
+        if converged and self._first_steps.evaluate(state, p)[1].any():
+            return state
+        raise InconsistentStateError(self._why(state, p, residual), residual)
+
+    def _linearize(self, state: FloatArray, parameters: FloatArray) -> NewtonModel:
+        """Newton steps of least norm by the gradients at a state, in states over their scale."""
+        scale = self.scale
+        return NewtonModel(
+            lambda z: self.newton_step.evaluate(scale * z, state, parameters)[0].copy(),
+            is_regular=True,
+        )
+
+    def _downhill(self, state: FloatArray, parameters: FloatArray) -> NewtonModel | None:
+        """Least-squares steps that decrease the residual; its rows are scaled to length one."""
+        scale = self.scale
+        gradients = self.gradients(state, parameters) * scale
+        length = positive(np.linalg.norm(gradients, axis=1))
+
+        def residual(z: FloatArray) -> FloatArray:
+            return self.residual_function(scale * z, parameters)[0]
+
+        def measure(z: FloatArray) -> float:
+            return float(np.linalg.norm(residual(z) / length))
+
+        steps = shortest_steps(gradients, residual)
+        return None if steps is None else steps._replace(measure=measure)
+
+    def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
+        """Returns in words why a Newton iteration that ended at a state failed."""
+        name = self.system.name
+        values = zip(self.residual_signals, residual, strict=True)
+        bad = [signal.name for signal, value in values if not np.isfinite(value)]
+        if bad:
+            return (
+                f"{name}: {', '.join(bad)} is not finite at the given state; start inside the "
+                "domain of the constraints"
+            )
+        worst = int(np.argmax(np.abs(residual)))
+        text = (
+            f"{name}: no consistent state found near the given one; "
+            f"{self.residual_signals[worst].name} = {residual[worst]:.3g} is left where "
+            "Newton's method ends. "
+        )
+        if are_dependent(self.gradients(state, parameters) * self.scale):
+            return text + (
+                "The gradients of the constraints depend on each other there: the constraints "
+                "contradict each other, or start away from this state"
+            )
+        return text + "Start nearer to the constraint, away from its singular states"
 
     def settle(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns the consistent state next to a user's start, computed level by level.

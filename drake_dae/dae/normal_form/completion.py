@@ -25,17 +25,7 @@ Completion = tuple[ca.SX, tuple[Signal, ...], RankMargin]
 def check_completion(
     structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX
 ) -> Completion:
-    """The user's completion, with its signals and its margin.
-
-    Args:
-        structure: The structure of the system.
-        chains: The constraint and output chains y and zeta of (20), (21).
-        samples: The states at which the Jacobian of Phi must be regular.
-        xi: The completion, shape (d, 1).
-
-    Raises:
-        ModelError: It has a wrong shape, is not smooth, or does not complete the chains.
-    """
+    """The user's completion, with its signals and its margin."""
     system, count = structure.system, structure.zero_dynamics_dimension
     if not isinstance(xi, ca.SX) or xi.shape != (count, 1):
         got = f"shape {xi.shape}" if isinstance(xi, ca.SX) else type(xi).__name__
@@ -93,9 +83,6 @@ def choose_completion(structure: Structure, chains: ca.SX, samples: Samples) -> 
 
     They complete them if they are regular on the null spaces of the chains' differentials. The
     arguments are those of `check_completion`.
-
-    Raises:
-        ModelError: No linear combinations complete the chains at all samples.
     """
     system, count = structure.system, structure.zero_dynamics_dimension
     if not count:

@@ -23,17 +23,7 @@ CLOSER = (0.9, 0.99)
 
 @dataclass(frozen=True, eq=False)
 class ContactMargin:
-    """The distance of frictional contacts from the Painleve paradox, over some states.
-
-    Attributes:
-        reserve: The smallest principal minor of A(x) over the contacts, each divided by its value
-            without friction: 1 - mu / mu_crit for a single contact. If it is not positive, the
-            Painleve paradox occurs.
-        critical_friction: Name of a coefficient of friction -> its lowest critical value if all
-            coefficients grow in proportion (equal ones if all are zero); infinite if there is none.
-        state: The state with the smallest value, shape (n,).
-        time: Its time in s; None if the states are not from a motion.
-    """
+    """The distance of frictional contacts from the Painleve paradox, over some states."""
 
     reserve: float
     critical_friction: dict[str, float]
@@ -47,12 +37,7 @@ class ContactMargin:
 
 
 class ContactMargins:
-    """Computes the contact margins of a system at states.
-
-    Args:
-        system: The system.
-        matrix: A(x), shape (m, m).
-    """
+    """Computes the contact margins of a system at states."""
 
     def __init__(self, system: DaeSystem, matrix: ca.SX) -> None:
         self._system, self._contacts = system, system.frictional_contacts

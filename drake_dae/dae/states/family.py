@@ -27,14 +27,7 @@ _TRIES = 6
 
 @dataclass(frozen=True, eq=False)
 class Deciding:
-    """Parameters for which an expression is not zero, although it is zero at the defaults.
-
-    Attributes:
-        names: The parameters and derivatives of exogenous signals that decide alone; or, if only
-            several together decide, a minimal set.
-        values: A value of each for which it is not zero.
-        defaults: Their defaults.
-    """
+    """Parameters for which an expression is not zero, although it is zero at the defaults."""
 
     names: tuple[str, ...]
     values: tuple[float, ...]
@@ -58,10 +51,6 @@ class Family:
 
     A parameter is drawn within its bounds, or within a factor of two of its default (if that is 0,
     from -1 to 1). So are the derivatives of an exogenous signal, unless its bounds are equal.
-
-    Args:
-        manifold: N*, or the constraints known so far.
-        states: Consistent states with the default parameters, shape (samples, n).
     """
 
     def __init__(self, manifold: Manifold, states: FloatArray) -> None:
@@ -69,14 +58,7 @@ class Family:
         self._system = manifold.system
 
     def deciding(self, acts: Callable[[FloatArray, FloatArray], bool]) -> Deciding | None:
-        """Returns the parameters for which an input acts that does not act at the defaults.
-
-        Args:
-            acts: (state, values of all parameters) -> whether it acts.
-
-        Returns:
-            The numbers that decide; None if it acts nowhere.
-        """
+        """Returns the parameters for which an input acts that does not act at the defaults."""
         hits = [member for member in self._members if acts(*member)]
         # One of many may be round-off of a nearly singular matrix.
         if 2 * len(hits) <= len(self._members):
@@ -107,14 +89,7 @@ class Family:
         )
 
     def lost(self, determinant: Callable[[FloatArray, FloatArray], float]) -> Deciding | None:
-        """Returns a parameter for which a determinant vanishes within the bounds, if there is one.
-
-        Args:
-            determinant: (state, values of all parameters) -> its sign; 0 if it vanishes.
-
-        Returns:
-            A parameter and the bound towards which (or at which) it vanishes.
-        """
+        """Returns a parameter for which a determinant vanishes within the bounds, or None."""
         system, state = self._system, self._states[0]
         defaults = system.parameter_values
         here = determinant(state, defaults)

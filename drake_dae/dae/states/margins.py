@@ -16,17 +16,7 @@ from drake_dae.trace.round_off import SINGULAR, equilibration, smallest_singular
 
 @dataclass(frozen=True)
 class RankMargin:
-    """The distance of a matrix from losing its rank.
-
-    Attributes:
-        singular_value: The smallest singular value over all examined states.
-        relative: The smallest one after rows and columns are scaled to about length one, by factors
-            that are common to all states, so that units do not matter.
-        state: The state with the smallest `relative`, shape (n,).
-        matrix: The matrix there.
-        vanishing_row: The row that is zero there; None if none is.
-        least: The threshold of `relative` for singular: `DaeSystem.least_margin`.
-    """
+    """The distance of a matrix from losing its rank."""
 
     singular_value: float
     relative: float
@@ -48,13 +38,6 @@ def find_margin(
 
     If the determinant of a square matrix changes its sign on the way from the first state, it is
     zero on that way, unless N* is not connected or the determinant is infinite.
-
-    Args:
-        samples: The states.
-        matrix: An expression of the state, shape (k, l), k <= l.
-        round_off: The entries that count as zero; none if None.
-        search: Whether to minimize further from the worst states, in the box that the states span
-            and in the region.
     """
     scaled = _ScaledMatrix(samples, _masked(matrix, round_off))
     candidates = list(samples.states)
@@ -105,14 +88,7 @@ def surroundings(samples: Samples) -> Region:
 def _crossing(
     samples: Samples, matrix: "_ScaledMatrix", start: float, there: FloatArray
 ) -> FloatArray | None:
-    """Returns a state where the determinant changes its sign on the way from the first state.
-
-    Args:
-        samples: The states.
-        matrix: The matrix.
-        start: The sign at the first state.
-        there: The end of the way.
-    """
+    """Returns a state where the determinant changes its sign on the way from the first state."""
     here = samples.states[0]
     if matrix.sign(there) == start:
         return None

@@ -20,12 +20,7 @@ _FLAT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The states x with low <= x <= high.
-
-    Attributes:
-        low: The lower bounds, shape (n,); -inf where there is none.
-        high: The upper bounds, shape (n,), not below `low`; inf where there is none.
-    """
+    """The states x with low <= x <= high."""
 
     low: FloatArray
     high: FloatArray
@@ -38,23 +33,14 @@ class Region:
 
 
 class ConsistentRegion:
-    """The consistent states in a region, with the default parameters.
-
-    Args:
-        manifold: N*, or the constraints known so far.
-        region: The region; None for the whole of N*.
-    """
+    """The consistent states in a region, with the default parameters."""
 
     def __init__(self, manifold: Manifold, region: Region | None) -> None:
         self.manifold = manifold
         self.region = region
 
     def project(self, guess: FloatArray) -> FloatArray:
-        """Returns a consistent state in the region, near a guess.
-
-        Raises:
-            InconsistentStateError: No consistent state is found in the region.
-        """
+        """Returns a consistent state in the region, near a guess."""
         region = self.region
         if region is None:
             return self.manifold.project(guess)
@@ -76,9 +62,6 @@ class ConsistentRegion:
         """Returns a consistent state with the bounded states of a guess, if there is one.
 
         So random values cover the region, although the projection changes other states.
-
-        Raises:
-            InconsistentStateError: No consistent state is found in the region.
         """
         region = self.region
         if region is None:
@@ -98,13 +81,6 @@ class ConsistentRegion:
 
         Each step leads to the zero of the linearized function, so that zeros are found in a few
         steps. A positive minimum is only approached.
-
-        Args:
-            function: Value and gradient, shape (n,), at a state.
-            start: A consistent state in the region.
-
-        Returns:
-            The last state, shape (n,).
         """
         region = self.region
         if region is None:

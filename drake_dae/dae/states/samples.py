@@ -11,28 +11,13 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import are_dependent
-from drake_dae.trace.round_off import Sized, multiply, significant
+from drake_dae.trace.round_off import Sized, are_dependent, multiply, significant
 
 
 class Samples:
     """Consistent states near guesses, with the default parameters.
 
     States that cannot be projected onto N*, or are outside the domain of (1)-(3), are left out.
-
-    Args:
-        manifold: N*, or the constraints known so far.
-        guesses: The nominal state first, shape (count, n).
-        region: The region of the states; None for no restriction.
-
-    Attributes:
-        states: The consistent states, shape (samples, n).
-        fields: f, g, h, l and m of the system with E = 1 at each state, by letter.
-        scale: The size of each state over all of them and the guesses, shape (n,).
-
-    Raises:
-        InconsistentStateError: No guess can be projected onto N*.
-        ModelError: A function is not finite at the nominal state.
     """
 
     def __init__(
@@ -67,11 +52,7 @@ class Samples:
         self.scale = np.where(largest > 0.0, largest, manifold.system.scale)
 
     def values(self, **expressions: ca.SX) -> list[tuple[FloatArray, ...]]:
-        """Evaluates expressions of the state, as matrices, at each state.
-
-        Raises:
-            ModelError: An expression is not finite at a state.
-        """
+        """Evaluates expressions of the state, as matrices, at each state."""
         function = self.system.trace("sample", expressions, often=False)
         result = []
         for state in self.states:
@@ -90,16 +71,7 @@ class Samples:
         return [(values[key], np.abs(values[key])) for values in self.fields]
 
     def derivatives(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> FloatArray:
-        """Returns the derivatives of functions along fields; round-off is set to zero.
-
-        Args:
-            rows: The symbolic derivatives, shape (a, k), with their structural zeros.
-            functions: The functions, shape (a, 1).
-            field: The fields at each state, shape (n, k).
-
-        Returns:
-            The derivatives, shape (samples, a, k).
-        """
+        """Returns the derivatives of functions along fields; round-off is set to zero."""
         if not rows.nnz():
             return np.zeros((len(self.states), *rows.shape))
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
@@ -126,14 +98,7 @@ def fields_at(
 
 
 def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """Draws states around the nominal state, which comes first; they are not yet consistent.
-
-    Args:
-        system: The system (1)-(3).
-        spread: The standard deviation of the states, as in `spread_of`.
-        count: The number of random states.
-        seed: The seed of the random numbers.
-    """
+    """Draws states around the nominal state, which comes first; they are not yet consistent."""
     random = np.random.default_rng(seed)
     normal = np.vstack(
         [np.zeros(system.num_states), random.standard_normal((count, system.num_states))]
@@ -142,11 +107,7 @@ def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> 
 
 
 def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:
-    """Converts a spread to shape (n,); the default of the system if None.
-
-    Raises:
-        ModelError: The shape is wrong, or a number is not finite.
-    """
+    """Converts a spread to shape (n,); the default of the system if None."""
     if spread is None:
         return system.nominal_spread
     deviations = numbers(f"{system.name}: spread", spread)

@@ -9,12 +9,7 @@ from drake_dae.trace.round_off import unit_rows
 
 
 def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
-    """Returns a basis T of the tangent space, orthonormal in scaled states, shape (n, n - k).
-
-    Args:
-        gradients: The gradients of the constraints, independent rows, shape (k, n).
-        scale: The sizes of the states, shape (n,).
-    """
+    """Returns a basis T of the tangent space, orthonormal in scaled states, shape (n, n - k)."""
     rows = unit_rows(gradients * scale)
     return scale[:, None] * np.linalg.svd(rows)[2][len(rows) :].T
 

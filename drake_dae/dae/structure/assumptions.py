@@ -63,22 +63,7 @@ class ViolationKind(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Violation:
-    """A violation of one of Assumptions (1)-(5) by a system.
-
-    Attributes:
-        assumption: The number of the assumption in the paper.
-        cause: The kind of the violation.
-        names: The names of the constraints or outputs concerned.
-        order: The order of the derivative concerned, if any.
-        state: A consistent state where the assumption fails, shape (n,); None if it fails
-            everywhere.
-        singular_value: The smallest singular value of A(x) or B(x) there, rows and columns scaled,
-            if the rank is lost.
-        least: The threshold for a lost rank, `DaeSystem.least_margin`.
-        combinations: The dependent constraints there if A(x) lost its rank; the dependent outputs
-            if B(x) did, or if outputs depend on the constraints.
-        deciding: The parameters and signals whose defaults cause the violation, if others do not.
-    """
+    """A violation of one of Assumptions (1)-(5) by a system."""
 
     assumption: int
     cause: ViolationKind
@@ -199,17 +184,7 @@ def rank_violation(
     vanishing: tuple[int, ViolationKind],
     dependent: tuple[int, ViolationKind],
 ) -> Violation | None:
-    """Returns the violation by a singular matrix: one kind if a whole row vanishes, else another.
-
-    Args:
-        margin: The margin of the matrix; None if there is no matrix.
-        signals: The signals of its rows.
-        degrees: The order of the derivative that each row belongs to.
-        vanishing, dependent: The number of the assumption, and the cause.
-
-    Returns:
-        The violation; None if the matrix is regular.
-    """
+    """Returns the violation by a singular matrix: another kind if a whole row vanishes."""
     if margin is None or not margin.is_singular:
         return None
     row = margin.vanishing_row

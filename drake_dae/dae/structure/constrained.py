@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
 from drake_dae.dae.manifold.manifold import Manifold
@@ -17,16 +17,18 @@ from drake_dae.dae.states.margins import RankMargin, find_margin
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_violation
-from drake_dae.dae.structure.dependence import find_dependence
-from drake_dae.dae.structure.mass_matrix import check_mass_matrix
-from drake_dae.dae.structure.redundancy import find_redundant
+from drake_dae.dae.structure.dependence import find_dependence, redundant_constraints
+from drake_dae.dae.structure.redundancy import all_constraints_hold
 from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibrated, smallest_singular_value
+from drake_dae.trace.round_off import equilibrated, positive, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
+
+PART = 0.1
+"""The least part of a constraint in a vanishing combination, relative to the largest."""
 
 
 @checked(ModelError)
@@ -81,17 +83,22 @@ class ConstraintStructure:
         x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
         return function(x, p)[0].reshape(matrix.shape)
 
-    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
-        """Compiles an expression on N* to a function of state, control and parameters.
+    def dependent_constraints(self, state: FloatArray, parameters: FloatArray) -> tuple[str, ...]:
+        """Returns the names of the constraints that become dependent where A(x) is singular.
 
-        Args:
-            name: Its name in messages.
-            value: An expression of the state and of the control `derivatives.control`.
-            needs_control: Whether the function takes the control; otherwise the control is 0.
-
-        Returns:
-            A function with the output "value", and with A(x) as the matrix that must be regular.
+        They are the parts of n with n^T A(x) = 0, in units of the usual lengths of the gradients.
         """
+        usual = [np.diag(self.constraint_matrix(x, parameters)) for x in self.states]
+        unit = 1.0 / np.sqrt(positive(np.median(np.abs(usual), axis=0)))
+        matrix = self.constraint_matrix(state, parameters) * unit * unit[:, None]
+        if not np.isfinite(matrix).all():
+            return ()
+        part = np.abs(np.linalg.svd(matrix)[0][:, -1])
+        signals = self.system.constraint_output_signals
+        return tuple(signals[i].name for i in np.flatnonzero(part > PART * part.max()))
+
+    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
+        """Compiles an expression of state and `derivatives.control` on N*, or with control 0."""
         control = self.derivatives.control
         inputs = {"control": control}
         if not needs_control:
@@ -132,17 +139,7 @@ def find_constraint_structure(
 def constraint_structure_of(
     owner: str, system: DaeSystem, structure: ConstraintStructure | None
 ) -> ConstraintStructure:
-    """Returns the constraint structure of a system: the argument, or a new one if None.
-
-    Args:
-        owner: The caller's name in messages.
-        system: The system (1)-(3).
-        structure: The structure, or that with the outputs; None to find it.
-
-    Raises:
-        AssumptionError, InconsistentStateError: It has none; see `find_constraint_structure`.
-        ModelError: It is not a structure, or that of another system.
-    """
+    """Returns the constraint structure of a system: the argument, or a new one if None."""
     if structure is None:
         return find_constraint_structure(system)
     makers = "find_structure or find_constraint_structure"
@@ -152,11 +149,7 @@ def constraint_structure_of(
 def checked_structure(
     owner: str, system: DaeSystem, structure: Kind, kind: type[Kind], made_by: str
 ) -> Kind:
-    """Checks that a structure belongs to a system, and returns it.
-
-    Raises:
-        ModelError: It is not a structure of this kind, or that of another system.
-    """
+    """Checks that a structure belongs to a system, and returns it."""
     if not isinstance(structure, kind):
         raise ModelError(
             f"{owner}: structure must be what {made_by} returns, got {type(structure).__name__}"
@@ -170,11 +163,7 @@ def checked_structure(
 
 
 def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """Returns initial guesses of consistent states, shape (count + 1, n).
-
-    Raises:
-        AssumptionError, ModelError: The system or an argument makes no sense.
-    """
+    """Returns initial guesses of consistent states, shape (count + 1, n)."""
     check_system(system)
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
@@ -184,22 +173,7 @@ def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) 
 def examine_constraints(
     system: DaeSystem, guesses: FloatArray, region: Region | None = None
 ) -> tuple[ConstraintStructure, Samples]:
-    """Finds r_1, ..., r_m and A(x) of a system that `check_system` accepts.
-
-    Args:
-        system: The system (1)-(3).
-        guesses: States near which consistent ones are sought, shape (count, n).
-        region: The region of the consistent states; None for no restriction.
-
-    Returns:
-        The structure, and the consistent states with the numbers at them.
-
-    Raises:
-        AssumptionError: Assumption (1) or (3) is violated, or no constraint input acts on a
-            constraint. A singular A(x) is left to `constraint_violation`.
-        InconsistentStateError: There is no consistent state near a guess.
-        ModelError: A function is not finite, or the mass matrix is none.
-    """
+    """Finds r_1, ..., r_m and A(x) of a system that `check_system` accepts."""
     try:
         chains, samples = constraint_chains(system, guesses, region)
     except AssumptionError as error:
@@ -225,16 +199,37 @@ def examine_constraints(
 
 
 def check_system(system: DaeSystem) -> None:
-    """Checks the number of constraints and the mass matrix of a system.
-
-    Raises:
-        AssumptionError: There are more constraints than states.
-        ModelError: The mass matrix is not symmetric and positive definite.
-    """
+    """Checks the number of constraints and the mass matrix of a system."""
     check_mass_matrix(system, system.nominal_state[None])
     if system.num_constraints > system.num_states:
         names = tuple(signal.name for signal in system.constraint_output_signals)
         raise Violation(2, ViolationKind.COUNT, names).error()
+
+
+def check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
+    """Checks E of E x' = f + g v + h u, since LDL^T reads only one triangle of it."""
+    function = system.trace("mass matrix", {"mass": ca.densify(system.mass_matrix)}, often=False)
+    for state in states:
+        mass = function(state, system.parameter_values)[0].reshape(state.size, state.size)
+        if is_positive_definite(mass):
+            continue
+        raise ModelError(
+            f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
+            f"{show(state)}. An equation in which no derivative stands is a constraint 0 = k(x) "
+            "with a constraint input; where it holds an unknown z that has no derivative, lift it: "
+            "make z a state with z' = v, v a new constraint input, and keep the equation as "
+            "constraint"
+        )
+
+
+def is_positive_definite(matrix: FloatArray) -> bool:
+    """Whether a matrix is symmetric and positive definite, independent of units."""
+    length = np.sqrt(np.abs(np.diag(matrix)))
+    if not (np.all(np.isfinite(matrix)) and np.all(length > 0.0)):
+        return False
+    scaled = matrix / length / length[:, None]
+    is_symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
+    return bool(is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12)
 
 
 def constraint_violation(structure: ConstraintStructure) -> Violation | None:
@@ -251,14 +246,16 @@ def constraint_violation(structure: ConstraintStructure) -> Violation | None:
         return violation
     if violation.cause is not ViolationKind.CONSTRAINT_RANK:
         return _as_redundant(system, violation)
-    dependence = find_dependence(structure.manifold, elimination, structure.states, margin.state)
+    combinations, everywhere, in_gradients = find_dependence(
+        structure.manifold, elimination, structure.states, margin.state
+    )
     cause = {  # By whether it is singular everywhere, and by its gradients.
         (True, True): ViolationKind.REDUNDANT,
         (False, True): ViolationKind.SINGULAR_CONFIGURATION,
         (True, False): ViolationKind.HIDDEN_DEGREE,
         (False, False): ViolationKind.CONSTRAINT_RANK,
-    }[dependence.everywhere, dependence.in_gradients]
-    violation = replace(violation, cause=cause, combinations=dependence.combinations)
+    }[everywhere, in_gradients]
+    violation = replace(violation, cause=cause, combinations=combinations)
     return _as_redundant(system, violation)
 
 
@@ -269,19 +266,7 @@ def with_numbers(
     states: FloatArray,
     matrix: ca.SX,
 ) -> Violation | None:
-    """Returns the violation by a matrix, also for other parameters than the defaults.
-
-    Args:
-        violation: The violation with the defaults; None if there is none.
-        assumption: The number of the assumption that it is regular.
-        manifold: N*.
-        states: Consistent states, shape (samples, n).
-        matrix: The matrix.
-
-    Returns:
-        The violation with the deciding numbers, if the matrix is regular for others; or the
-        violation that it is singular within given bounds.
-    """
+    """Returns the violation by a matrix, also for other parameters than the defaults."""
     system = manifold.system
     bounded = any(p.bounds is not None for p in system.parameters)
     if violation is None and not (bounded and matrix.is_square()):
@@ -316,7 +301,10 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
     possible = (ViolationKind.CONSTRAINT_DEGREE, ViolationKind.SINGULAR_CONFIGURATION)
     if violation.cause not in possible:
         return violation
-    combinations = find_redundant(system)
+    try:
+        combinations = redundant_constraints(all_constraints_hold(system))
+    except InconsistentStateError:
+        return violation
     # A gradient that vanishes wherever its constraint holds does not depend on others.
     if not combinations or not all(combination.others for combination in combinations):
         return violation

@@ -11,8 +11,14 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples
-from drake_dae.trace.newton import are_dependent
-from drake_dae.trace.round_off import SINGULAR, equilibration, significant
+from drake_dae.trace.round_off import (
+    SINGULAR,
+    are_dependent,
+    equilibrated,
+    equilibration,
+    significant,
+    smallest_singular_value,
+)
 
 _ON_MANIFOLD = 1e-8
 """The residual of a constraint that a state on N* may have. It appears in the gradient of an output
@@ -23,11 +29,7 @@ that is a constraint times a factor."""
 class Combination:
     """A row of a matrix that is a linear combination of others: row = sum factors_j row_j.
 
-    Attributes:
-        name: The constraint or the output whose row it is.
-        others: The constraints or outputs that it follows from.
-        factors: The factors, shape (len(others),), at the state where this was found.
-        constant: Whether the factors are the same at all examined states.
+    It is `constant` if the factors are the same at all states.
     """
 
     name: str
@@ -43,33 +45,13 @@ class Combination:
         return f"'{self.name}' ~ {terms.replace('+ -', '- ') or '0'}{varying}"
 
 
-@dataclass(frozen=True)
-class Dependence:
-    """The linear dependence of the constraints where A(x) is singular.
-
-    Attributes:
-        combinations: The rows that follow from those before them: of the gradients of the
-            constraints if these depend on each other, otherwise of A(x).
-        everywhere: Whether A(x) is singular at all examined states, and not just at one.
-        in_gradients: Whether the gradients of the chains k_i, L_f k_i, ..., depend on each other,
-            at all examined states if `everywhere`.
-    """
-
-    combinations: tuple[Combination, ...]
-    everywhere: bool
-    in_gradients: bool
-
-
 def find_dependence(
     manifold: Manifold, elimination: Elimination, states: FloatArray, where: FloatArray
-) -> Dependence:
+) -> tuple[tuple[Combination, ...], bool, bool]:
     """Finds how the constraints depend on each other at a state where A(x) is singular.
 
-    Args:
-        manifold: N*.
-        elimination: A(x), and the gradients of the last derivative in each chain.
-        states: Other consistent states, shape (count, n).
-        where: The state, shape (n,).
+    Also returns whether A(x) is singular at all states, and whether the gradients of k_i, k_i', ...
+    depend on each other at all states examined: at that one, or at all.
     """
     system = manifold.system
     names = [signal.name for signal in system.constraint_output_signals]
@@ -81,19 +63,16 @@ def find_dependence(
         return [a, last * system.scale]
 
     def is_singular(state: FloatArray) -> bool:
-        scaled = _scaled(matrices(state)[0])[0]
-        return bool(np.linalg.svd(scaled, compute_uv=False)[-1] < system.least_margin)
-
-    def in_gradients(state: FloatArray) -> bool:
-        return are_dependent(manifold.gradients(state) * system.scale)
+        scaled = equilibrated(significant(matrices(state)[0]))
+        return smallest_singular_value(scaled) < system.least_margin
 
     everywhere = all(is_singular(state) for state in states)
     examined = [where, *states] if everywhere else [where]
-    dependent = all(in_gradients(state) for state in examined)
+    in_gradients = all(are_dependent(manifold.gradients(x) * system.scale) for x in examined)
     # Chains may depend on each other below their last derivatives alone.
-    by_gradients = dependent and are_dependent(matrices(where)[1])
+    by_gradients = in_gradients and are_dependent(matrices(where)[1])
     values = [matrices(state)[1 if by_gradients else 0] for state in examined]
-    return Dependence(tuple(combinations_of(names, values)), everywhere, dependent)
+    return tuple(combinations_of(names, values)), everywhere, in_gradients
 
 
 def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
@@ -107,35 +86,26 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
 
 
 def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combination]:
-    """Generates the outputs that are functions of the constraints, by their gradients."""
+    """Yields the outputs that are functions of the constraints, by their gradients."""
     system, manifold = samples.system, samples.manifold
     constraints = [signal.name for signal in manifold.residual_signals]
     for row, signal in enumerate(system.output_signals):
         if signal.name in names and not system.m[row, :].nnz():
             both = ca.vertcat(manifold.residual_expression, system.l[row])
-            values = samples.values(gradient=ca.densify(ca.jacobian(both, system.state)))
-            gradients = [_without_residuals(gradient, system.scale) for (gradient,) in values]
+            gradients = []
+            for (gradient,) in samples.values(gradient=ca.densify(ca.jacobian(both, system.state))):
+                # A residual alone in its column counts as much as any other entry.
+                sizes = np.abs(gradient * system.scale)
+                is_residual = sizes < _ON_MANIFOLD * sizes.max(axis=1, keepdims=True)
+                gradients.append(np.where(is_residual, 0.0, gradient * system.scale))
             rows = combinations_of([*constraints, signal.name], gradients, _ON_MANIFOLD)
             yield from (row for row in rows if row.name == signal.name)
-
-
-def _without_residuals(gradients: FloatArray, scale: FloatArray) -> FloatArray:
-    # A residual alone in its column counts as much as any other entry.
-    scaled = gradients * scale
-    sizes = np.abs(scaled)
-    return np.where(sizes < _ON_MANIFOLD * sizes.max(axis=1, keepdims=True), 0, scaled)
 
 
 def combinations_of(
     names: list[str], values: list[FloatArray], least: float = SINGULAR
 ) -> list[Combination]:
-    """Returns the rows that depend on earlier rows at the first of some states.
-
-    Args:
-        names: The names of the rows.
-        values: The matrix at each state.
-        least: A row depends on others if its remainder, relative to its length, is below this.
-    """
+    """Returns the rows that depend on earlier rows at the first of some states."""
     matrix, lengths = _scaled(values[0])
     independent: list[int] = []
     combinations = []

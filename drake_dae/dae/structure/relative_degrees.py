@@ -5,6 +5,8 @@ its numbers at consistent states, with the default parameters and signals at res
 there must be zero with all other numbers.
 """
 
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -16,12 +18,13 @@ from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.states.family import VISIBLE, Deciding, Family
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind
 from drake_dae.dae.structure.dependence import following_outputs, redundant_constraints
-from drake_dae.dae.structure.elsewhere import Elsewhere, Row
 from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import NegligibleWarning
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.lie import lie_derivative, lie_derivative_along
@@ -30,30 +33,21 @@ from drake_dae.trace.round_off import Sized, multiply
 MANY = 10
 """A function that is zero at this many random states is zero."""
 
+DOUBTFUL = 1e-13
+"""An entry above this, relative to the others in its row or column, may be intended."""
+
+Row = Callable[[FloatArray, FloatArray, float], Sized]
+"""A row of numbers at a state for values of all parameters, and the threshold for zero."""
+
 
 def constraint_chains(
     system: DaeSystem, guesses: FloatArray, region: Region | None
 ) -> tuple[list[list[ca.SX]], Samples]:
-    """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3).
-
-    Args:
-        system: The system (1)-(3).
-        guesses: States near which consistent ones are sought, shape (count, n).
-        region: The region of the consistent states; None for no restriction.
-
-    Returns:
-        The chains, and consistent states with the numbers at them.
-
-    Raises:
-        AssumptionError: Assumption (1) or (3) is violated, or no constraint input acts on a
-            constraint.
-        InconsistentStateError: There is no consistent state near a guess.
-        ModelError: A function is not finite.
-    """
+    """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3)."""
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
     chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
-    undecided, elsewhere = list(range(system.num_constraints)), Elsewhere()
+    undecided, by_numbers = list(range(system.num_constraints)), ByNumbers()
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, explicit.g, x)
@@ -66,7 +60,7 @@ def constraint_chains(
         for row, i in enumerate(undecided):
             order = len(chains[i])
             if force_acts[row].all():
-                elsewhere.refuse(i)
+                by_numbers.refuse(i)
                 continue
             if force_acts[row].any():
                 state = samples.states[int(np.argmin(force_acts[row]))]
@@ -80,7 +74,7 @@ def constraint_chains(
                 if rows[row, :].nnz():
                     violation = Violation(assumption, ViolationKind.NUMBERS, (names[i],), order)
                     along = numbers.along(chains[i][-1], key)
-                    elsewhere.look(i, violation, samples, along)
+                    by_numbers.examine(i, violation, samples, along)
             next_undecided.append(i)
             if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
@@ -93,7 +87,7 @@ def constraint_chains(
         if stuck:
             dependent = redundant_constraints(samples)
             those = tuple(names[i] for i in stuck)
-            deciding = elsewhere.deciding(stuck)
+            deciding = by_numbers.deciding(stuck)
             violation = Violation(2, ViolationKind.NO_FORCE, those, combinations=dependent)
             raise replace(violation, deciding=deciding).error()
         for i in next_undecided:
@@ -119,16 +113,7 @@ class OutputChains(NamedTuple):
 def output_chains(
     derivatives: Derivatives, elimination: Elimination, samples: Samples
 ) -> OutputChains:
-    """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and the rows of B(x).
-
-    Args:
-        derivatives: The time derivatives along the motion on N*.
-        elimination: Equations (9)-(14) as expressions.
-        samples: The consistent states at which numbers decide.
-
-    Raises:
-        AssumptionError: Assumption (4) is violated, or no control acts on an output.
-    """
+    """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and the rows of B(x)."""
     system = derivatives.system
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     names, count = [s.name for s in system.output_signals], system.num_outputs
@@ -140,14 +125,14 @@ def output_chains(
     round_off, need_force = np.zeros((count, controls), dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
     slopes = np.array([value for value, _ in n_star_values])
-    elsewhere, numbers = Elsewhere(), _ChainRows(samples, elimination)
+    by_numbers, numbers = ByNumbers(), _ChainRows(samples, elimination)
     following, rows = elimination.l_star, elimination.n_star
     undecided = list(range(count))
     while True:
         acts, still = _acts(slopes), []
         for row, i in enumerate(undecided):
             if acts[row].all():
-                elsewhere.refuse(i)
+                by_numbers.refuse(i)
                 drift[i] = following[row]
                 control_matrix[i, :] = rows[row, :]  # (16)
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
@@ -159,7 +144,7 @@ def output_chains(
             else:
                 if not chains[i] and rows[row, :].nnz():
                     violation = Violation(4, ViolationKind.NUMBERS, (names[i],), 0)
-                    elsewhere.look(i, violation, samples, numbers.feedthrough(i))
+                    by_numbers.examine(i, violation, samples, numbers.feedthrough(i))
                 still.append(i)
                 chains[i].append(following[row])
                 need_force = need_force or derivatives.has_unknowns(moving[row])
@@ -177,7 +162,7 @@ def output_chains(
                 continue
             if rows[row, :].nnz():
                 violation = Violation(4, ViolationKind.NUMBERS, (names[i],), len(chains[i]))
-                elsewhere.look(i, violation, samples, numbers.along(chains[i][-1], "h*"))
+                by_numbers.examine(i, violation, samples, numbers.along(chains[i][-1], "h*"))
             # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
             # where nothing acts although the structure allows it.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
@@ -188,7 +173,7 @@ def output_chains(
             ):
                 stuck.append(i)
         if stuck:
-            those, deciding = tuple(names[i] for i in stuck), elsewhere.deciding(stuck)
+            those, deciding = tuple(names[i] for i in stuck), by_numbers.deciding(stuck)
             following = tuple(following_outputs(samples, those))
             violation = Violation(
                 5, ViolationKind.NO_CONTROL, those, combinations=following, deciding=deciding
@@ -211,14 +196,53 @@ def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Size
     return [h_star for h_star, _ in pairs], [n_star for _, n_star in pairs]
 
 
-class _ChainRows:
-    """The action of inputs at a state, for values of all parameters.
+class ByNumbers:
+    """Constraints and outputs whose row is zero at the default parameters, but not at others."""
 
-    Args:
-        samples: States with the default parameters.
-        elimination: Equations (9)-(14), for the action of the control through the constraint
-            inputs.
-    """
+    def __init__(self) -> None:
+        self._violations: dict[int, Violation] = {}
+
+    def examine(self, index: int, violation: Violation, samples: Samples, row: Row) -> None:
+        """Evaluates a row that is zero at the default parameters at others."""
+        if index in self._violations:
+            return
+        system = samples.system
+
+        @np.errstate(all="ignore")  # Values that are not finite decide nothing.
+        def acts(state: FloatArray, parameters: FloatArray, negligible: float) -> bool:
+            value, size = row(state, parameters, negligible)
+            return bool(np.any(np.abs(value) > VISIBLE * size))
+
+        family = Family(samples.manifold, samples.states)
+        deciding = family.deciding(lambda x, p: acts(x, p, system.negligible))
+        if deciding:
+            self._violations[index] = replace(violation, deciding=deciding)
+        defaults = system.parameter_values
+        if system.negligible > DOUBTFUL and all(
+            acts(state, defaults, DOUBTFUL) for state in samples.states
+        ):
+            warnings.warn(
+                f"{system.name}: what acts on derivative {violation.order} of "
+                f"'{violation.names[0]}' is less than {system.negligible:g} of the others, the "
+                "system's `negligible`, and counts as zero. If it is meant, choose other units, or "
+                "set a smaller number",
+                NegligibleWarning,
+                stacklevel=5,
+            )
+
+    def refuse(self, index: int) -> None:
+        """Raises AssumptionError if a degree is another one for other parameters."""
+        if index in self._violations:
+            raise self._violations[index].error()
+
+    def deciding(self, indices: Sequence[int]) -> Deciding | None:
+        """Returns the parameters for which an input acts on one of some constraints or outputs."""
+        violations = (self._violations[i] for i in indices if i in self._violations)
+        return next((violation.deciding for violation in violations), None)
+
+
+class _ChainRows:
+    """The action of inputs at a state, for values of all parameters."""
 
     def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
         self._system, self._scale = samples.system, samples.scale

@@ -16,10 +16,10 @@ from drake_dae.dae.structure.constrained import (
     constraint_violation,
     examine_constraints,
     guesses,
+    is_positive_definite,
     with_numbers,
 )
 from drake_dae.dae.structure.dependence import combinations_of
-from drake_dae.dae.structure.mass_matrix import is_positive_definite
 from drake_dae.dae.structure.relative_degrees import output_chains
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
@@ -84,13 +84,8 @@ class Structure(ConstraintStructure):
 
         No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
 
-        Args:
-            commanded: ubar of (28), shape (p, 1).
-
-        Returns:
-            x', shape (n, 1), v, shape (m, 1), and a scalar that is 0 exactly where one of them is
-            not determined; None if the control is not found in this way, or if friction may leave
-            the motion undetermined.
+        Returns x', v, and a scalar that is 0 exactly where one of them is not determined; None if
+        the control is not found in this way, or if friction may leave the motion undetermined.
         """
         if self.system.control_metric is not None or self.system.frictional_contacts:
             return None
@@ -105,13 +100,8 @@ class Structure(ConstraintStructure):
     def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Returns u = B(x)^-1 (-a(x) + ubar), for which z_i^(mu_i) = ubar_i on N*.
 
-        If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
-
-        Args:
-            commanded: ubar of (28), shape (p, 1).
-
-        Returns:
-            u, shape (p, 1), and a scalar that is 0 exactly where it is not determined.
+        If B(x) does not determine u, `DaeSystem.control_metric` chooses it. Also returns a scalar
+        that is 0 exactly where u is not determined.
         """
         solution: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
@@ -124,14 +114,7 @@ class Structure(ConstraintStructure):
         return control, pivot
 
     def control_by_matrix(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Returns the control of `control_for`, computed with B(x); A(x) must be regular.
-
-        Args:
-            commanded: ubar of (28), shape (p, 1).
-
-        Returns:
-            u, shape (p, 1), and a scalar that is 0 exactly where B(x) loses its rank.
-        """
+        """Returns the control of `control_for`, computed with B(x); A(x) must be regular."""
         needed, metric = commanded - self.drift, self.system.control_metric  # (28)
         if metric is not None:
             return nearest_solution(self.control_matrix, needed, metric, self.system.free_control)
@@ -172,17 +155,7 @@ def find_structure(
 
 
 def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """Returns the structure of a system: the argument, or the result of `find_structure` if None.
-
-    Args:
-        owner: The caller's name in messages.
-        system: The system (1)-(3).
-        structure: The structure, or None to find it.
-
-    Raises:
-        AssumptionError, InconsistentStateError: There is no structure; see `find_structure`.
-        ModelError: It is not a system, or the structure is that of another one.
-    """
+    """Returns the given structure of a system, or the result of `find_structure`."""
     if structure is None:
         return find_structure(system)
     return checked_structure(owner, system, structure, Structure, "find_structure")
@@ -191,16 +164,7 @@ def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> 
 def examine_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> tuple[Structure, Violation | None]:
-    """Finds the structure as `find_structure`, but also returns it where B(x) is singular.
-
-    Returns:
-        The structure, and how B(x) violates Assumption (4) or (5); None if it does not.
-
-    Raises:
-        AssumptionError: There is no B(x), since one of Assumptions (1)-(3) is violated or an
-            output has no degree.
-        InconsistentStateError, ModelError: It has no structure; see `find_structure`.
-    """
+    """Finds the structure as `find_structure`, but also returns it where B(x) is singular."""
     if why := why_no_law(system):
         raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
     constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
@@ -231,14 +195,14 @@ def why_no_law(system: DaeSystem) -> str:
 
 
 def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
-    """Finds mu_1, ..., mu_p and B(x) if A(x) is regular.
-
-    Raises:
-        AssumptionError: Assumption (4) is violated, or no control acts on an output. A singular
-            B(x) is left to `control_violation`.
-        ModelError: A function is not finite, or `control_metric` is not valid.
-    """
-    _check_metric(samples)
+    """Finds mu_1, ..., mu_p and B(x) if A(x) is regular."""
+    if (metric := samples.system.control_metric) is not None:
+        for state, (value,) in zip(samples.states, samples.values(metric=metric), strict=True):
+            if not is_positive_definite(value):
+                raise ModelError(
+                    f"{samples.system.name}: control_metric is not symmetric and positive definite "
+                    f"at x = {show(state)}; give each control a positive weight"
+                )
     elimination = constrained.elimination
     outputs = output_chains(constrained.derivatives, elimination, samples)
     degrees = tuple(len(chain) for chain in outputs.chains)
@@ -260,24 +224,6 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
         round_off=outputs.round_off,
         control_margin=find_margin(samples, outputs.control_matrix, outputs.round_off),
     )
-
-
-def _check_metric(samples: Samples) -> None:
-    """Checks the `control_metric`.
-
-    Raises:
-        ModelError: It is not symmetric and positive definite at a state.
-    """
-    system = samples.system
-    if system.control_metric is None:
-        return
-    values = samples.values(metric=system.control_metric)
-    for state, (metric,) in zip(samples.states, values, strict=True):
-        if not is_positive_definite(metric):
-            raise ModelError(
-                f"{system.name}: control_metric is not symmetric and positive definite at x = "
-                f"{show(state)}; give each control a positive weight"
-            )
 
 
 def control_violation(structure: Structure) -> Violation | None:

@@ -31,14 +31,7 @@ MOST = 8
 
 @dataclass(frozen=True)
 class UnilateralInput:
-    """A constraint input that must not be negative: a contact force that can only push.
-
-    Attributes:
-        force: The name of the constraint input, which acts on the constraint in the same place.
-        friction: The name of the parameter that is its coefficient of friction; None without one.
-        sliding: The velocities that its friction opposes, as expressions that are linear in the
-            velocities among the states, shape (k, 1); None if they are not known.
-    """
+    """A constraint input that must not be negative: a contact force that can only push."""
 
     force: str
     friction: str | None = None
@@ -60,22 +53,7 @@ class PainleveOutcome(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """The unilateral contacts of a system in which at least one contact has friction.
-
-    Args:
-        owner: The name of the system, for messages.
-        inputs: The constraint inputs of the system.
-        parameters: The parameters of the system.
-        contacts: The unilateral constraint inputs of the system.
-
-    Attributes:
-        rows: The indices of the contacts among the constraint inputs. Contacts whose input was
-            removed are left out.
-        frictions: The coefficients of friction, in the order of the rows; None without one.
-
-    Raises:
-        ModelError: There are too many contacts.
-    """
+    """The unilateral contacts of a system in which at least one contact has friction."""
 
     owner: str
     inputs: Sequence[Signal]
@@ -125,12 +103,6 @@ class Contacts:
         Minors are those of sets of contacts with all other constraints, of which none can open. The
         least ratio is the same in any order of the contacts and in any units, 1 without friction,
         and positive exactly where all minors are.
-
-        Args:
-            matrix: A(x), shape (m, m).
-
-        Returns:
-            A scalar. Where it is not positive, only its sign has a meaning.
         """
         smallest = ca.SX(1)
         others = [i for i in range(matrix.shape[0]) if i not in self.rows]
@@ -152,11 +124,6 @@ def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> 
 
     A minor with the first row is a_11 times that of the Schur complement of a_11 without it; one
     without the first row is that of A without it.
-
-    Args:
-        matrix: A, shape (m, m).
-        rows: The rows.
-        before: The product of the pivots of eliminated rows, by which minors are multiplied.
     """
     if rows:
         first, *others = rows
@@ -168,13 +135,7 @@ def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> 
 
 
 def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[int]) -> float:
-    """Returns the smallest s > 0 at which a principal minor of A_0 - s D is zero; else infinity.
-
-    Args:
-        without: A_0, A(x) without friction, shape (m, m).
-        per_unit: D, the decrease of A per unit of friction, shape (m, m).
-        rows: The rows of contacts. Only minors with all other rows count.
-    """
+    """Returns the smallest s > 0 at which a principal minor of A_0 - s D is zero; else infinity."""
     largest = 0.0
     for used in _sets(len(without), rows):
         part = np.ix_(used, used)
@@ -191,18 +152,7 @@ def painleve_outcome(
     size: FloatArray,
     rows: Sequence[int],
 ) -> PainleveOutcome | None:
-    """Determines the outcome of a Painleve paradox by the linear complementarity problem.
-
-    Args:
-        matrix: A(x), shape (m, m).
-        without: A(x) without friction, shape (m, m).
-        force: v = -A^-1 b, which keeps all constraints whether or not it pushes, shape (m,).
-        size: The size of the terms whose sum is b, shape (m,).
-        rows: The contacts; all other constraints are kept.
-
-    Returns:
-        None if exactly one set of forces fits and keeps a contact, or if this cannot be decided.
-    """
+    """Determines the outcome of a Painleve paradox by the linear complementarity problem."""
     if not np.all(np.isfinite(force)):
         return PainleveOutcome.INCONSISTENT
     edge = np.abs(without) @ np.abs(force)

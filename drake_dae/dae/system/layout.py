@@ -23,10 +23,6 @@ class DerivativeLayout:
         reference = (r_1, r_1', ..., r_1^(mu_1),     r_2, ...)    sum (mu_i + 1) numbers
 
     The constraint chains of (4) are stacked likewise, with r_i in place of mu_i.
-
-    Attributes:
-        degrees: mu_1, ..., mu_p, not negative.
-        more: The number of derivatives of each r_i in a reference after r_i^(mu_i); none if empty.
     """
 
     degrees: tuple[int, ...]

@@ -173,11 +173,7 @@ def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
 
 
 def outputs_named(names: Collection[str], outputs: Sequence[Signal]) -> list[int]:
-    """Returns the indices of outputs by their names.
-
-    Raises:
-        ModelError: There is no output of such a name.
-    """
+    """Returns the indices of outputs by their names."""
     known = [signal.name for signal in outputs]
     for name in names:
         if name not in known:
@@ -193,20 +189,12 @@ def moving(parameters: Sequence[Parameter], names: Container[str]) -> tuple[Para
 
 
 def bounded(parameter: Parameter, bounds: tuple[ArrayLike, ArrayLike]) -> Parameter:
-    """Returns a parameter with bounds and with the same symbols.
-
-    Raises:
-        ModelError: The bounds are not valid, or the value is outside of them.
-    """
+    """Returns a parameter with bounds and with the same symbols."""
     return _same_symbols(parameter, replace(parameter, bounds=bounds))
 
 
 def valued(parameter: Parameter, value: ArrayLike) -> Parameter:
-    """Returns a parameter with another default and the same symbols; one number sets all entries.
-
-    Raises:
-        ModelError: The value does not fit, or is out of the parameter's range.
-    """
+    """Returns a parameter with another default; one number sets all entries."""
     entries = np.atleast_1d(numbers(f"parameter '{parameter.name}'", value))
     if entries.shape not in ((1,), parameter.value.shape):
         raise ModelError(
@@ -225,3 +213,88 @@ def _same_symbols(parameter: Parameter, made: Parameter) -> Parameter:
 def is_symbol(value: Any) -> bool:
     """Whether it is a CasADi SX matrix of symbols."""
     return isinstance(value, ca.SX) and value.is_valid_input()
+
+
+def parameter_symbol(parameters: Sequence[Parameter]) -> ca.SX:
+    """Returns the symbols of all parameters in one column, then w', w'', ... of exogenous ones."""
+    rates = [rate for p in parameters if p.exogenous for rate in p.derivatives]
+    return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters], *rates)
+
+
+def parameter_slice(owner: str, parameters: Sequence[Parameter], name: str) -> slice:
+    """Returns the slice of a parameter in the parameter vector."""
+    start = 0
+    for parameter in parameters:
+        if parameter.name == name:
+            return slice(start, start + parameter.value.size)
+        start += parameter.value.size
+    raise ModelError(f"{owner}: {unknown_name('parameter', name, [p.name for p in parameters])}")
+
+
+@dataclass(frozen=True, eq=False)
+class Exogenous:
+    """The exogenous parameters w of a system, with symbols for their time derivatives."""
+
+    owner: str
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def moving(self) -> tuple[Parameter, ...]:
+        """The exogenous parameters."""
+        return tuple(p for p in self.parameters if p.exogenous)
+
+    def __bool__(self) -> bool:
+        return bool(self.moving)
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Names and units of the entries of w."""
+        return tuple(signal for p in self.moving for signal in p.signals)
+
+    def rate(self, expression: ca.SX) -> ca.SX:
+        """Returns the part sum_j (d/dw^(j)) w^(j+1) of a time derivative, shape (k, 1)."""
+        rate = ca.SX(expression.numel(), 1)
+        for p in self.moving:
+            levels = (p.symbol, *p.derivatives)
+            if ca.depends_on(expression, levels[-1]):
+                raise ModelError(
+                    f"{self.owner}: more than {len(p.derivatives)} derivatives of '{p.name}' are "
+                    "needed"
+                )
+            rate += ca.jtimes(expression, ca.vertcat(*levels[:-1]), ca.vertcat(*levels[1:]))
+        return rate
+
+    def degrees(self, *expressions: ca.SX) -> tuple[int, ...]:
+        """Returns the number of derivatives of each entry of w on which expressions depend."""
+        every = ca.veccat(*expressions)
+        degrees: list[int] = []
+        for p in self.moving:
+            for i in range(p.value.size):
+                orders = [k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i])]
+                degrees.append(max(orders, default=0))
+        return tuple(degrees)
+
+    def rates(self) -> dict[str, slice]:
+        """Name of an exogenous parameter -> the place of its derivatives in the parameter vector.
+
+        The entries of the first derivative come first, then those of the second one.
+        """
+        first, rates = sum(p.value.size for p in self.parameters), dict[str, slice]()
+        for p in self.moving:
+            rates[p.name] = slice(first, first + p.value.size * len(p.derivatives))
+            first = rates[p.name].stop
+        return rates
+
+    def places(self, degrees: Sequence[int]) -> list[int]:
+        """Returns the indices of w_1, w_1', ..., w_1^(d_1), w_2, ... among the parameters."""
+        start, following = 0, sum(p.value.size for p in self.parameters)
+        places, remaining = [], iter(degrees)
+        for p in self.parameters:
+            size = p.value.size
+            if p.exogenous:
+                for i in range(size):
+                    rates = range(next(remaining))
+                    places += [start + i, *(following + order * size + i for order in rates)]
+                following += size * len(p.derivatives)
+            start += size
+        return places

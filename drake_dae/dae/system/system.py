@@ -12,14 +12,18 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, vector
-from drake_dae.dae.system.called import called_functions
-from drake_dae.dae.system.checks import checked_fields
 from drake_dae.dae.system.contacts import Contacts, UnilateralInput
-from drake_dae.dae.system.exogenous import Exogenous
-from drake_dae.dae.system.parameters import parameter_slice, parameter_symbol
-from drake_dae.dae.system.scale import spread_about
-from drake_dae.dae.system.sharing import ForceSharing
-from drake_dae.dae.system.signals import Parameter, Signal, bounded, moving, valued
+from drake_dae.dae.system.fields import called_functions, checked_fields
+from drake_dae.dae.system.signals import (
+    Exogenous,
+    Parameter,
+    Signal,
+    bounded,
+    moving,
+    parameter_slice,
+    parameter_symbol,
+    valued,
+)
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import Factors, PositiveDefiniteFactorization
@@ -28,82 +32,61 @@ from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
 
 
 @dataclass(frozen=True, eq=False)
+class ForceSharing:
+    """The distribution of forces among redundant constraints, some of which are removed.
+
+    The motion determines the sum v = G(x) v_all alone. Among all v_all with that sum the one with
+    the least sum of c_i v_i^2 is shown, v_all = T(x) v: G T = 1. See `share_forces`.
+    """
+
+    split: ca.SX
+    gather: ca.SX
+    signals: tuple[Signal, ...]
+    undetermined: tuple[str, ...]
+    left_out: ca.SX
+    left_out_signals: tuple[Signal, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class DaeSystem:
     """A nonlinear differential-algebraic control system, equations (1)-(3):
 
         x' = f(x) + g(x) v + h(x) u,    0 = k(x),    z = l(x) + m(x) v.
 
-    All functions may also depend on exogenous signals w(t), which are not controlled and whose
-    derivatives are known: they are parameters with `exogenous=True`. In section 2, L_f then becomes
-    the total derivative D = L_f + sum_j (d/dw^(j)) w^(j+1); degrees, A, B and (9)-(28) keep their
-    form, and N* moves.
-
-    With a mass matrix E the first is E(x) x' = f + g v + h u, and what the paper calls f, g, h is
-    E^-1 f, E^-1 g, E^-1 h (see `explicit`). Giving E, as a robot has it in M(q), costs far fewer
-    operations than giving its inverse.
-
-    If there are more controls than outputs, B(x) of (16) does not determine the control. Among all
-    u with B u = ubar - a the law (28) then takes the one nearest to `free_control` u_0 in the
-    metric `control_metric` W,
-
-        u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0).
-
-    u_0 does not affect the outputs. W must make the terms of u^T W u comparable: for torques in N m
-    and forces in N, take 1 / limit^2 as weights. The zero dynamics of such systems depend on W and
-    u_0; pinned outputs and stability use the same choice.
-
-    The fields are CasADi SX expressions of `state` and of the symbols of `parameters`; numbers
-    and NumPy arrays are taken as constants. The data checks itself when it is made.
+    The fields are CasADi SX expressions of `state` and of the symbols of `parameters`; numbers are
+    constants. Exogenous signals w(t) are parameters with `exogenous=True`: in section 2, L_f then
+    becomes D = L_f + sum_j (d/dw^(j)) w^(j+1), and N* moves. With E the first equation is
+    E x' = f + g v + h u; giving M(q) costs far fewer operations than giving its inverse.
 
     Attributes:
         state: The symbols x, shape (n, 1).
-        f: The drift, shape (n, 1).
-        g: The input matrix of the constraint inputs v, shape (n, m).
-        h: The input matrix of the control inputs u, shape (n, p); p = 0 without control.
+        f, g, h: The drift and the input matrices of v and u, shapes (n, 1), (n, m) and (n, p).
         k: The constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
-        l: The controlled outputs z at v = 0, as many as the controls for a law (28), shape (p, 1),
-            or fewer with a `control_metric`; a system that is only simulated may have others, or
-            none.
-        m: The matrix of v in the controlled outputs, shape (p, m).
+        l, m: The controlled outputs z, shapes (q, 1) and (q, m). A law (28) needs q = p, or fewer
+            with a `control_metric`; a system that is only simulated may have any number.
         parameters: Named numbers that the expressions depend on.
         state_signals, constraint_input_signals, control_signals, constraint_output_signals,
-            output_signals: Names and units of x, v, u, y and z; a plain name is a Signal without
-            unit. Made up ("x0", "x1", ...) where not given.
+            output_signals: Names and units of x, v, u, y, z; "x0", "x1", ... where not given.
         nominal_state: The initial guess for consistent states, shape (n,); zero if None.
-        state_scale: The typical size of each state, positive, shape (n,). Random states, searches
-            and tolerances are relative to it. If None, max(|nominal state|, 1), so that give it
-            where a state is measured in a unit that is far from its size.
-        name: The name of the system in messages.
+        state_scale: The size of each state, to which tolerances are relative; if None,
+            max(|nominal state|, 1): give it where a unit is far from the size of a state.
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
-        implicit: A function of x' and v that returns E x' - f - g v, shape (n, 1), and the
-            derivatives of L_f^(r_i - 1) k_i along x', shape (m, 1), for when it takes fewer
-            operations than the expressions above: for a robot it is inverse dynamics.
-        factorize: A function that returns factors of given rows and columns of E, for when they
-            take fewer operations than a triangular factor: for a robot with many links they are the
-            articulated-body algorithm. It returns None if it has none for these rows.
-        sharing: The distribution of forces among redundant constraints; k contains the others. None
-            without redundant constraints. Made by `share_forces`.
-        control_metric: W, shape (p, p), symmetric positive definite, for more controls than
-            outputs; None otherwise.
-        free_control: u_0, shape (p, 1); zero if None.
-        compiled: Whether functions that are called often are compiled to machine code, if there is
-            a C compiler: True, from the first call; False, never; "auto", if the cache has the
-            code, or once a function was called so often that compilation pays. See
-            `trace.compiled`.
-        least_margin: A(x) and B(x) count as singular where their smallest singular value, rows and
-            columns scaled to about length one, is below this.
-        negligible: Entries below this, relative to the others in their row or column, count as zero
-            when relative degrees are decided, such as 1e-17 in place of 0. If such an entry is
-            intended, change units or this number.
-        contacts: The unilateral constraint inputs, if friction acts on one of them. The motion is
-            well defined only where a unique nonnegative force exists, see `dae.system.contacts`.
-        dry: The names of parameters that are coefficients of Coulomb friction in f, which turns
-            where a velocity does.
+        implicit: (x', v) -> E x' - f - g v and the derivatives of L_f^(r_i - 1) k_i along x', if
+            that takes fewer operations: for a robot it is inverse dynamics.
+        factorize: Rows of E -> its factors, or None: for a long robot articulated bodies.
+        sharing: The forces of redundant constraints, from `share_forces`.
+        control_metric, free_control: W, shape (p, p), and u_0: with more controls than outputs (28)
+            takes u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0), nearest to u_0. Make the
+            terms of u^T W u comparable, as by 1 / limit^2.
+        compiled: Machine code from the first call (True), never, or when it pays ("auto").
+        least_margin: A(x) or B(x) is singular where its smallest singular value, scaled, is below.
+        negligible: Entries below this, relative to their row or column, are zero in degrees.
+        contacts: Constraint inputs that only push, if one has friction: see `system.contacts`.
+        dry: The names of parameters that are coefficients of Coulomb friction in f.
 
     Raises:
-        ModelError: A shape does not fit, a symbol is neither state nor parameter, names or symbols
-            are not unique, a constant is not finite, or a function is not smooth in the state, such
-            as fabs.
+        ModelError: A shape does not fit, a symbol is unknown, names are not unique, a number is not
+            finite, or a function is not smooth in the state, such as fabs.
     """
 
     state: ca.SX
@@ -354,10 +337,12 @@ class DaeSystem:
     def usual_spread(self, state: ArrayLike) -> FloatArray:
         """Returns the default standard deviation of random states around a state, shape (n,).
 
-        Raises:
-            ModelError: The state has a wrong shape, or a number is not finite.
+        It is 0.1 of the scale, a hundredth of a value above 10 scales, and a tenth of one below
+        1e-3 scales that is not round-off.
         """
-        return spread_about(self.state_vector(state), self.scale)
+        size = np.abs(self.state_vector(state)) / self.scale
+        small = (size < 1e-3) & (size > 1e-12 * max(1.0, size.max()))
+        return self.scale * np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
 
     def trace(
         self,
@@ -372,15 +357,36 @@ class DaeSystem:
     ) -> TracedFunction:
         """Compiles expressions to a function of the state, of other inputs and of the parameters.
 
-        Args:
-            name: The name of the outputs in messages.
-            outputs, pivot, regular, often, doubt, lean: The arguments of `TracedFunction`.
-            inputs: Further input symbols, placed between "state" and "parameters".
+        Further inputs stand between these; the other arguments are those of `TracedFunction`.
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
         return TracedFunction(
             f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled, doubt, lean
         )
+
+    def agree(self, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
+        """Returns whether two expressions agree at random states around the nominal state.
+
+        The parameters are varied as well.
+        """
+        symbols = [self.state, *unknowns, self.parameter_symbol]
+        function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
+        random, p = np.random.default_rng(0), self.parameter_values
+        deviation = self.nominal_spread
+        finite = 0
+        for spread in (0.0, 0.1, 0.1):
+            x = self.nominal_state + deviation * random.standard_normal(self.num_states)
+            numbers = [random.standard_normal(u.numel()) for u in unknowns]
+            changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
+            a, b = (v.full() for v in function(x, *numbers, changed))
+            if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+                continue  # Out of the domain of one of the functions.
+            finite += 1
+            # By columns: constraints may have very different units.
+            size = np.abs(a).max(axis=0, initial=0.0) + np.abs(b).max(axis=0, initial=0.0)
+            if not np.all(np.abs(a - b) <= 1e-9 * np.abs(b) + 1e-11 * size):
+                return False
+        return finite > 0
 
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
         """Checks a parameter vector, ordered as `parameter_symbol`; the default if None.

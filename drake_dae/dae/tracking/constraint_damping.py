@@ -45,15 +45,6 @@ def damped(
     contact of frequency w = sqrt(A k), for c > p already at mu = 1). Then for mu = 1 the contact is
     damped for all p; for mu = 2 and c from w to 2 w it is damped from about p = 2.5 w on, best near
     5 w. The force poles must be faster than the contact.
-
-    Args:
-        structure: The structure of the system.
-        damping: A design such as `poles(-200.0)`, for y_i' in place of an error: r_i - 1 poles.
-            None for y_i^(r_i) = 0.
-        latency: How late the control acts, in s; see `acting_late`.
-
-    Raises:
-        GainError: The gains do not fit, or are not Hurwitz.
     """
     system = acting_late(structure.system, latency)
     if damping is None and system is structure.system:
@@ -72,11 +63,7 @@ def damped(
 
 
 def damping_gains(structure: Structure, damping: GainDesign | FeedbackGains) -> FeedbackGains:
-    """Returns the coefficients c of `damped`.
-
-    Raises:
-        GainError: The gains do not fit, or are not Hurwitz.
-    """
+    """Returns the coefficients c of `damped`."""
     system = structure.system
     names = tuple(signal.name for signal in system.constraint_output_signals)
     degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
@@ -196,17 +183,7 @@ def best_damping(stiffness: float, mobility: float, sample_time: float, delay: i
 def unstable_from(
     frequency: float, sample_time: float, delay: int, damping: float, integral: float = 0.0
 ) -> float | None:
-    """Returns the lowest relative stiffness at which a contact is unstable, if there is one.
-
-    Args:
-        frequency: w = sqrt(A k) of the given stiffness.
-        sample_time, delay: As for `contact_damping`.
-        damping: c.
-        integral: The gain K_i of the integral of the force's error.
-
-    Returns:
-        The lowest up to a factor of two; None if all are stable.
-    """
+    """Returns the lowest relative stiffness at which a contact is unstable, if there is one."""
     for share in STIFFNESSES.tolist():
         natural = frequency * share**0.5
         added = integral * natural * sample_time
@@ -218,12 +195,6 @@ def unstable_from(
 
 def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> None:
     """Warns if a recommended gain is outside the range in which it is valid.
-
-    Args:
-        lost: The result of `unstable_from`.
-        stiffness: The given k in N/m.
-        swing: w T of this contact.
-        advice: The recommended gain, in words.
 
     Warns:
         AdviceWarning: The gain is outside its range.
@@ -248,14 +219,7 @@ def _step(frequency: float, sample_time: float) -> FloatArray:
 
 
 def _radius(step: FloatArray, damping: float, delay: int, integral: float = 0.0) -> float:
-    """The spectral radius of a contact whose damping is sampled, held and delayed.
-
-    Args:
-        step: The matrix of `_step`, shape (2, 3).
-        damping: c.
-        delay: The delay in samples until c phi' acts.
-        integral: The increment per sample of the integral of phi, for phi = 1.
-    """
+    """The spectral radius of a contact whose damping is sampled, held and delayed."""
     # (phi, phi', the integral, the held values from next to last).
     matrix = np.zeros((3 + delay, 3 + delay))
     matrix[:2, :2] = step[:, :2]

@@ -27,13 +27,6 @@ class Deflection:
 
     the error e = phi - phi_d obeys e'' + c e' + A k e = 0 for any reference that is twice
     differentiable. A stiffness that is wrong by a factor s leaves |1 - s| of the oscillation.
-
-    Attributes:
-        stiffness: k in N/m.
-        damping: c, shape (m, m).
-        inputs: Output -> the constraint input that it is; all of them.
-        matrix: A(x), shape (m, m).
-        more: The number of further derivatives of each output's reference, 2 for a force.
     """
 
     stiffness: float
@@ -46,13 +39,7 @@ class Deflection:
     def of(
         cls, structure: Structure, stiffness: float, damping: GainDesign | FeedbackGains | None
     ) -> "Deflection":
-        """Checks that the forces of a system can be commanded so.
-
-        Raises:
-            GainError: The damping does not fit.
-            ModelError: A force is no output of degree 0, or a constraint is on velocities, or the
-                stiffness is not positive.
-        """
+        """Checks that the forces of a system can be commanded so."""
         system, size = structure.system, structure.system.num_constraints
         inputs = force_outputs_of(system)
         degrees = [structure.output_degrees[i] for i in inputs]

@@ -22,12 +22,6 @@ class IntegralAction:
     so that an output has mu_i + 1 poles in place of mu_i. If mu_i = 0 it is the integral of a
     measured force: ubar_i = r_i - K_i0 int (z_i - r_i) dt. With a constant model error, e_i tends
     to zero.
-
-    Attributes:
-        outputs: The indices of these outputs.
-        degrees: mu_1, ..., mu_p.
-        signals: Names and units of sigma.
-        symbol: The symbols of sigma, shape (k, 1).
     """
 
     outputs: tuple[int, ...]
@@ -43,12 +37,7 @@ class IntegralAction:
         names: Sequence[str],
         measured: ForceMeasurement | None,
     ) -> "IntegralAction":
-        """Returns the integral action on outputs by their names.
-
-        Raises:
-            GainError: A name is not that of an output, occurs twice, or is that of a force with
-                mu_i = 0 that is not measured.
-        """
+        """Returns the integral action on outputs by their names."""
         names_of_outputs = [signal.name for signal in system.output_signals]
         integrated = []
         for name in names:
@@ -79,12 +68,7 @@ class IntegralAction:
         return tuple(degree + (i in self.outputs) for i, degree in enumerate(self.degrees))
 
     def coordinates(self, errors: ca.SX, integral: ca.SX | None = None) -> ca.SX:
-        """Returns the error coordinates, with the integrals among them.
-
-        Args:
-            errors: (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i, 1).
-            integral: sigma, shape (k, 1); its symbols if None.
-        """
+        """Returns the error coordinates, with the integrals among them."""
         values = self.symbol if integral is None else integral
         starts, rows = DerivativeLayout(self.degrees).starts.tolist(), []
         for i, degree in enumerate(self.degrees):
@@ -94,13 +78,7 @@ class IntegralAction:
         return ca.vertcat(ca.SX(0, 1), *rows)
 
     def rate(self, chain: ca.SX, values: ca.SX, measured: ForceMeasurement | None) -> ca.SX:
-        """Returns sigma' = z - r of these outputs, shape (k, 1).
-
-        Args:
-            chain: The output chains, with measured forces where the law uses them.
-            values: r_1, ..., r_p, shape (p, 1).
-            measured: The measurement, if the law uses it.
-        """
+        """Returns sigma' = z - r of these outputs, shape (k, 1)."""
         starts, rows = DerivativeLayout(self.degrees).starts.tolist(), [ca.SX(0, 1)]
         for i in self.outputs:
             if self.degrees[i]:

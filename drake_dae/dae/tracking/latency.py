@@ -26,16 +26,6 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
     a contact with viscous friction damps several joints by one matrix J^T d J. v are the states
     that a force or a control drives. Those whose own damping, at the nominal state, is 0 or
     negative do not count.
-
-    Args:
-        system: The system of a law.
-        latency: T in s; 0 for a law that acts at once.
-
-    Returns:
-        The system with E + T D in place of E; itself if that is the same.
-
-    Raises:
-        ModelError: The latency is negative.
     """
     if latency < 0.0:
         raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")

@@ -22,13 +22,6 @@ class ForceMeasurement:
 
     Outputs that are combinations of constraint inputs, z_i = m_i(x) v, take m_i v in place of v_j;
     then Gbar is a multiple of the identity.
-
-    Attributes:
-        layout: The layout of reference vectors and chains.
-        rows: Output index i -> m_i, shape (1, m), for the measured outputs.
-        inputs: Output index i -> constraint input index j, for those that are a single one.
-        gain: Gbar, shape (m, m), positive semidefinite.
-        symbol: The symbols v of the measurement, shape (m, 1).
     """
 
     layout: DerivativeLayout
@@ -39,17 +32,7 @@ class ForceMeasurement:
 
     @classmethod
     def of(cls, system: DaeSystem, layout: DerivativeLayout, gain: ArrayLike) -> "ForceMeasurement":
-        """Returns the measurement of all constraint inputs of a system.
-
-        Args:
-            system: The system (1)-(3).
-            layout: The layout of its reference vectors and chains.
-            gain: Gbar, a number or shape (m, m).
-
-        Raises:
-            GainError: The gain is not positive semidefinite, or is for an output with mu_i >= 1.
-            ModelError: No output consists of constraint inputs, or constraints share their forces.
-        """
+        """Returns the measurement of all constraint inputs of a system."""
         if system.sharing is not None:
             raise ModelError(
                 f"{system.name}: measured_force is not supported for redundant constraints that "
@@ -77,11 +60,7 @@ class ForceMeasurement:
         return ca.mtimes(self.rows[output], self.symbol)
 
     def chain(self, chain: ca.SX) -> ca.SX:
-        """Returns the output chains with the measurement in place of the model's l*_i.
-
-        Args:
-            chain: The output chains by the model, shape (sum mu_i, 1).
-        """
+        """Returns the output chains with the measurement in place of the model's l*_i."""
         result = ca.SX(chain)
         for head, output in zip(self.layout.heads, self.layout.dynamic, strict=True):
             if output in self.rows:
@@ -89,12 +68,7 @@ class ForceMeasurement:
         return result
 
     def highest(self, highest: ca.SX, values: ca.SX) -> ca.SX:
-        """Returns the highest derivatives of the reference, less Gbar (v - r) where mu_i = 0.
-
-        Args:
-            highest: r_i^(mu_i), shape (p, 1).
-            values: r_i, shape (p, 1).
-        """
+        """Returns the highest derivatives of the reference, less Gbar (v - r) where mu_i = 0."""
         excess = ca.SX(self.symbol.numel(), 1)
         for i, j in self.inputs.items():
             excess[j] = self.symbol[j] - values[i]
@@ -108,15 +82,7 @@ class ForceMeasurement:
 
 
 def force_gain(value: ArrayLike, size: int) -> FloatArray:
-    """Checks Gbar of (59) and returns it as a matrix of shape (m, m).
-
-    Args:
-        value: A number for all forces, or the matrix.
-        size: The number of forces, m.
-
-    Raises:
-        GainError: The shape is wrong, or the matrix is not positive semidefinite.
-    """
+    """Checks Gbar of (59) and returns it as a matrix of shape (m, m)."""
     gain = numbers("force_gain", value, GainError)
     if gain.ndim == 0:
         gain = gain * np.eye(size)
@@ -147,11 +113,7 @@ def _force_outputs(system: DaeSystem) -> dict[int, ca.SX]:
 
 
 def force_outputs_of(system: DaeSystem) -> dict[int, int]:
-    """The outputs that are single constraint inputs, z_i = v_j, as output index i -> index j.
-
-    Raises:
-        ModelError: No output is a constraint input, or a combination of some.
-    """
+    """The outputs that are single constraint inputs, z_i = v_j, as output index i -> index j."""
     rows = _force_outputs(system)
     return {i: j for i, row in rows.items() if (j := _single(row)) is not None}
 

@@ -1,18 +1,16 @@
 """States at rest with constant outputs."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pinned.pinned_point import PinnedPoint, Regularity
-from drake_dae.dae.zero_dynamics.stability import ROUNDED, balanced_norm
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint
+from drake_dae.dae.zero_dynamics.stability import ROUNDED, balanced_matrix
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.newton import DEPENDENT, ROUND_OFF, NewtonModel, newton, shortest_steps
+from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
+from drake_dae.trace.round_off import DEPENDENT
 
 AT_REST = 1e-8
 """A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
@@ -29,13 +27,9 @@ SAME = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Where a search for an equilibrium ends.
+    """Where a search for an equilibrium ends: a state, x' there, and why it is not at rest, if so.
 
-    Attributes:
-        state: The state, shape (n,).
-        rate: x' there, shape (n,).
-        unrest: Why the state is not at rest; empty if it is.
-        degenerate: The number of directions in which its Jacobian is singular; at an equilibrium 0.
+    `degenerate` is the number of directions in which the Jacobian of a state at rest is singular.
     """
 
     state: FloatArray
@@ -44,35 +38,24 @@ class Rest:
     degenerate: int = 0
 
 
-def clock_rates(system: DaeSystem) -> FloatArray:
-    """Returns the rates of states with a constant rate, such as clocks, shape (n,); else 0."""
-    explicit, rates = system.explicit, np.zeros(system.num_states)
-    for i in range(system.num_states):
-        if explicit.f[i].is_constant() and not (explicit.g[i, :].nnz() or explicit.h[i, :].nnz()):
-            rates[i] = float(explicit.f[i])
-    return rates
-
-
 class Equilibria:
-    """The equilibria on Z(R). The arguments of all methods are arrays of the right sizes.
+    """The equilibria on Z(R).
 
     An equilibrium is a state at rest whose Jacobian is not singular: Newton's step from there is
     short, and its slopes hardly change beside it. A small rate alone shows nothing: that of
     x' = exp(-x) is small for all large x, and Newton's step is 1 everywhere.
-
-    Args:
-        pinned: Z(R).
-
-    Attributes:
-        pinned: Z(R).
-        sizes: The sizes of the states, shape (n,).
     """
 
     def __init__(self, pinned: PinnedOutputs) -> None:
-        self.pinned = pinned
+        self.pinned, system = pinned, pinned.system
         examined = np.abs(pinned.structure.states).max(axis=0)
-        self.sizes = np.maximum(examined, pinned.system.nominal_spread)
-        self._clocks = clock_rates(pinned.system)
+        self.sizes = np.maximum(examined, system.nominal_spread)
+        # The rates of states with a constant rate, such as clocks.
+        explicit, self._clocks = system.explicit, np.zeros(system.num_states)
+        for i in range(system.num_states):
+            still = not (explicit.g[i, :].nnz() or explicit.h[i, :].nnz())
+            if still and explicit.f[i].is_constant():
+                self._clocks[i] = float(explicit.f[i])
 
     def constant_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
         """Returns R with the outputs of a state and zero derivatives.
@@ -94,15 +77,9 @@ class Equilibria:
         return reference
 
     def find(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """Returns the equilibrium at which a search from a guess ends, shape (n,).
-
-        Raises:
-            InconsistentStateError: It ends at none.
-        """
+        """Returns the equilibrium at which a search from a guess ends, shape (n,)."""
         rest = self.search(reference, guess, parameters)
-        unrest = rest.unrest
-        if not unrest and rest.degenerate:
-            unrest = "the Jacobian is singular"
+        unrest = rest.unrest or ("the Jacobian is singular" if rest.degenerate else "")
         if unrest:
             raise InconsistentStateError(self.none(reference, rest.state, unrest), rest.rate)
         return rest.state
@@ -119,9 +96,6 @@ class Equilibria:
 
         T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
         shortest step is taken.
-
-        Raises:
-            InconsistentStateError: There is no state on Z(R) near the guess, or a state is a clock.
         """
         pinned = self.pinned
         if self._clocks.any():
@@ -149,7 +123,8 @@ class Equilibria:
                 return None
             tangent = scipy.linalg.null_space(gradients)
             along = tangent.T @ slopes @ tangent
-            noise = ROUND_OFF * balanced_norm(slopes) / (np.linalg.norm(along) or 1.0)
+            size = np.linalg.norm(balanced_matrix(slopes)[0], 2)
+            noise = ROUND_OFF * float(size) / (np.linalg.norm(along) or 1.0)
             inner = tangent @ np.linalg.pinv(along, noise) @ tangent.T
 
             def step(z: FloatArray) -> FloatArray:
@@ -170,29 +145,13 @@ class Equilibria:
         degenerate = self._degenerate(point.state, reference, parameters)
         return Rest(point.state, point.rate, "", degenerate)
 
-    def find_all(
-        self, reference: FloatArray, guesses: Sequence[FloatArray], parameters: FloatArray
-    ) -> FloatArray:
-        """Finds distinct equilibria from several guesses, shape (k, n)."""
-        distinct = np.zeros((0, self.sizes.size))
-        for guess in guesses:
-            try:
-                rest = self.find(reference, guess, parameters)
-            except InconsistentStateError:
-                continue
-            near = np.abs(distinct - rest) <= ISOLATED * np.maximum(self.sizes, np.abs(rest))
-            if not np.any(np.all(near, axis=1)):
-                distinct = np.vstack([distinct, rest])
-        return distinct
-
     def unrest(self, point: PinnedPoint, reference: FloatArray, parameters: FloatArray) -> str:
         """Returns why a point is no regular state at rest, as text; empty if it is one.
 
         A state that a tiny change brings to rest, as in a fast system, does not count as changing.
         """
-        regularity = self.pinned.regularity(point)
-        if regularity is not Regularity.REGULAR:
-            return regularity.value
+        if flaw := self.pinned.flaw(point):
+            return flaw
         slopes, _ = self.pinned.slopes(point.state, reference, parameters)
         slow = np.abs(point.rate) <= AT_REST * np.abs(slopes) @ self.sizes
         unrest = np.where(slow, 0.0, point.unrest)

@@ -6,7 +6,6 @@ spaces a period of a periodic motion takes T c to T M c; the eigenvalues of M ar
 """
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -15,9 +14,8 @@ import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, vector
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pursuit import GROWN, Reference
+from drake_dae.dae.zero_dynamics.pinned_motion import GROWN, PinnedMotion, TimeFunction
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict, eigenvalues_of
 from drake_dae.errors import ModelError
 from drake_dae.trace.given import result_of
@@ -46,18 +44,7 @@ REPEATED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class StabilityAlong:
-    """The stability of the internal states while the outputs follow a periodic reference.
-
-    Attributes:
-        verdict: Exponentially stable if all multipliers are inside the unit circle, unstable if one
-            is outside. Otherwise not decided: one is on the circle up to the error of integration,
-            or no motion with the period of the reference is found.
-        reason: The reason for the verdict, in words.
-        period: The period of the reference in s.
-        multipliers: The Floquet multipliers of the periodic motion, the largest first, shape
-            (dimension,); empty if none is found.
-        state: The start of the periodic motion, shape (n,); None without one.
-    """
+    """The stability of the internal states while the outputs follow a periodic reference."""
 
     verdict: Verdict
     reason: str
@@ -67,25 +54,17 @@ class StabilityAlong:
 
 
 class _MotionLost(Exception):
-    """The exception for a motion that cannot be followed over a period."""
+    """Raised where a motion cannot be followed over a period."""
 
 
 class PeriodicMotions:
-    """The motions on Z(R(t)) with the period of R, and their multipliers.
-
-    Args:
-        pinned: Z(R).
-        reference: The function t -> R(t).
-        parameters: The function t -> values of all parameters.
-        scale: The sizes of the states, shape (n,).
-        period: The period in s.
-    """
+    """The motions on Z(R(t)) with the period of R, and their multipliers."""
 
     def __init__(
         self,
         pinned: PinnedOutputs,
-        reference: Reference,
-        parameters: Callable[[float], FloatArray],
+        reference: TimeFunction,
+        parameters: TimeFunction,
         scale: FloatArray,
         period: float,
     ) -> None:
@@ -93,30 +72,29 @@ class PeriodicMotions:
         self._reference, self._period = reference, period
 
     def judge(self, motion: PinnedMotion) -> StabilityAlong:
-        """Judges the periodic motion found near a motion.
-
-        Raises:
-            ModelError: The reference, or an exogenous signal, does not have the period.
-        """
+        """Judges the periodic motion found near a motion."""
         if not motion.times.size:
             return StabilityAlong(Verdict.UNDECIDED, str(motion.ending), self._period)
         self._check_period(motion.times)
         # Late, when decaying disturbances are gone; or early, when growing ones are still small.
         late = int(np.count_nonzero(motion.times <= motion.times[-1] - self._period)) - 1
         for first in dict.fromkeys((max(late, 0), 0)):
-            found = self._close(motion.states[first], float(motion.times[first]))
-            if found is not None:
-                return self._by_multipliers(*found)
+            try:
+                state, matrix = self._close(motion.states[first], float(motion.times[first]))
+            except _MotionLost:
+                continue
+            noise = CARRIED * max(1.0, float(np.linalg.norm(matrix, 2)))
+            values, errors = eigenvalues_of(matrix, np.full(matrix.shape, noise))
+            order = np.argsort(-np.abs(values), kind="stable")
+            return self._by_multipliers(state, values[order], errors[order])
         reason = f"no motion with the period {self._period:.6g} s of the reference is found"
         if motion.ending is not None:
             reason += f"; the motion ends: {motion.ending}"
         return StabilityAlong(Verdict.UNDECIDED, reason, self._period)
 
-    def _by_multipliers(self, state: FloatArray, matrix: FloatArray) -> StabilityAlong:
-        noise = CARRIED * max(1.0, float(np.linalg.norm(matrix, 2)))
-        values, errors = eigenvalues_of(matrix, np.full(matrix.shape, noise))
-        order = np.argsort(-np.abs(values), kind="stable")
-        values, errors = values[order], errors[order]
+    def _by_multipliers(
+        self, state: FloatArray, values: ComplexArray, errors: FloatArray
+    ) -> StabilityAlong:
         sizes, over = np.abs(values), f"over {self._period:.6g} s"
         reason = f"the largest Floquet multiplier is {sizes[0]:.4g} {over}"
         if np.any(sizes > 1.0 + errors):
@@ -132,16 +110,14 @@ class PeriodicMotions:
         return StabilityAlong(verdict, reason, self._period, values, state)
 
     def _check_period(self, times: FloatArray) -> None:
-        """Checks that the signals repeat, at a few times, none a round part of the period."""
+        """Raises ModelError if the signals do not repeat, at a few times."""
         begin = float(times[0])
         last = max(float(times[-1]) - self._period, begin)
         for time in np.linspace(begin, last, 4).tolist():
             for signals in (self._goal, self._parameters):
                 now, later = signals(time), signals(time + self._period)
-                if np.any(
-                    np.abs(later - now)
-                    > REPEATED * max(1.0, float(np.max(np.abs(now), initial=0.0)))
-                ):
+                allowed = REPEATED * max(1.0, float(np.max(np.abs(now), initial=0.0)))
+                if np.any(np.abs(later - now) > allowed):
                     raise ModelError(
                         f"{self._pinned.system.name}: the reference does not have the period "
                         f"{self._period:g} s: it differs at {time:g} s and a period later"
@@ -153,52 +129,39 @@ class PeriodicMotions:
         return vector(f"reference({time:g})", goal, self._pinned.layout.reference_size)
 
     def _onto(self, state: FloatArray, time: float) -> FloatArray:
-        """Projects a state onto Z(R(t)).
-
-        Raises:
-            _MotionLost: There is none, or it is not near.
-        """
+        """Projects a state onto Z(R(t)), which must be near."""
         projected, converged = self._pinned.project(state, self._goal(time), self._parameters(time))
         is_near = np.abs(projected - state) <= 0.1 * (self._scale + np.abs(state))
         if not (converged and np.all(is_near)):
             raise _MotionLost
         return projected
 
-    def _close(self, state: FloatArray, begin: float) -> tuple[FloatArray, FloatArray] | None:
-        """Finds the start of the periodic motion near a state, and M; None if there is none.
+    def _close(self, state: FloatArray, begin: float) -> tuple[FloatArray, FloatArray]:
+        """Returns the start of the periodic motion near a state, and M.
 
         Newton's method for the distance from the start after a period, along the tangent space.
         """
         for _ in range(NEWTON_STEPS):
             basis = self._pinned.tangent(state, self._parameters(begin), self._scale)
-            try:
-                later, columns = self._carry(state, basis, begin)
-            except _MotionLost:
-                return None
+            later, columns = self._carry(state, basis, begin)
             scaled = (basis / self._scale[:, None]).T
             matrix = scaled @ (columns / self._scale[:, None])
             if not np.all(np.isfinite(matrix)):
-                return None
+                break
             gap = scaled @ ((later - state) / self._scale)
             change = basis @ np.linalg.lstsq(matrix - np.eye(gap.size), -gap, rcond=CARRIED)[0]
             if np.max(np.abs(change) / self._scale) <= CLOSED:
                 off = np.max(np.abs(later - state) / self._scale)
-                allowed = 1e3 * CLOSED * max(1.0, float(np.linalg.norm(matrix, 2)))
-                return (state, matrix) if off <= allowed else None
-            try:
-                state = self._onto(state + change, begin)
-            except _MotionLost:
-                return None
-        return None
+                if off > 1e3 * CLOSED * max(1.0, float(np.linalg.norm(matrix, 2))):
+                    break
+                return state, matrix
+            state = self._onto(state + change, begin)
+        raise _MotionLost
 
     def _carry(
         self, state: FloatArray, columns: FloatArray, begin: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Integrates a state and directions in its tangent space, as columns, over a period.
-
-        Raises:
-            _MotionLost: The motion grows without bound, is too fast, or leaves the domain.
-        """
+        """Integrates a state and directions in its tangent space, as columns, over a period."""
         left = MOST_STEPS
         for start, stop in pairwise(np.linspace(begin, begin + self._period, SECTIONS + 1)):
             state, columns, steps = self._section(state, columns, start, stop, left)

@@ -8,7 +8,7 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 
 LINEARIZED = 1e-11
 """The error of a linearization, relative to the terms in each of its entries."""
@@ -36,18 +36,6 @@ class Stability:
 
     The verdict is local: for states near this equilibrium and outputs near its outputs. The global
     sufficient conditions (i) and (ii) below (36) are not examined.
-
-    Attributes:
-        verdict: Stable if all eigenvalues have negative real parts, unstable if one has a positive
-            one; otherwise not decided: an eigenvalue is on the imaginary axis up to round-off, the
-            Jacobian is singular, or no equilibrium is found. Whether a motion that leaves an
-            unstable equilibrium stays bounded, as on a limit cycle, is not examined. Without zero
-            dynamics: stable, or not decided if A(x) or B(x) is singular.
-        reason: The reason for the verdict, in words.
-        eigenvalues: The eigenvalues of the zero dynamics in 1/s, largest real part first, shape
-            (dimension,); empty if no state at rest is found.
-        state: The equilibrium, or the state at rest with a singular Jacobian, shape (n,); None if
-            none is needed, or found.
     """
 
     verdict: Verdict
@@ -65,18 +53,8 @@ def linearized_eigenvalues(
 ) -> tuple[ComplexArray, FloatArray]:
     """Returns the eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), with errors.
 
-    The errors come from round-off in the derivative, and from the error of the equilibrium, which
-    is large if Newton's method converges slowly.
-
-    Args:
-        pinned: Z(R).
-        scale: The sizes of the states, shape (n,).
-        state: An equilibrium, shape (n,).
-        reference: R there.
-        parameters: Values of all parameters.
-
-    Returns:
-        Both in 1/s, largest real part first, shape (dimension,) each.
+    They come from round-off in the derivative, and from the error of the equilibrium, which is
+    large if Newton's method converges slowly. Both in 1/s, largest real part first.
     """
     slopes, _ = pinned.slopes(state, reference, parameters)
     free, moved = pinned.coordinates(state, parameters, scale)
@@ -88,7 +66,7 @@ def linearized_eigenvalues(
     units = scale[free][:, None] / scale[free]
     matrix = (slopes @ moved)[free] / units
     off = off / units + ROUNDED * np.linalg.norm(matrix, 2)
-    rounded = ROUNDED * balanced_norm(sizes * scale / scale[:, None])
+    rounded = ROUNDED * float(np.linalg.norm(balanced_matrix(sizes * scale / scale[:, None])[0], 2))
     values, errors = eigenvalues_of(matrix, off, rounded)
     along = moved @ (scale[free] * np.random.default_rng(0).standard_normal(free.size))
     along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
@@ -108,27 +86,23 @@ def stays_off_the_axis(matrix: FloatArray, error: FloatArray, rounded: float) ->
     Eigenvalues of a defective matrix have errors of the root of its error, even if all are far from
     the axis. A perturbation that moves one to i w is at least the smallest singular value of A - i
     w; this equals e for some w only if i w is an eigenvalue of [[A, -e], [e, -A^T]] (Byers 1988).
-
-    Args:
-        matrix, error, rounded: As for `eigenvalues_of`.
     """
-    size = len(matrix)
-    with np.errstate(invalid="ignore"):
-        balanced, similarity = scipy.linalg.matrix_balance(matrix, permute=False)
-    units, norm = np.diag(similarity), float(np.linalg.norm(balanced, 2))
+    balanced, units = balanced_matrix(matrix)
+    norm = float(np.linalg.norm(balanced, 2))
     off = float(np.linalg.norm(error / units[:, None] * units, 2)) + rounded + ROUNDED * norm
     if not (np.isfinite(off) and norm > 0.0):
         return False
-    away = off * np.eye(size)
+    away = off * np.eye(len(matrix))
     values = np.linalg.eigvals(np.block([[balanced, -away], [away, -balanced.T]]))
     # Its eigenvalues have an error of the root of round-off where they meet on the axis.
     return bool(np.min(np.abs(values.real)) > np.sqrt(ROUNDED) * norm)
 
 
-def balanced_norm(matrix: FloatArray) -> float:
-    """Returns the norm of a matrix after balancing, which does not depend on units."""
+def balanced_matrix(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Returns a matrix whose norm does not depend on units, and these units of its rows."""
     with np.errstate(invalid="ignore"):  # SciPy casts factors of 1e50 to numbers of rows.
-        return float(np.linalg.norm(scipy.linalg.matrix_balance(matrix, permute=False)[0], 2))
+        balanced, similarity = scipy.linalg.matrix_balance(matrix, permute=False)
+    return balanced, np.diag(similarity)
 
 
 def eigenvalues_of(
@@ -139,18 +113,11 @@ def eigenvalues_of(
     To first order an error E of the matrix moves an eigenvalue by at most |y|^H |E| |x| / |y^H x|,
     with its left and right eigenvectors y and x. So in a triangular matrix a small eigenvalue is as
     accurate as its own entry. Balancing removes the units first.
-
-    Args:
-        matrix: The matrix, shape (d, d).
-        error: The error bounds of its entries, shape (d, d).
-        rounded: The error bound of the entries of the balanced matrix; that of the computation is
-            added.
+    `error` bounds the entries of the matrix, `rounded` those of the balanced one.
     """
     if not matrix.size:
         return np.zeros(0, dtype=complex), np.zeros(0)
-    with np.errstate(invalid="ignore"):  # SciPy casts factors of 1e50 to numbers of rows.
-        balanced, similarity = scipy.linalg.matrix_balance(matrix, permute=False)
-    units = np.diag(similarity)
+    balanced, units = balanced_matrix(matrix)
     values, left, right = scipy.linalg.eig(balanced, left=True, right=True)
     off = error / units[:, None] * units + rounded + ROUNDED * np.linalg.norm(balanced, 2)
     moved = np.einsum("ik,ij,jk->k", np.abs(left), off, np.abs(right))
@@ -164,12 +131,7 @@ def judge(
 ) -> Stability:
     """Judges a state at rest by its eigenvalues.
 
-    Args:
-        values, errors: The result of `linearized_eigenvalues`, at least one eigenvalue.
-        state: The state, shape (n,).
-        place: The state in words.
-        degenerate: The number of directions in which its Jacobian is singular; the smallest
-            eigenvalues, as many, are known to nothing.
+    In `degenerate` directions its Jacobian is singular: as many eigenvalues are known to nothing.
     """
     smallest = np.argsort(np.abs(values))[:degenerate]
     errors = errors.copy()

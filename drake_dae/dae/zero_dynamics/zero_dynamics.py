@@ -16,11 +16,10 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, show, vector
 from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.equilibria import AT_REST, Equilibria
+from drake_dae.dae.zero_dynamics.equilibria import AT_REST, ISOLATED, Equilibria
 from drake_dae.dae.zero_dynamics.floquet import PeriodicMotions, StabilityAlong
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
-from drake_dae.dae.zero_dynamics.pursuit import Reference, follow
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion, TimeFunction, follow
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     Stability,
@@ -47,9 +46,9 @@ class Exogenous(Protocol):
 class ZeroDynamics:
     """The dynamics (35) that remain if the outputs are pinned to a reference.
 
-    In all methods `reference` is R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), shape
-    (sum (mu_i + 1),), as for `TrackingLaw`; `guess` is a state, shape (n,), the nominal one if
-    None; and `parameters` are the values of all parameters, the defaults if None.
+    In all methods states have shape (n,), outputs z shape (p,); `reference` is R = (r_1, r_1',
+    ..., r_1^(mu_1), r_2, ...), shape (sum (mu_i + 1),), as for `TrackingLaw`; `guess` is a state,
+    the nominal one if None; and `parameters` are values of all parameters, the defaults if None.
 
     Args:
         system: The system (1)-(3).
@@ -81,9 +80,6 @@ class ZeroDynamics:
     ) -> FloatArray:
         """Returns a state on Z(R), to round-off, by Newton's method from a guess.
 
-        Returns:
-            x, shape (n,).
-
         Raises:
             InconsistentStateError: Newton's method does not reach Z(R) from there.
             ModelError: A shape is wrong, or a number is not finite.
@@ -96,7 +92,7 @@ class ZeroDynamics:
     @checked(ModelError)
     def motion(
         self,
-        reference: Reference,
+        reference: TimeFunction,
         times: ArrayLike,
         guess: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
@@ -111,7 +107,6 @@ class ZeroDynamics:
             reference: The function t -> R(t); it is also evaluated between the times.
             times: Times in s, increasing, shape (k,).
             guess: A state near the first one; it decides which of several solutions is followed.
-            parameters: Values of all parameters.
             exogenous: The references of the exogenous signals, as for `make_closed_loop`; without
                 any they stand still.
 
@@ -138,14 +133,6 @@ class ZeroDynamics:
         The Jacobian is not singular there: of states at rest that are not isolated none is
         returned.
 
-        Args:
-            outputs: z, shape (p,).
-            guess: The initial guess.
-            parameters: Values of all parameters.
-
-        Returns:
-            x, shape (n,).
-
         Raises:
             InconsistentStateError: No state near the guess has these outputs; or there are such
                 states, but no equilibrium: `residual` is then x', shape (n,).
@@ -171,7 +158,6 @@ class ZeroDynamics:
 
         Args:
             state: x, shape (n,).
-            parameters: Values of all parameters.
             outputs: z, shape (p,). If None, those of the state; outputs with mu_i = 0, which the
                 state does not determine, are those with the smallest x'. Give them if this
                 choice is not unique, as for a force that does not affect the motion.
@@ -206,7 +192,6 @@ class ZeroDynamics:
 
         Args:
             state: The initial guess of the equilibrium.
-            parameters: Values of all parameters.
             outputs: z at the equilibrium, shape (p,). If None those of the state, where outputs
                 with mu_i = 0, which depend on the control, are as brings it nearest to rest.
 
@@ -244,7 +229,6 @@ class ZeroDynamics:
 
         Args:
             guesses: States from which the search starts, shape (k, n); `structure.states` if None.
-            parameters: Values of all parameters.
             outputs: z, shape (p,). If None those of the first guess, as in `stability`.
 
         Returns:
@@ -262,12 +246,21 @@ class ZeroDynamics:
             )
         starts, p = [self._guess(row) for row in rows], self.system.parameter_vector(parameters)
         goal = self._goal(self.structure.manifold.project(starts[0], p), outputs, p)
-        return self._equilibria.find_all(goal, starts, p)
+        distinct = np.zeros((0, self.system.num_states))
+        for start in starts:
+            try:
+                rest = self._equilibria.find(goal, start, p)
+            except InconsistentStateError:
+                continue
+            sizes = np.maximum(self._equilibria.sizes, np.abs(rest))
+            if not np.any(np.all(np.abs(distinct - rest) <= ISOLATED * sizes, axis=1)):
+                distinct = np.vstack([distinct, rest])
+        return distinct
 
     @checked(ModelError)
     def stability_along(
         self,
-        reference: Reference,
+        reference: TimeFunction,
         motion: PinnedMotion,
         period: float,
         parameters: ArrayLike | None = None,
@@ -283,7 +276,6 @@ class ZeroDynamics:
             reference: The function t -> R(t).
             motion: The result of `motion` for this reference.
             period: The period of R(t) and of the exogenous signals, in s.
-            parameters: Values of all parameters.
             exogenous: The references of the exogenous signals, as for `motion`.
 
         Raises:

@@ -76,24 +76,24 @@ def friction_parameters(
 @checked(ModelError)
 @dataclass(frozen=True)
 class FrictionCone:
-    """The limit |tangential force| <= friction * normal force of a contact that must not slide.
+    """The bound |tangential force| <= limit * normal force of a contact that must not slide.
 
     Attributes:
         normal: The name of the normal force, a constraint force that is positive in contact.
         tangents: The names of one or two tangential forces.
-        friction: The coefficient of friction, positive.
+        limit: The largest ratio of the forces, positive: the coefficient of static friction.
 
     Raises:
-        ModelError: The friction is not positive, or there are not one or two tangential forces.
+        ModelError: The limit is not positive, or there are not one or two tangential forces.
     """
 
     normal: str
     tangents: Sequence[str]
-    friction: float
+    limit: float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tangents", tuple(self.tangents))
-        positive("friction", self.friction)
+        positive("limit", self.limit)
         if not 1 <= len(self.tangents) <= 2:
             raise ModelError(
                 f"a friction cone has one or two tangential forces, got {len(self.tangents)}"

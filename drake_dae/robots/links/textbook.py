@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.system.expressions import as_expression
+from drake_dae.dae.system.fields import as_expression
 from drake_dae.dae.system.signals import Parameter, Signal, is_symbol, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import Outline

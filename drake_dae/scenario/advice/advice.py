@@ -45,18 +45,16 @@ def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) ->
     )
 
 
-def least_damping(
-    structure: Structure, damping: parts.Poles | parts.Coefficients | parts.Matrices
-) -> float:
+def least_damping(structure: Structure, damping: parts.Gains) -> float:
     """The least damping of a constraint, in 1/s."""
-    with at("constraint_damping"):
+    with at("law.constraint_damping"):
         return float(np.min(np.diag(damping_gains(structure, damping.design()).matrix)))
 
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
     """Computes gains and other settings that a scenario in Drake's own contact leaves out.
 
-    It computes gains, integrals of forces and of points, constraint damping, an observer of
+    It computes gains, integrals of forces and of points, constraint damping, an estimator of
     disturbance and friction, and measured force, each if it is left out; and for a task the gains
     without contact, soft along the distance. With encoders and rigid joints the gains are those of
     `advised_gains` for the noise of the encoders; otherwise those of `contact_gains`. A scenario
@@ -75,15 +73,16 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             enough; or `largest_roughness` or `largest_errors` is given and not used.
     """
     material = scenario.plant.material
+    law, sensors = scenario.law, scenario.sensors
     _check_bounds(scenario)
     if material is None or not scenario.is_advised:
         return Completed(scenario)
     if model.stages:
         text = (
             "no gains are computed if the robot has springs, motors or valves. Give gains, "
-            "integral and observer, as in the scenario wall_flexible_contact"
+            "integral and estimator, as in the scenario wall_flexible_contact"
         )
-        raise ScenarioError(("gains", text))
+        raise ScenarioError(("law.gains", text))
     sampling = scenario.sampling
     period = material.time_step if sampling is None else sampling.period
     if not period:
@@ -91,17 +90,17 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             "for a continuous compliant plant without `sampling` no gains are computed; give some, "
             "or a sampling"
         )
-        raise ScenarioError(("gains", text))
+        raise ScenarioError(("law.gains", text))
     late = 0 if sampling is None else sampling.late_samples
     mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
     stiffness = material.stiffness_on(model, _FORCE)
     fast = None
     known_by, outlook = f"velocities within {NOISE:.2g} rad/s", ""
-    if scenario.encoders is None:
+    if sensors.encoders is None:
         contact = contact_gains(stiffness, mobility, period, late, NOISE)
     else:
         sensed = sensed_contact(scenario, model, structure, (period, late), stiffness)
-        with at("gains"):
+        with at("law.gains"):
             errors = largest_errors(scenario)
             best, hint = chosen_gains(sensed, largest_roughness(scenario, model), errors)
         contact, fast = best.gains, best.state_rate
@@ -109,12 +108,10 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
     points = moved_points(model)
-    integral = scenario.integral
+    integral = law.integral
     if integral is None:
         integral = [name for name in positions if name in points] + forces.tolist()
-    force = scenario.force_feedback
-    if not force.is_measured:
-        force = parts.MeasuredForce(sample_period=period)
+    force = sensors.force or parts.MeasuredForce(sample_period=period)
     # A force of degree 0 has a gain only if it is integrated.
     of_forces = {
         name: [rounded(contact.force_gain)] for name in forces.tolist() if name in integral
@@ -124,17 +121,18 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         for name in positions.tolist()
     }
     gains = parts.Coefficients(outputs=of_positions | of_forces)
-    damping = scenario.constraint_damping
+    damping = law.constraint_damping
     if damping is None and contact.constraint_damping:
         damping = parts.Poles(all=[-rounded(contact.constraint_damping)])
-    observer = scenario.observer
-    if observer is None:
-        frictional = [c.name for c in model.constraints if c.friction_parameter]
-        observer = parts.Observer(
+    estimator = scenario.estimator or parts.Estimator()
+    frictional = [c.friction_parameter for c in model.constraints if c.friction_parameter]
+    if estimator.rate is None:
+        estimator = replace(
+            estimator,
             rate=rounded(contact.observer_rate),
             force_rate=rounded(contact.observer_force_rate),
             friction_rate=rounded(contact.friction_rate),
-            identify_friction=frictional,
+            identify=list(dict.fromkeys([*frictional, *estimator.identify])),
             state_rate=None if fast is None else rounded(fast),
         )
     task = scenario.task
@@ -155,23 +153,26 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     chosen = replace(
         scenario,
         task=task,
-        gains=gains,
-        integral=integral,
-        constraint_damping=damping,
-        observer=observer,
-        force_feedback=force,
-        largest_roughness=None,
-        largest_errors=None,
+        law=replace(
+            law,
+            gains=gains,
+            integral=integral,
+            constraint_damping=damping,
+            largest_roughness=None,
+            largest_errors=None,
+        ),
+        estimator=estimator,
+        sensors=replace(sensors, force=force),
     )
-    identified = ", ".join(observer.identify_friction) or "none"
+    identified = ", ".join(name for name in estimator.identify if name in frictional) or "none"
     estimated = "" if fast is None else f", and an estimate of the state of {rounded(fast):g} 1/s"
     note = (
         f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
         f"{period:g} s and {known_by}: Butterworth's poles of positions "
         f"at {rounded(contact.position_rate):g} 1/s, and of forces one at "
         f"{-rounded(contact.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
-        f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an observer of "
-        f"{observer.rate:g} 1/s that identifies the friction of: {identified}{estimated}"
+        f"of the constraint {rounded(contact.constraint_damping):g} 1/s, an estimator of "
+        f"{estimator.rate:g} 1/s that identifies: {identified}{estimated}"
         f"{outlook}"
         f"{touch_note}"
     )
@@ -184,14 +185,14 @@ def _check_bounds(scenario: Scenario) -> None:
     Raises:
         ScenarioError: One is not, or is not positive.
     """
-    is_used = scenario.is_advised and scenario.encoders is not None
+    is_used, law = scenario.is_advised and scenario.sensors.encoders is not None, scenario.law
     for name in ("largest_roughness", "largest_errors"):
-        if getattr(scenario, name) is not None and not is_used:
+        if getattr(law, name) is not None and not is_used:
             text = (
                 "it is used only for gains that are computed for rigid joints with encoders in "
-                "Drake's contact; leave it out, or leave `gains` out and give encoders"
+                "Drake's contact; leave it out, or leave `law.gains` out and give encoders"
             )
-            raise ScenarioError((name, text))
-    if scenario.largest_roughness is not None and not scenario.largest_roughness > 0.0:
-        value = f"must be positive, got {scenario.largest_roughness:g} N m"
-        raise ScenarioError(("largest_roughness", value))
+            raise ScenarioError((f"law.{name}", text))
+    if law.largest_roughness is not None and not law.largest_roughness > 0.0:
+        value = f"must be positive, got {law.largest_roughness:g} N m"
+        raise ScenarioError(("law.largest_roughness", value))

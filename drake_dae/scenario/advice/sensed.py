@@ -45,7 +45,7 @@ def sensed_contact(
         timing: The period in s and the delay in samples.
         stiffness: The stiffness of the contact in N/m.
     """
-    system, state, encoders = model.dae, structure.states[0], scenario.encoders
+    system, state, encoders = model.dae, structure.states[0], scenario.sensors.encoders
     assert encoders is not None
     velocities = slice(model.links.q.numel(), 2 * model.links.q.numel())
     rows, moved = system.l.numel(), moved_points(model)
@@ -59,7 +59,8 @@ def sensed_contact(
     moves = np.einsum("ij,ji->i", jacobian, np.linalg.solve(inertia, jacobian.T))
     levers = np.linalg.norm(jacobian, axis=1)
     free, contact = slice(len(points)), slice(len(points), None)
-    may_estimate = scenario.observer is None or scenario.observer.state_rate is not None
+    estimator = scenario.estimator
+    may_estimate = estimator is None or estimator.rate is None or estimator.state_rate is not None
     has_rates = encoders.velocity_bandwidth is None and velocities_are_rates(model.links)
     period, delay = timing
     return SensedContact(
@@ -74,7 +75,7 @@ def sensed_contact(
         noise=SensorNoise(
             position=_largest(encoders.position_deviation),
             velocity=_largest(encoders.velocity_noise),
-            force=_largest(getattr(scenario.force_feedback, "noise_deviation", 0.0)),
+            force=_largest(scenario.sensors.force_noise),
             velocity_bandwidth=encoders.velocity_bandwidth or 0.0,
         ),
         estimates=may_estimate and has_rates,
@@ -154,15 +155,16 @@ def largest_roughness(scenario: Scenario, model: RobotModel) -> float:
         scenario: The scenario.
         model: Its robot, for the limits of its drives.
     """
-    if scenario.largest_roughness is not None:
-        return scenario.largest_roughness
+    if scenario.law.largest_roughness is not None:
+        return scenario.law.largest_roughness
     finite = model.control_limits[np.isfinite(model.control_limits)]
     return _SHARE * float(np.max(finite, initial=1.0 / _SHARE if not finite.size else 0.0))
 
 
 def largest_errors(scenario: Scenario) -> dict[str, float]:
     """The bounds of errors, by the names that `advised_gains` has for them."""
-    given = {} if scenario.largest_errors is None else vars(scenario.largest_errors)
+    errors = scenario.law.largest_errors
+    given = {} if errors is None else vars(errors)
     return {f"{name}_error": most for name, most in given.items() if most is not None}
 
 

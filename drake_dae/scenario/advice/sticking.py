@@ -121,8 +121,8 @@ def _longest(
     part = slice(links.q.numel(), links.q.numel() + links.v.numel())
     factors = PositiveDefiniteFactorization(dae.mass_matrix[part, part])
     parameters, known = dae.parameter_values, {parameter.name for parameter in dae.parameters}
-    for name in known.intersection(scenario.plant_parameters):
-        parameters[dae.parameter_slice(name)] = scenario.plant_parameters[name]
+    for name in known.intersection(scenario.plant.parameters):
+        parameters[dae.parameter_slice(name)] = scenario.plant.parameters[name]
     kinematics, mobilities, names, coefficients = links.kinematics(), [], [], []
     for constraint, touch in touching(model):
         moving = kinematics.value(kinematics.velocity(touch.frame, touch.point))

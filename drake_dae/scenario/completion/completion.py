@@ -72,7 +72,7 @@ def complete(
     if (
         # A robot that is only simulated.
         not (size or setting.S.shape[0] or scenario.references)
-        or scenario.control_weights
+        or scenario.law.control_weights
         or scenario.compliances is not None
         # The model refuses such actuators.
         or np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals)

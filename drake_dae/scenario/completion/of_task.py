@@ -118,7 +118,7 @@ def _off_surface(
     touching = setting.postures(scenario, links, candidates).at(q)
     names = [task.contact] if isinstance(task.contact, str) else [*task.contact]
     values = {parameter.name: parameter.value for parameter in bound.parameters}
-    values |= {name: np.atleast_1d(value) for name, value in scenario.plant_parameters.items()}
+    values |= {name: np.atleast_1d(value) for name, value in scenario.plant.parameters.items()}
     contacts = [c.name for c in bound.constraints if c.touch(links) is not None]
     moved = {
         f"{name}.position": values[f"{name}.position"] + BEFORE * normal

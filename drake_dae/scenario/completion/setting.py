@@ -74,7 +74,7 @@ class Setting:
     ) -> Postures:
         """The configurations of the robot, with some parameters moved."""
         rows, outward = candidates.expression, candidates.outward
-        with at("plant_parameters or exogenous"):
+        with at("plant.parameters or exogenous"):
             values = {**_parameters(scenario), **moved}
             return Postures(links, self.bound, rows, self.S, outward, values)
 
@@ -82,7 +82,7 @@ class Setting:
 def _parameters(scenario: Scenario) -> dict[str, FloatArray]:
     """Parameter name -> value at the start, for the parameters that differ from their defaults."""
     begin = scenario.integrator.start_time
-    values = {name: np.atleast_1d(value) for name, value in scenario.plant_parameters.items()}
+    values = {name: np.atleast_1d(value) for name, value in scenario.plant.parameters.items()}
     for name, references in scenario.exogenous.items():
         entries = [value_at(r, getattr(r, "size", 1), begin) for r in references]
         values[name] = np.concatenate([np.zeros(0), *entries])

@@ -53,15 +53,15 @@ def task_controller(
     """
     task = scenario.task
     assert task is not None
-    assert scenario.gains is not None  # advised.
-    noise = float(np.max(np.asarray(getattr(scenario.force_feedback, "noise_deviation", 0.0))))
+    assert scenario.law.gains is not None  # advised.
+    noise = float(np.max(scenario.sensors.force_noise))
     points = opening_contact(scenario, model)
     forces = [signal.name for point in points for signal in point.force_signals]
     with at("task"):
         free_system = open_contact(law.system, forces)
-    with at("task.gains" if task.gains else "gains"):
+    with at("task.gains" if task.gains else "law.gains"):
         structure = find_structure(free_system)
-        gains = (task.gains or scenario.gains).design()
+        gains = (task.gains or scenario.law.gains).design()
         free_law = TrackingLaw(free_system, gains, structure=structure, latency=law.latency)
     with at("task"):
         # The noise of the sum over the points.

@@ -60,6 +60,7 @@ class Form:
 
     def _core_schema(self, source: type[Any], handler: pydantic.GetCoreSchemaHandler) -> CoreSchema:
         texts = {**attribute_texts(source), **self.texts}
+        fields_in_data = list(_fields_of(source, self.defaults))
         entries = {
             name: core_schema.typed_dict_field(
                 handler.generate_schema(
@@ -67,10 +68,13 @@ class Form:
                 ),
                 required=default is MISSING,
             )
-            for name, hint, default in _fields_of(source, self.defaults)
+            for name, hint, default in fields_in_data
             if not self.keys or name in self.keys
         }
         names, tag = list(entries), {TAG: self.tag} if self.tag else {}
+        # Drake's own defaults are not written: another Drake may not have the key any more.
+        drakes = {} if is_dataclass(source) else {n: d for n, _, d in fields_in_data}
+        unwritten = {name: drakes[name] for name in drakes if name not in self.defaults}
         if tag:
             literal = core_schema.literal_schema([self.tag])
             entries[TAG] = core_schema.typed_dict_field(literal, required=self.needs_tag)
@@ -80,7 +84,9 @@ class Form:
             return source(**{**self.defaults, **data})
 
         def dump(made: Any, dump_data: Callable[[Any], Any]) -> Any:
-            return dump_data({**tag, **{name: getattr(made, name) for name in names}})
+            values = [(name, getattr(made, name)) for name in names]
+            told = {n: v for n, v in values if n not in unwritten or v != unwritten[n]}
+            return dump_data({**tag, **told})
 
         data = core_schema.typed_dict_schema(
             entries,

@@ -134,7 +134,7 @@ def _scenario(robot: NewRobot, task: NewTask, links: Links) -> Scenario:
         # On a strongly curved surface an axis fixed to the normal hinders motion along it.
         tool_axis="normal" if isinstance(task.surface, Plane) else "fixed",
         outputs=[PointCoordinates(robot.tip, along, robot.point)],
-        gains=parts.Poles(all=[-4.0]),
+        law=parts.Law(gains=parts.Poles(all=[-4.0])),
         references=dict(task.references(robot.tip)),
         start=parts.Start(positions=near),
         duration=2 * task.period,

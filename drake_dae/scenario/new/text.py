@@ -28,7 +28,7 @@ _KEYS = (
     "constraints",
     "outputs",
     "tool_axis",
-    "gains",
+    "law",
     "references",
     "start",
     "duration",
@@ -96,9 +96,9 @@ def _lines(data: Mapping[str, Any], robot: NewRobot, task: NewTask) -> Iterator[
     if data["tool_axis"] != "normal":
         fixed = "to keep it normal to a surface that bends would hinder the way along"
         yield from _with_reason(f"tool_axis: {data['tool_axis']}", fixed)
-    (pole,) = data["gains"]["all"]
+    (pole,) = data["law"]["gains"]["all"]
     fading = f"1/s; after {-6 / pole:.2g} s less than a fiftieth of an error is left"
-    yield from _with_reason(f"gains: !Poles {{all: [{pole}]}}", fading)
+    yield from _with_reason(f"law: {{gains: {{all: [{pole}]}}}}", fading)
     yield "references:"
     (along, path), (pressing, force), *constant = data["references"].items()
     speed = 2 * pi * task.radius / task.period

@@ -9,9 +9,8 @@ from casadi import SX
 from numpy.typing import ArrayLike
 
 from drake_dae import references
-from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
+from drake_dae.robots import actuation, force_outputs, outputs
 from drake_dae.robots import constraints as contact
-from drake_dae.robots.constraints import friction
 from drake_dae.robots.surfaces import implicit, measured, surface, surfaces
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms.forms import Choice, Form
@@ -19,17 +18,13 @@ from drake_dae.scenario.forms.values import FileName, Numbers, Pair, Row, Triple
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts import written
 from drake_dae.scenario.parts.task import ScenarioTask
-from drake_dae.scenario.robot_file import payloads
 from drake_dae.systems.control import sampling
-from drake_dae.systems.plants.contact import disturbance_forces
-from drake_dae.systems.sensing import encoders
 from drake_dae.systems.task import phases
 
 # Vectors and arrays are written as in `_WRITTEN`; numbers, text, booleans, Literals, dataclasses,
 # tuples, and lists and dictionaries of these are written directly.
 
 _WRITTEN = {surface.Vector: Triple, ArrayLike: Numbers, str | Path: FileName, surface.Pair: Pair}
-_LISTED: dict[Any, Any] = {**_WRITTEN, Sequence[str]: list[str]}
 
 Surface = Annotated[
     surfaces.Plane
@@ -87,19 +82,15 @@ Reference = Annotated[
     | Annotated[references.CsvReference, Form(tag="!Csv")],
     Choice({**_WRITTEN, ArrayLike: Row, references.PathLimits: _PathLimits}),
 ]
-Load = Annotated[known_forces.KnownForce | joint_friction.JointFriction, Choice(_LISTED)]
-Payload = Annotated[payloads.Payload, Form()]
-DisturbanceForce = Annotated[disturbance_forces.DisturbanceForce, Form(_WRITTEN)]
-FrictionCone = Annotated[friction.FrictionCone, Form(_WRITTEN)]
-Force = Annotated[parts.ModelForce | parts.MeasuredForce, Choice()]
 Plant = Annotated[
     plants.IdealConstraints | plants.MultibodyPlant | plants.CompliantContact | plants.OwnPlant,
     Choice(),
 ]
 Sampling = Annotated[sampling.Sampling, Form()]
-Encoders = Annotated[encoders.Encoders, Form(_WRITTEN)]
-Observer = Annotated[parts.Observer, Form()]
-LargestErrors = Annotated[parts.LargestErrors, Form()]
+Sensors = Annotated[parts.Sensors, Form(_WRITTEN)]
+Estimator = Annotated[parts.Estimator, Form()]
+Law = Annotated[parts.Law, Form()]
+Judgement = Annotated[parts.Judgement, Form()]
 _Conditions = Annotated[
     tuple[Annotated[phases.Condition, Form()], ...], pydantic.Strict(False)
 ]  # In data a tuple is a list.
@@ -114,4 +105,3 @@ Phase = Annotated[
     Choice(_PHASE_DATA),
 ]
 Task = Annotated[ScenarioTask, Form({Sequence[phases.Phase]: list[Phase], **_BY_NAME})]
-Gains = Annotated[parts.Poles | parts.Coefficients | parts.Matrices, Choice()]

@@ -1,32 +1,21 @@
-"""Parts of a scenario without a class in the library: force feedback, gains, start."""
+"""Parts of a scenario without a class in the library: sensors, estimator, law, start."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated
 
-from pydrake.systems.framework import Context
+import numpy as np
+from numpy.typing import ArrayLike
 
-from drake_dae.arrays import positive
+from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
+from drake_dae.robots.constraints.friction import FrictionCone
+from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.values import Numbers
 from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor
-
-
-@dataclass(frozen=True)
-class ModelForce:
-    """The law computes the constraint force from its model: (28)."""
-
-    is_measured: ClassVar = False
-    seed: ClassVar = 0
-    gain: ClassVar = 0.0
-
-    def sensor(self, size: int) -> ForceSensor | None:
-        """None, since the force is not measured."""
-        return None
-
-    def begin(self, sensor: ForceSensor, context: Context) -> None:
-        """Does nothing: there is no sensor."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +29,9 @@ class MeasuredForce:
         noise_deviation: The standard deviation of the noise in N or N m, one number for all forces
             or one per force.
         drift: The rate at which the bias changes, in N/s or N m/s, one number for all forces or one
-            per force. No law and no observer knows it; a task subtracts the bias that it finds
+            per force. No law and no estimator knows it; a task subtracts the bias that it finds
             within `tare_time`, and feels what the drift adds from then on.
         seed: The seed of the noise.
-        gain: Gbar of (59), a number or a matrix row by row; for rigid joints only.
     """
 
     time_constant: float = 0.0
@@ -52,21 +40,33 @@ class MeasuredForce:
     noise_deviation: Numbers = 0.0
     drift: Numbers = 0.0
     seed: int = 0
-    gain: Numbers = 0.0
-    is_measured: ClassVar = True
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**32:
             raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
 
-    def sensor(self, size: int) -> ForceSensor | None:
+    def sensor(self, size: int) -> ForceSensor:
         """The sensor of m = `size` forces."""
         lags = self.time_constant, self.sample_period
         return ForceSensor(size, *lags, self.bias, self.noise_deviation, self.drift)
 
-    def begin(self, sensor: ForceSensor, context: Context) -> None:
-        """Sets the sensor's errors in its context."""
-        sensor.set_errors(context, self.bias, self.noise_deviation, self.drift)
+
+@dataclass(frozen=True)
+class Sensors:
+    """What the law measures; it knows exactly what no sensor measures.
+
+    Attributes:
+        encoders: The measurement of positions and velocities, with `sampling`.
+        force: The measurement of the constraint force, in place of that of the law's model.
+    """
+
+    encoders: Annotated[Encoders, Form({ArrayLike: Numbers})] | None = None
+    force: Annotated[MeasuredForce, Form()] | None = None
+
+    @property
+    def force_noise(self) -> FloatArray:
+        """The standard deviation of the noise of the measured force, in N or N m."""
+        return np.asarray(0.0 if self.force is None else self.force.noise_deviation)
 
 
 @dataclass(frozen=True)
@@ -88,15 +88,24 @@ class LargestErrors:
 
 
 @dataclass(frozen=True)
-class Observer(Observing):
-    """The settings of a `DisturbanceObserver` of model errors.
+class Estimator(Observing):
+    """The settings of a `DisturbanceObserver` or `StateEstimator` of model errors.
 
     Attributes:
-        identify_friction: The names of constraints whose coefficient of friction is identified. The
-            initial value is the coefficient of the constraint; write 0 if it is unknown.
+        rate: k_o in 1/s, the rate of disturbances along the free directions; it is computed with
+            the gains if it is left out.
+        identify: Names of parameters that are estimated while the robot moves: coefficients of
+            friction of contacts, as "wall.friction", whose initial value is that of the constraint
+            (write 0 if it is unknown); and, each with a standard deviation and within `bounds`,
+            masses and places of payloads, friction of joints, "wall.rpy" of a surface.
     """
 
-    identify_friction: list[str] = field(default_factory=list)
+    rate: float | None = None  # type: ignore[assignment]
+    identify: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.rate is not None:
+            super().__post_init__()
 
 
 @dataclass(frozen=True)
@@ -166,12 +175,74 @@ class Matrices:
         return gain_matrices(*self.groups)
 
 
+Gains = Annotated[Poles | Coefficients | Matrices, Choice()]
+
+
+@dataclass(frozen=True)
+class Law:
+    """The tracking law (28).
+
+    Attributes:
+        gains: Its gains. If they are left out: poles at -4 1/s with ideal constraints. With contact
+            that gives way gains are computed, see `advised`, together with `integral`,
+            `constraint_damping`, `estimator` and `sensors.force` if these are left out; the
+            scenario in the folder of the run contains them; not with `actuation`.
+        integral: Names of outputs whose errors are integrated as well, with one more pole:
+            positions, and forces if `sensors.force` measures them; none if left out while `gains`
+            are given.
+        constraint_damping: Damping of compliant constraints by the law, written as gains, with r_i
+            - 1 poles per constraint; none if left out while `gains` are given.
+        contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
+            of forces change within periods of the contact: its deflection is then fed ahead. It
+            needs rigid joints, and references, no task.
+        force_gain: Gbar of (59), a number or a matrix row by row, with `sensors.force`; for rigid
+            joints only.
+        control_weights: One weight per actuator, if there are more actuators than outputs. The law
+            then chooses the control with the least sum of weight * (u - free_control)^2. The
+            parameter "free_control" is zero unless it is in `exogenous`.
+        largest_roughness: The largest permitted rms change of the controls from sample to sample by
+            the noise of encoders, over all joints, in N m, for computed gains; if left out 0.3 % of
+            the largest effort limit, or 1 N m without limits.
+        largest_errors: The largest permitted errors for computed gains: those are then the
+            smoothest ones within them, and without a bound the ones with the least errors.
+    """
+
+    gains: Gains | None = None
+    integral: list[str] | None = None
+    constraint_damping: Gains | None = None
+    contact_stiffness: float | None = None
+    force_gain: Numbers = 0.0
+    control_weights: list[float] = field(default_factory=list)
+    largest_roughness: float | None = None
+    largest_errors: Annotated[LargestErrors, Form()] | None = None
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What counts in the verdict of a run.
+
+    Attributes:
+        tolerances: Output name -> the tolerated error in its unit. For others it is 1 % of the
+            range of the references in their unit.
+        friction_cones: Contacts that must not slide, such as grips: `analyze` and the verdict say
+            where their forces leave these cones.
+        may_diverge: Whether a run continues when its errors or states diverge; otherwise it ends
+            with the reason.
+    """
+
+    tolerances: dict[str, float] = field(default_factory=dict)
+    friction_cones: list[Annotated[FrictionCone, Form({Sequence[str]: list[str]})]] = field(
+        default_factory=list
+    )
+    may_diverge: bool = False
+
+
 @dataclass(frozen=True)
 class Start:
     """A start at rest, on the constraints, with given errors of the outputs.
 
     The constraints are those of the plant, and the outputs those of the law's model, which may
-    assume another wall (`plant_parameters`): the law sees no other errors than these. If a scenario
+    assume another wall (`plant.parameters`): the law sees no other errors than these. If a scenario
     has `exogenous` signals, the robot starts in motion with its references.
 
     Attributes:

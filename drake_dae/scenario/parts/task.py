@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
 
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.references import Reference
-from drake_dae.scenario.forms.forms import Choice
-from drake_dae.scenario.parts.parts import Coefficients, Matrices, Poles
+from drake_dae.scenario.parts.parts import Gains
 from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.task import Task
 
@@ -36,7 +34,7 @@ class ScenarioTask:
         retries: How many times phases may return to the approach; then the run ends with an error.
         signals: Name -> reference of a signal that conditions of phases watch.
         gains: The gains of the law without contact, with the distance among its outputs; those of
-            `gains` if left out.
+            `law.gains` if left out.
     """
 
     phases: Sequence[Phase]
@@ -46,7 +44,7 @@ class ScenarioTask:
     tare_time: float = 0.0
     retries: int = 10
     signals: Mapping[str, Reference | float] = field(default_factory=dict)
-    gains: Annotated[Poles | Coefficients | Matrices, Choice()] | None = None
+    gains: Gains | None = None
 
     def __post_init__(self) -> None:
         signals = self.make().signals

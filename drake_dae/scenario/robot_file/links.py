@@ -39,14 +39,14 @@ def add_robot(
         robot: The robot.
         plant: The plant, registered in the scene graph.
         scene_graph: The scene graph.
-        payloads: The key `plant_payloads` of the scenario.
+        payloads: The key `plant.payloads` of the scenario.
 
     Raises:
         ScenarioError: Drake cannot read the file, or ignores parts of it; or a change of the
             scenario does not fit it.
     """
     change_robot(robot, plant, read_into(plant, robot, scene_graph))
-    add_payloads("plant_payloads", payloads, plant)
+    add_payloads("plant.payloads", payloads, plant)
     cut_loops(plant)
 
 
@@ -62,7 +62,7 @@ def robot_links(
     Args:
         robot: The key `robot` of the scenario.
         scene_graph: The scene graph for its geometry.
-        payloads: The key `plant_payloads` of the scenario, for the links of the plant.
+        payloads: The key `plant.payloads` of the scenario, for the links of the plant.
         drawn: Whether the geometry will be drawn.
 
     Raises:
@@ -70,7 +70,7 @@ def robot_links(
     """
     plant, efforts = read_robot(robot, scene_graph, drawn)
     change_robot(robot, plant, efforts)
-    add_payloads("plant_payloads", payloads, plant)
+    add_payloads("plant.payloads", payloads, plant)
     cuts = cut_loops(plant)
     finalize(plant)
     for joint in joints_of(plant):

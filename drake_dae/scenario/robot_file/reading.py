@@ -274,7 +274,7 @@ def _explained(warning: str) -> str:
     elif "friction" in text:
         text = (
             "Coulomb friction of joints is not read from files; write leave_out: [joint_friction] "
-            "under robot, and the friction as a !JointFriction under known_forces"
+            "under robot, and the friction as a !JointFriction under robot.known_forces"
         )
     elif "effort limit" in text:
         text += " Name the driven joints under robot.actuators"

@@ -1,17 +1,22 @@
 """The robot of a scenario: a file, and changes of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import pydantic
+from numpy.typing import ArrayLike
 
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
-from drake_dae.scenario.forms.forms import Form
+from drake_dae.robots.joint_friction import JointFriction
+from drake_dae.robots.known_forces import KnownForce
+from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.scenario.forms.forms import Choice, Form
 from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.forms.values import Triple
+from drake_dae.scenario.forms.values import Numbers, Triple
 from drake_dae.scenario.robot_file.payloads import Payload
 
 
@@ -86,6 +91,13 @@ LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
 """The parts of a robot's file that a scenario can leave out."""
 
 
+KnownLoad = Annotated[
+    KnownForce | JointFriction,
+    Choice({Vector: Triple, ArrayLike: Numbers, Sequence[str]: list[str]}),
+]
+"""Known forces on a robot."""
+
+
 @dataclass(frozen=True)
 class Robot:
     """A robot's file that Drake's Parser reads, with changes.
@@ -124,6 +136,8 @@ class Robot:
             to 0. constraints: all constraints of the file except joints, such as <equality> of
             MJCF; write them under `constraints` instead.
         payloads: Masses attached to the robot, known to plant and law.
+        known_forces: Known forces on frames; "<name>.force" is zero unless it is in `exogenous` or
+            `plant.parameters`. And friction of joints.
     """
 
     file: str = ""
@@ -135,6 +149,7 @@ class Robot:
     leave_out: list[LeftOut] = field(default_factory=list)
     description: str = ""
     payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
+    known_forces: list[KnownLoad] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if bool(self.file) == bool(self.description):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray, brief, listed, number_in
+from drake_dae.arrays import FloatArray, brief, listed, number_in, numbers
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 
@@ -29,6 +29,10 @@ class Recorded:
 
     values: FloatArray
     signals: tuple[Signal, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", numbers("the values of a signal", self.values))
+        object.__setattr__(self, "signals", tuple(self.signals))
 
 
 Table = tuple[FloatArray, dict[str, Recorded]]

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.primitives import VectorLogSink
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, listed
+from drake_dae.arrays import FloatArray, listed, numbers
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.files import MOST_RECORDED, check_file, open_file
@@ -58,10 +58,12 @@ class Record:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        lengths = {"time": np.shape(self.time)[:1]} | {
+        time = numbers("the times of a record", self.time)
+        object.__setattr__(self, "time", time)
+        lengths = {"time": time.shape[:1]} | {
             name: np.shape(recorded.values)[:1] for name, recorded in self.signals.items()
         }
-        if np.ndim(self.time) != 1 or len(set(lengths.values())) != 1:
+        if time.ndim != 1 or len(set(lengths.values())) != 1:
             text = ", ".join(f"{name} {size}" for name, size in lengths.items())
             raise ModelError(
                 f"all signals of a record must have as many samples as time, got the sizes {text}"

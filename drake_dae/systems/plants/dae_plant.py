@@ -26,8 +26,7 @@ from drake_dae.blocks.failures import (
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.blocks.trials import state_tickets
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.structure.shared_forces import manifold_of_left_out
-from drake_dae.dae.structure.singular import dependent_constraints
+from drake_dae.dae.structure.redundancy import manifold_of_left_out
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError, SingularityError
 from drake_dae.systems.blocks.along import function_along
@@ -223,7 +222,7 @@ class DaePlant(ParameterizedSystem, Plant):
         if not isinstance(error, SingularityError):
             return error
         if not self.dae.frictional_contacts:
-            names = dependent_constraints(self.structure, error.state, parameters)
+            names = self.structure.dependent_constraints(error.state, parameters)
             return singular_configuration(self.dae.name, error.time, error.state, names)
         if not inputs and self._is_controlled:
             return error

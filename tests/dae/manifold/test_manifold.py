@@ -11,7 +11,8 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import are_dependent, newton, shortest_steps
+from drake_dae.trace.newton import newton, shortest_steps
+from drake_dae.trace.round_off import are_dependent
 
 CONSTRAINED = [name for name, make in PROBLEMS.items() if make().constraint_degrees]
 

@@ -208,7 +208,7 @@ def test_on_an_ideal_plant_nothing_changes_but_round_off(name):
     Inside of a step the stages leave N* by the integrator's error. So steps are short.
     """
     records = []
-    for settings in ([], ["constraint_damping={all: [-100.0]}"]):
+    for settings in ([], ["law.constraint_damping={all: [-100.0]}"]):
         scenario = load_scenario(
             find_scenario(name),
             [
@@ -228,7 +228,9 @@ def test_on_an_ideal_plant_nothing_changes_but_round_off(name):
 
 
 def test_a_scenario_reports_which_key_has_bad_damping():
-    scenario = load_scenario(find_scenario("two_link_wall"), ["constraint_damping={all: [50.0]}"])
+    scenario = load_scenario(
+        find_scenario("two_link_wall"), ["law.constraint_damping={all: [50.0]}"]
+    )
     with pytest.raises(ScenarioError, match="constraint_damping: "):
         build_scenario(scenario)
 

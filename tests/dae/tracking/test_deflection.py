@@ -12,8 +12,8 @@ STIFFNESS, DAMPING = 1e5, 50.0
 CONTINUOUS = (
     f"plant=!CompliantContact {{time_step: 0, stiffness: {STIFFNESS}, dissipation: 0}}",
     "plant.radius=1.0e-5",
-    f"constraint_damping=!Poles {{all: [-{DAMPING}]}}",
-    "gains.all=[-8]",
+    f"law.constraint_damping=!Poles {{all: [-{DAMPING}]}}",
+    "law.gains.all=[-8]",
     "start.errors.tool.z=0",
     "references.tool.z=0.3",
     "references.wall.force=!PointToPoint {start: [10], end: [40], start_time: 0.5, end_time: 0.55}",
@@ -41,11 +41,11 @@ def test_the_contact_follows_a_force_that_rises_within_a_period():
     The law is linear in 1 / k, and half of k leaves the opposite of that: the geometry changes by
     1e-3 of it.
     """
-    _, errors = force_errors(f"contact_stiffness={STIFFNESS}")
+    _, errors = force_errors(f"law.contact_stiffness={STIFFNESS}")
     assert np.abs(errors).max() < 1e-3
     _, without = force_errors()
     assert np.abs(without).max() > 5.0
-    _, half = force_errors(f"contact_stiffness={STIFFNESS / 2.0}")
+    _, half = force_errors(f"law.contact_stiffness={STIFFNESS / 2.0}")
     assert_allclose(half, -without, atol=6e-3)
 
 
@@ -59,4 +59,4 @@ def test_the_contact_follows_a_force_that_rises_within_a_period():
 )
 def test_where_a_deflection_is_not_known_it_is_refused(name, stiffness, message):
     with pytest.raises(ScenarioError, match=message):
-        build_scenario(load_scenario(name, [f"contact_stiffness={stiffness}"]))
+        build_scenario(load_scenario(name, [f"law.contact_stiffness={stiffness}"]))

@@ -277,7 +277,7 @@ def test_what_are_no_numbers_is_refused_at_once(design, given, message):
         (["a"], [2], [1.0, 2.0], r"\(2,\)"),
         (["a"], [2, 1], np.ones((2, 3)), r"1.*2"),
         (["a"], [1], [[np.nan]], "nan"),
-        (["a"], [1], "K", "matrix"),
+        (["a"], [1], "K", "'K'"),
         (["a", "b"], [0, 1], [[1.0], [1.0]], r"'a'.*0"),
     ],
 )

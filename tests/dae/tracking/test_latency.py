@@ -154,7 +154,7 @@ def test_coulomb_friction_is_left_out_beside_parameters_of_any_size():
 
 
 LATE = "sampling={period: 0.001, delay: 0.001}"
-DAMPED = "known_forces=[!JointFriction {joints: [joint1, joint2], viscous: 1000}]"
+DAMPED = "robot.known_forces=[!JointFriction {joints: [joint1, joint2], viscous: 1000}]"
 
 
 def off_prediction(*settings):
@@ -195,11 +195,11 @@ def test_a_plant_that_steps_damps_by_the_speed_after_the_step(monkeypatch):
     """
     settings = (
         "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5, friction: 0.0}",
-        "known_forces=[!JointFriction {joints: [joint7], viscous: 100}]",
+        "robot.known_forces=[!JointFriction {joints: [joint7], viscous: 100}]",
         "references={tool.y: 0, tool.z: 0.6, tool.z_axis: 0, joint3: 0, joint7: 0, wall.force: 20}",
         "start.errors={joint7: 0.01}",
-        "gains=!Poles {all: [-10.0]}",
-        "constraint_damping=!Poles {all: [-200.0]}",
+        "law.gains=!Poles {all: [-10.0]}",
+        "law.constraint_damping=!Poles {all: [-200.0]}",
         "duration=0.5",
     )
 

@@ -17,10 +17,10 @@ from problems.zero_systems import (
 )
 from scipy.integrate import solve_ivp
 
-import drake_dae.dae.zero_dynamics.pursuit as module
+import drake_dae.dae.zero_dynamics.pinned_motion as module
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned.pinned_motion import EndCause
-from drake_dae.dae.zero_dynamics.pinned.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned_motion import EndCause
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.errors import NonFiniteError
 

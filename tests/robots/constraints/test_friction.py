@@ -157,8 +157,8 @@ def test_a_law_that_does_not_know_the_friction_is_off_as_derived(friction):
         1e-6,
         "constraints.0.friction=0.0",
         "constraints.0.stiction_tolerance=0.01",
-        f"plant_parameters={{wall.friction: [{friction}]}}",
-        "gains={all: [-4.0]}",
+        f"plant.parameters={{wall.friction: [{friction}]}}",
+        "law.gains={all: [-4.0]}",
     )
     force, desired = record["constraint_force"][:, 0], record["desired_output"][:, 1]
     plant = loop.plant

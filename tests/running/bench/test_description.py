@@ -143,7 +143,7 @@ def test_a_loop_without_commands_has_the_sliders_of_its_parameters():
 
 @pytest.mark.slow
 def test_a_payload_that_only_the_plant_has_is_not_pushed():
-    payload = "plant_payloads=[{frame: tool, mass: 0.5}]"
+    payload = "plant.payloads=[{frame: tool, mass: 0.5}]"
     built = build_commanded(scenario("two_link_wall", "plant=!CompliantContact {}", payload))
     pushes = bench_of(built.loop, built.context, "arm", ()).data["pushes"]
     assert any("link2" in name for name in pushes)

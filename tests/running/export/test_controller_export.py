@@ -30,11 +30,11 @@ FAULTS = NONE, NUMBER, STALE, LATE, CLOCK, VALUE = range(6)
 SAMPLED = "sampling={period: 0.001}"
 EVERYTHING = (
     "sampling={period: 0.002, delay: 0.003}",
-    "observer={rate: 20.0}",
+    "estimator={rate: 20.0}",
     "saturation=true",
-    "encoders={resolution: 1.0e-5, velocity_bandwidth: 500}",
-    "force_feedback=!MeasuredForce {sample_period: 0.002, noise_deviation: [0.1]}",
-    "integral=[tool.z, wall.force]",
+    "sensors.encoders={resolution: 1.0e-5, velocity_bandwidth: 500}",
+    "sensors.force={sample_period: 0.002, noise_deviation: [0.1]}",
+    "law.integral=[tool.z, wall.force]",
 )
 """What a loop may have besides plant and law; the delay ends between two samples."""
 
@@ -70,7 +70,7 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
         pytest.param("wall_point_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
         # Another mass than the model has: what the observer holds is more than rounding.
         pytest.param(
-            "wall_polish", ("plant_parameters={link6.mass: 3.0}",), marks=pytest.mark.slow
+            "wall_polish", ("plant.parameters={link6.mass: 3.0}",), marks=pytest.mark.slow
         ),
         pytest.param(
             "wall_point_contact", ("sampling=null",), marks=[pytest.mark.slow, pytest.mark.thorough]
@@ -309,7 +309,7 @@ int main() {
         ("two_link_wall", (), "samples"),
         (
             "two_link_wall",
-            ("integral=[tool.z]", "sampling=null"),
+            ("law.integral=[tool.z]", "sampling=null"),
             "'tracking_controller'",
         ),
         (

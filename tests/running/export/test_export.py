@@ -146,7 +146,7 @@ def test_names_units_and_defaults(library):
 
 def test_the_plant_has_its_own_parameters(tmp_path):
     """What the scenario's plant has and the law's model does not."""
-    chosen = scenario("two_link_wall", "plant_parameters={link1.mass: [13.5]}")
+    chosen = scenario("two_link_wall", "plant.parameters={link1.mass: [13.5]}")
     export_code(*build_scenario(chosen), "arm", tmp_path)
     source = (tmp_path / "arm.c").read_text()
     assert "arm_default_parameters[] = {13.5, 6.0, " in source
@@ -248,8 +248,8 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 @needs_compiler
 def test_an_observer_is_among_what_holds_between_samples(tmp_path, capsys):
     """Law, limits and observer are in the update of the loop, so that nothing is left out."""
-    words = ["observer={rate: 20.0}", "sampling={period: 0.002}", "saturation=true"]
-    words.append("force_feedback=!MeasuredForce {sample_period: 0.002}")
+    words = ["estimator={rate: 20.0}", "sampling={period: 0.002}", "saturation=true"]
+    words.append("sensors.force={sample_period: 0.002}")
     settings = [word for each in words for word in ("--set", each)]
     assert main(["export", "two_link_wall", *settings, "--out", str(tmp_path)]) == 0
     assert "not among them" not in capsys.readouterr().out

@@ -24,11 +24,11 @@ CONFIG = SimulatorConfig(
 SAMPLED = "sampling={period: 0.001}"
 EVERYTHING = (
     "sampling={period: 0.002, delay: 0.003}",
-    "observer={rate: 20.0}",
+    "estimator={rate: 20.0}",
     "saturation=true",
-    "encoders={resolution: 1.0e-5, velocity_bandwidth: 500}",
-    "force_feedback=!MeasuredForce {sample_period: 0.002}",
-    "integral=[tool.z, wall.force]",
+    "sensors.encoders={resolution: 1.0e-5, velocity_bandwidth: 500}",
+    "sensors.force={sample_period: 0.002}",
+    "law.integral=[tool.z, wall.force]",
 )
 
 
@@ -195,7 +195,7 @@ def test_all_files_are_linked_together(tmp_path):
             "two_link_wall",
             (
                 SAMPLED,
-                "force_feedback=!MeasuredForce {sample_period: 0.01, noise_deviation: [0.1]}",
+                "sensors.force={sample_period: 0.01, noise_deviation: [0.1]}",
             ),
             "random",
         ),

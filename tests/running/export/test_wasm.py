@@ -19,8 +19,8 @@ needs_zig = pytest.mark.skipif(find_spec("ziglang") is None, reason="there is no
 CONFIG = SimulatorConfig(
     integration_scheme="runge_kutta3", use_error_control=False, max_step_size=0.001
 )
-SETTINGS = ("sampling={period: 0.001}", "observer={rate: 20.0}", "saturation=true")
-SETTINGS += ("force_feedback=!MeasuredForce {sample_period: 0.001}",)
+SETTINGS = ("sampling={period: 0.001}", "estimator={rate: 20.0}", "saturation=true")
+SETTINGS += ("sensors.force={sample_period: 0.001}",)
 
 SCRIPT = """
 import { readFileSync } from "node:fs";

@@ -30,7 +30,7 @@ def test_a_rollout_is_drakes_run_or_says_why_not(names, tmp_path):
         assert names[3] == "Drake's contact", refused
         assert re.fullmatch(r"[^.]+(\. [^.]+)?", refused), refused
         return
-    seeds = {"force_noise": chosen.force_feedback.seed} if chosen.force_feedback.is_measured else {}
+    seeds = {"force_noise": chosen.sensors.force.seed} if chosen.sensors.force else {}
     if chosen.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
     simulate(loop.diagram, context, chosen.duration, chosen.integrator, may_diverge=True)

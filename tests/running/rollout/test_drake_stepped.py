@@ -16,12 +16,12 @@ from drake_dae.scenario.rolled import roll_scenario, rollout_times
 STIFF = "plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, radius: 1.0e-5}"
 CONTINUOUS = (
     STIFF,
-    "constraint_damping=!Poles {all: [-50.0]}",
-    "gains.all=[-25.0]",
+    "law.constraint_damping=!Poles {all: [-50.0]}",
+    "law.gains.all=[-25.0]",
     "references={tool.z: 0.3, wall.force: 20}",
 )
-ENCODERS = "encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}"
-NOISE = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
+ENCODERS = "sensors.encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}"
+NOISE = "sensors.force={sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
 LATE = "sampling={period: 2.0e-3, delay: 3.0e-3}"
 
 LOOPS = {
@@ -33,12 +33,12 @@ LOOPS = {
     "encoders": ("wall_point_contact", ENCODERS),
     "noise": (
         "wall_point_contact",
-        "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.1, seed: 7}",
+        "sensors.force={sample_period: 0.001, noise_deviation: 0.1, seed: 7}",
     ),
     "drives with limits": ("wall_point_contact", "saturation=true"),
     "a push": (
         "wall_point_contact",
-        "plant_disturbances=[{frame: link7, start_time: 0.01, end_time: 0.03, force: [5, 0, 0]}]",
+        "plant.disturbances=[{frame: link7, start_time: 0.01, end_time: 0.03, force: [5, 0, 0]}]",
     ),
     "a start between two steps": ("wall_point_contact", "integrator.start_time=0.0104"),
 }
@@ -98,8 +98,8 @@ def test_many_starts_are_each_alone():
 @pytest.mark.parametrize(
     ("robot", "setting"),
     [
-        ("wall_point_contact", "force_feedback=!MeasuredForce {time_constant: 0.002}"),
-        ("two_link_wall", "force_feedback=!MeasuredForce {time_constant: 0.002}"),
+        ("wall_point_contact", "sensors.force={time_constant: 0.002}"),
+        ("two_link_wall", "sensors.force={time_constant: 0.002}"),
     ],
 )
 def test_a_continuous_state_beside_it_is_refused(robot, setting):

@@ -78,14 +78,14 @@ def assert_same(ours, theirs, tolerance, slack=0):
             "two_link_wall",
             [
                 "sampling={period: 0.002, delay: 0.001}",
-                "encoders={position_noise: 1e-5, velocity_noise: 1e-3, seed: 3}",
+                "sensors.encoders={position_noise: 1e-5, velocity_noise: 1e-3, seed: 3}",
             ],
             ("encoder_noise",),
             marks=pytest.mark.slow,
         ),
         pytest.param(
             "two_link_measured_force",
-            ["force_feedback=!MeasuredForce {sample_period: 0.003, noise_deviation: 0.1}"],
+            ["sensors.force={sample_period: 0.003, noise_deviation: 0.1}"],
             ("force_noise",),
             marks=pytest.mark.slow,
         ),
@@ -170,7 +170,7 @@ def test_a_run_that_fails_ends_no_other(monkeypatch):
     euler = ["integrator.integration_scheme=explicit_euler", FIXED[1]]
     settings = [*euler, "integrator.max_step_size=0.01"]
     loop, chosen, starts, rows = problem("two_link_wall", *settings)
-    rows[::3] = start_values(*build_scenario(scenario("two_link_wall", "gains.all=[-4000]")))[1]
+    rows[::3] = start_values(*build_scenario(scenario("two_link_wall", "law.gains.all=[-4000]")))[1]
     times = np.linspace(0.0, 2.0, 21)
     ours, theirs = both_ways(monkeypatch, loop, starts, rows, times, config=chosen.integrator)
     assert [each.failure is None for each in ours] == [k % 3 > 0 for k in range(COUNT)]
@@ -238,8 +238,8 @@ def test_samples_go_on_beside_a_run_that_fails(monkeypatch, first):
     settings = (
         "plant=!CompliantContact {stiffness: 1.0e5, friction: 0.2}",
         "sampling={period: 1.0e-3, delay: 1.0e-3}",
-        "constraint_damping=!Poles {all: [-50.0]}",
-        "gains.all=[-25.0]",
+        "law.constraint_damping=!Poles {all: [-50.0]}",
+        "law.gains.all=[-25.0]",
     )
     chosen = scenario("two_link_wall", *settings)
     loop, context = build_scenario(chosen)
@@ -300,7 +300,7 @@ def test_operations_are_those_of_casadi(options):
 def test_diagrams_that_differ_in_constants_share_their_code(monkeypatch):
     """Sampled laws with other references and gains: one C source, and each has its own runs."""
     settings = ["sampling={period: 0.002, delay: 0.001}", *FIXED]
-    others = ["references.tool.z.offset=0.25", "gains.all=[-3.0]"]
+    others = ["references.tool.z.offset=0.25", "law.gains.all=[-3.0]"]
     found, texts, tables = [], [], []
     for more in ((), others):
         loop, chosen, starts, rows = problem("two_link_wall", *settings, *more)

@@ -91,7 +91,7 @@ def test_equal_fixed_steps_are_equal(name, scheme, compiled):
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, 0.2, chosen.integrator)
-    seeds = [chosen.force_feedback.seed] if chosen.force_feedback.is_measured else None
+    seeds = [chosen.sensors.force.seed] if chosen.sensors.force else None
     (found,) = rollout(
         loop,
         start,
@@ -203,7 +203,7 @@ def test_rows_within_a_thousand_short_steps_are_those_of_long_ones():
         ("references.tool.z.amplitudes=[3.0]", "integrator.accuracy=1e-6"),
         ("references.tool.z.amplitudes=[3.0]", *fixed(step=0.01)[:3]),
         # Gains that no step of this length follows.
-        ("gains.all=[-4000]", *fixed("explicit_euler", 0.01)[:3]),
+        ("law.gains.all=[-4000]", *fixed("explicit_euler", 0.01)[:3]),
     ],
 )
 def test_a_failure_is_that_of_the_simulation(settings, compiled):
@@ -299,8 +299,8 @@ def test_integrals_are_those_of_drake(case, compiled):
     Of a position, of a force behind a sensor with a lag, and of one that the law but integrates.
     """
     name, settings = {
-        "position": ("two_link_wall", ["integral=[tool.z]", "start.errors.tool.z=0.01"]),
-        "measured": ("two_link_measured_force", ["integral=[wall.force, tool.z]"]),
+        "position": ("two_link_wall", ["law.integral=[tool.z]", "start.errors.tool.z=0.01"]),
+        "measured": ("two_link_measured_force", ["law.integral=[wall.force, tool.z]"]),
         "direct": ("two_link_wall", []),
     }[case]
     chosen = scenario(name, "duration=0.1", *settings, *fixed())
@@ -329,17 +329,17 @@ def test_integrals_are_those_of_drake(case, compiled):
         grid(0.1, 1e-3),
         config=chosen.integrator,
         compiled=compiled,
-        seeds=[chosen.force_feedback.seed],
+        seeds=[chosen.sensors.force.seed],
     )
     assert_equal_records(found.record, wanted, 1e-12)
 
 
 @pytest.mark.slow
 @mostly_compiled
-@pytest.mark.parametrize(("pole", "integral"), [(-80, []), (-40, ["integral=[tool.z]"])])
+@pytest.mark.parametrize(("pole", "integral"), [(-80, []), (-40, ["law.integral=[tool.z]"])])
 def test_drives_with_limits_are_those_of_drake(pole, integral, compiled):
     """To 1e-12 of the largest value; integrals stand still while a drive is at its limit."""
-    settings = ["duration=0.1", "start.errors.tool.z=0.05", f"gains.all=[{pole}]", *integral]
+    settings = ["duration=0.1", "start.errors.tool.z=0.05", f"law.gains.all=[{pole}]", *integral]
     chosen = scenario("two_link_wall", *settings, "saturation=true", *fixed())
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
@@ -355,7 +355,7 @@ def test_drives_with_limits_are_those_of_drake(pole, integral, compiled):
 
 
 def test_one_start_is_that_of_all_rows_of_parameters_or_seeds():
-    noisy = ["sampling={period: 0.01}", "encoders={position_noise: 1.0e-4}"]
+    noisy = ["sampling={period: 0.01}", "sensors.encoders={position_noise: 1.0e-4}"]
     loop, context = build_scenario(scenario("two_link_wall", *fixed(step=0.01), *noisy))
     start, parameters = start_values(loop, context)
     rows, seeds, times = np.array([parameters, 1.01 * parameters]), [3, 4], grid(0.1, 0.01)
@@ -429,7 +429,7 @@ def test_all_scenarios_are_rolled_out_as_drake_runs_them(name):
     chosen = scenario(name, "duration=0.02", *fixed())
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
-    seeds = [chosen.force_feedback.seed] if chosen.force_feedback.is_measured else None
+    seeds = [chosen.sensors.force.seed] if chosen.sensors.force else None
     wanted = run(loop, context, 0.02, chosen.integrator)
     arguments = (loop, start, parameters, grid(0.02, 1e-3))
     for compiled in (False, True)[: 2 if name in COMPILED and shutil.which("cc") else 1]:
@@ -491,15 +491,17 @@ def test_states_that_leave_the_constraints_are_brought_back_as_drake_does(name, 
             ["sampling={period: 0.003, delay: 0.003}", "saturation=true"],
             [
                 "sampling={period: 0.002}",
-                "force_feedback=!MeasuredForce "
-                "{sample_period: 0.002, gain: 0.2, noise_deviation: 0.1}",
-                "integral=[tool.z]",
-                "gains=!Poles {all: [-4, -5, -6]}",
+                "sensors.force={sample_period: 0.002, gain: 0.2, noise_deviation: 0.1}",
+                "law.integral=[tool.z]",
+                "law.gains=!Poles {all: [-4, -5, -6]}",
             ],
-            ["sampling={period: 0.002}", "encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"],
+            [
+                "sampling={period: 0.002}",
+                "sensors.encoders={resolution: 1.0e-5, velocity_bandwidth: 300}",
+            ],
             [
                 "sampling={period: 0.002, delay: 0.001}",
-                "encoders={position_noise: 1e-5, velocity_noise: 1e-3, seed: 3, "
+                "sensors.encoders={position_noise: 1e-5, velocity_noise: 1e-3, seed: 3, "
                 "position_bias: 1e-4}",
             ],
         ],
@@ -512,7 +514,7 @@ def test_sampled_laws_are_those_of_drake(settings, compiled):
     loop, context = build_scenario(chosen)
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, 0.2, chosen.integrator)
-    seeds = {"force_noise": chosen.force_feedback.seed} if chosen.force_feedback.is_measured else {}
+    seeds = {"force_noise": chosen.sensors.force.seed} if chosen.sensors.force else {}
     if chosen.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
     (found,) = rollout(
@@ -528,7 +530,7 @@ def test_sampled_laws_are_those_of_drake(settings, compiled):
     assert_equal_records(found.record, wanted, 1e-11)
 
 
-OBSERVED = ["sampling={period: 0.002}", "force_feedback=!MeasuredForce {sample_period: 0.002}"]
+OBSERVED = ["sampling={period: 0.002}", "sensors.force={sample_period: 0.002}"]
 
 
 @pytest.mark.slow
@@ -537,16 +539,19 @@ OBSERVED = ["sampling={period: 0.002}", "force_feedback=!MeasuredForce {sample_p
     ("name", "settings"),
     some(
         [
-            ("two_link_wall", ["constraints.0.friction=0.0", "observer.identify_friction=[wall]"]),
-            ("two_link_wall", ["saturation=true", "integral=[tool.z]", "observer.force_rate=5.0"]),
-            ("two_link_wall", ["encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"]),
+            ("two_link_wall", ["constraints.0.friction=0.0", "estimator.identify=[wall.friction]"]),
+            (
+                "two_link_wall",
+                ["saturation=true", "law.integral=[tool.z]", "estimator.force_rate=5.0"],
+            ),
+            ("two_link_wall", ["sensors.encoders={resolution: 1.0e-5, velocity_bandwidth: 300}"]),
             ("two_link_flexible", ["sampling.delay=0.001"]),
         ]
     ),
 )
 def test_observed_loops_are_those_of_drake(name, settings, compiled):
     """To 1e-11 of the largest value, as of sampled laws; what is observed moves."""
-    observer = "observer={rate: 20.0}"
+    observer = "estimator={rate: 20.0}"
     chosen = scenario(name, "duration=0.2", *OBSERVED, observer, *settings, *fixed())
     loop, context = build_scenario(chosen)
     own = loop.plant.GetMyMutableContextFromRoot(context)
@@ -556,7 +561,7 @@ def test_observed_loops_are_those_of_drake(name, settings, compiled):
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, 0.2, chosen.integrator)
     assert np.ptp(wanted["disturbance"], axis=0).max() > 1.0
-    seeds = {"force_noise": chosen.force_feedback.seed}
+    seeds = {"force_noise": chosen.sensors.force.seed}
     if chosen.encoders is not None:
         seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
     settings = {"config": chosen.integrator, "compiled": compiled, "seeds": [seeds]}

@@ -11,7 +11,8 @@ LEGS = """
 robot: {{file: {folder}/legs.urdf, free: [trunk], actuators: all}}
 constraints:
 {feet}
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: {{all: [-4.0]}}
 {rest}
 """
 

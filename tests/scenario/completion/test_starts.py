@@ -13,7 +13,8 @@ robot: {{file: {folder}/far.urdf, base: {{weld: base}}, actuators: all}}
 constraints:
 - {{frame: hand, surface: !Plane {{point: [0.3, 0, 0], normal: [-1, 0, 0]}}, name: wall}}
 outputs: [!PointCoordinates {{frame: hand, axes: z}}]
-gains: !Poles {{all: [-4.0]}}
+law:
+  gains: !Poles {{all: [-4.0]}}
 references: {{hand.z: {z}, wall.force: 5.0}}
 start: {{positions: {positions}}}
 """

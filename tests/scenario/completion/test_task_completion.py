@@ -15,7 +15,8 @@ robot: {{file: package://drake_dae_models/seven_joint_arm.dmd.yaml}}
 constraints:
 - {{name: wall, frame: tool, surface: {surface}}}
 {more}
-gains: !Poles {{all: [-20]}}
+law:
+  gains: !Poles {{all: [-20]}}
 task:
   phases:
   - {first}

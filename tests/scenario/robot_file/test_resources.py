@@ -16,7 +16,8 @@ SCENARIO = """
 robot: {file: robot/arm.urdf}
 constraints: []
 outputs: [!JointPositions {joints: [joint]}]
-gains: !Poles {all: [-3.0]}
+law:
+  gains: !Poles {all: [-3.0]}
 references: {joint: 0.2}
 duration: 0.01
 """

@@ -41,7 +41,8 @@ constraints:
 outputs:
 - !PointCoordinates {frame: panda_hand, axes: yz}
 - !JointPositions {joints: [panda_joint3, panda_joint5, panda_joint6, panda_joint7]}
-gains: !Poles {all: [-4.0]}
+law:
+  gains: !Poles {all: [-4.0]}
 references:
   panda_hand.y: !Sinusoids {offset: 0.3, amplitudes: [0.05], frequencies: [2.0]}
   panda_hand.z: !Sinusoids {offset: 1.3, amplitudes: [0.04], frequencies: [2.0]}
@@ -70,7 +71,8 @@ constraints:
   point: [0.0, 0.0, 0.3]
   surface: !Plane {point: [0.0, 0.0, 1.1], normal: [0.0, 0.0, -1.0]}
 outputs: [!JointPositions {joints: [shoulder]}]
-gains: !Poles {all: [-4.0]}
+law:
+  gains: !Poles {all: [-4.0]}
 references:
   shoulder: !Sinusoids {offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}
   ceiling.force: 10.0
@@ -86,7 +88,8 @@ robot:
   actuators: all
 outputs: [!JointPositions {joints: [ARM, panda_finger_joint1]}]
 forces: []
-gains: !Poles {all: [-4.0]}
+law:
+  gains: !Poles {all: [-4.0]}
 references:
   ARM: !Constant {values: [0.1, 0.5, 0.2, -1.1, 0.1, 1.3, 0.4]}
   panda_finger_joint1: !Sinusoids {offset: 0.02, amplitudes: [0.01], frequencies: [2.0]}

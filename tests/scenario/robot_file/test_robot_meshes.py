@@ -178,7 +178,8 @@ outputs:
 - !JointPositions
   joints: [shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint,
     wrist_3_joint]
-gains: !Poles {all: [-3.0]}
+law:
+  gains: !Poles {all: [-3.0]}
 references: {shoulder_pan_joint: 0.2, shoulder_lift_joint: 0.3, elbow_joint: 0.4,
   wrist_1_joint: 0.1, wrist_2_joint: 0.2, wrist_3_joint: 0.3}
 """
@@ -215,7 +216,8 @@ MJCF = """<mujoco model="arm"><compiler angle="radian" meshdir="assets"/>
 ARM = """
 robot: {file: arm.xml}
 outputs: [!JointPositions {joints: [j1, j2]}]
-gains: !Poles {all: [-3.0]}
+law:
+  gains: !Poles {all: [-3.0]}
 references: {j1: 0.2, j2: 0.3}
 start: {errors: {j1: 0.1}}
 duration: 0.5

@@ -9,13 +9,13 @@ STEPS = 50
 """A run is advanced so many times; every second of these moments is kept."""
 
 GAINS = (  # As they were computed for wall_point_contact at 77bdd245, with twice the rates.
-    "gains=!Coefficients {outputs: {tool.y: [33000, 2060, 64.1], tool.z: [33000, 2060, 64.1], "
+    "law.gains=!Coefficients {outputs: {tool.y: [33000, 2060, 64.1], tool.z: [33000, 2060, 64.1], "
     "tool.z_axis.y: [1030, 45.4], tool.z_axis.z: [1030, 45.4], joint3: [1030, 45.4], "
     "joint7: [1030, 45.4], wall.force: [19.7]}}",
-    "integral=[tool.y, tool.z, wall.force]",
-    "constraint_damping=!Poles {all: [-49.2]}",
-    "observer={rate: 42.8, friction_rate: 10.7, force_rate: 21.4, identify_friction: [wall]}",
-    "force_feedback=!MeasuredForce {sample_period: 0.001}",
+    "law.integral=[tool.y, tool.z, wall.force]",
+    "law.constraint_damping=!Poles {all: [-49.2]}",
+    "estimator={rate: 42.8, friction_rate: 10.7, force_rate: 21.4, identify: [wall.friction]}",
+    "sensors.force={sample_period: 0.001}",
 )
 """Of the seven joints on a wall that gives way, at 1 kHz."""
 
@@ -91,25 +91,25 @@ IDEAL = (
 QUICK = {"two_link_wall", "seven_joint_wall", "slider_crank", "two_link_flexible_motors"}
 
 PUSHED = (
-    "plant_disturbances=[{frame: tool, force: [0, 5, 5], start_time: 0.1003, end_time: 0.3998}]",
+    "plant.disturbances=[{frame: tool, force: [0, 5, 5], start_time: 0.1003, end_time: 0.3998}]",
     "sampling={period: 0.001, delay: 0.001}",
-    "observer={rate: 20.0}",
-    "force_feedback=!MeasuredForce {sample_period: 0.001}",
-    "gains={all: [-10]}",
+    "estimator={rate: 20.0}",
+    "sensors.force={sample_period: 0.001}",
+    "law.gains={all: [-10]}",
 )
 
 SEEN = (
     "bounds={wall.position: [[0.69, -0.01, -0.01], [0.71, 0.01, 0.01]], wall.rpy: [-0.15, 0.15]}",
     "constraints.0.rpy=[0, 0, 0]",
-    "identified=[wall.position, wall.rpy]",
-    "plant_parameters={wall.position: [0.701, 0, 0], wall.rpy: [0, 0.02, -0.01]}",
+    "estimator.identify=[wall.friction, wall.position, wall.rpy]",
+    "plant.parameters={wall.position: [0.701, 0, 0], wall.rpy: [0, 0.02, -0.01]}",
 )
 
 SPRINGS = (
     "sampling=null",
-    "integral=[]",
-    "observer=null",
-    "force_feedback=!ModelForce {}",
+    "law.integral=[]",
+    "estimator=null",
+    "sensors.force=null",
     "plant=!CompliantContact {time_step: 0, stiffness: 1.0e5, friction: 0.1}",
 )
 
@@ -133,18 +133,18 @@ CASES = {
         "wall_point_contact",
         (
             *GAINS[:3],
-            "observer={rate: 30.0, friction_rate: 7.0, force_rate: 15.0, state_rate: 300.0, "
-            "identify_friction: [wall]}",
+            "estimator={rate: 30.0, friction_rate: 7.0, force_rate: 15.0, state_rate: 300.0, "
+            "identify: [wall.friction]}",
             GAINS[4],
             SOFT,
-            "encoders={resolution: 1.0e-5}",
+            "sensors.encoders={resolution: 1.0e-5}",
         ),
         rolls=True,
     ),
     "parameters estimated": Case("wall_point_contact", (*GAINS, SOFT, *SEEN), rolls=True),
     "saturation": Case(
         "seven_joint_wall",
-        ("saturation=true", "start.errors={tool.y: 0.2}", "gains={all: [-30]}"),
+        ("saturation=true", "start.errors={tool.y: 0.2}", "law.gains={all: [-30]}"),
         rolls=True,
     ),
     # Rows at samples: Drake's ports then have the control before them, a rollout that after them.
@@ -166,7 +166,7 @@ CASES = {
         (
             *GAINS,
             SOFT,
-            "plant_disturbances=[{frame: tool, force: [-60, 0, 0], start_time: 0.1003, "
+            "plant.disturbances=[{frame: tool, force: [-60, 0, 0], start_time: 0.1003, "
             "end_time: 0.2003}]",
         ),
         amplifies=True,

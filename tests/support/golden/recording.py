@@ -108,8 +108,8 @@ def gains_found() -> dict[str, list[float]]:
         "point": (),
         "softer": ("plant.stiffness=2e4",),
         "late": ("sampling.delay=0.002",),
-        "encoders": ("encoders={resolution: 1.0e-5}",),
-        "differences": ("encoders={resolution: 1.0e-5, velocity_bandwidth: 300}",),
+        "encoders": ("sensors.encoders={resolution: 1.0e-5}",),
+        "differences": ("sensors.encoders={resolution: 1.0e-5, velocity_bandwidth: 300}",),
         "slow": ("plant.time_step=0.002", "sampling={period: 0.002, delay: 0.002}"),
     }
     for name, changed in settings.items():

@@ -223,7 +223,7 @@ def test_what_makes_no_sense_is_refused():
 
 def test_a_scenario_names_what_is_integrated():
     scenario = load_scenario(
-        find_scenario("two_link_measured_force"), ["integral=[tool.z, wall.force]"]
+        find_scenario("two_link_measured_force"), ["law.integral=[tool.z, wall.force]"]
     )
     loop, context = build_scenario(scenario)
     assert loop.controller.law.gains.degrees == (3, 1)

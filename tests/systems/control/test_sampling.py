@@ -348,7 +348,8 @@ def test_force_of_a_sampled_sensor_follows_the_control_of_two_samples_before():
         "two_link_wall",
         "references={tool.z: 0.3, wall.force: 20}",
         "start.errors={}",
-        "force_feedback=!MeasuredForce {gain: 5, time_constant: 0.05, sample_period: 0.01}",
+        "sensors.force={time_constant: 0.05, sample_period: 0.01}",
+        "law.force_gain=5",
         "sampling={period: 0.01, delay: 0.0}",
     )
     loop, context = build_scenario(found)

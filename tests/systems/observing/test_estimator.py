@@ -149,9 +149,9 @@ def test_noise_leaves_the_deviations_of_the_filter(ratio):
     assert_allclose(np.std((states - estimates)[200:], axis=0), wanted, rtol=0.12)
 
 
-FORCE = "force_feedback=!MeasuredForce {sample_period: 0.001, noise_deviation: 0.3}"
+FORCE = "sensors.force={sample_period: 0.001, noise_deviation: 0.3}"
 NOISY = ("wall_point_contact", "plant=!CompliantContact {time_step: 0.001, friction: 0.3}", FORCE)
-NOISE = "encoders={position_noise: 5.0e-5, velocity_noise: 0.01}"
+NOISE = "sensors.encoders={position_noise: 5.0e-5, velocity_noise: 0.01}"
 
 
 @pytest.mark.slow
@@ -193,8 +193,12 @@ def test_innovations_of_a_thousand_seeds_are_consistent():
     loop, _ = build_scenario(chosen)
     shares = []
     for k in range(1000):
-        force = replace(chosen.force_feedback, seed=2 * k + 1)
-        other = replace(chosen, encoders=replace(chosen.encoders, seed=2 * k), force_feedback=force)
+        sensors = replace(
+            chosen.sensors,
+            encoders=replace(chosen.sensors.encoders, seed=2 * k),
+            force=replace(chosen.sensors.force, seed=2 * k + 1),
+        )
+        other = replace(chosen, sensors=sensors)
         run = roll_scenario(other, loop, start_scenario(other, loop), 4000.0)
         assert run.failure is None
         shares.append(np.mean(in_band(loop, run.record)))
@@ -213,10 +217,10 @@ def test_without_a_force_sensor_the_force_is_that_of_the_model():
         scenario(
             "wall_point_contact",
             "plant=!CompliantContact {time_step: 0.001, friction: 0.3}",
-            "encoders={resolution: 1.0e-5}",
-            f"gains=!Coefficients {{outputs: {{{points}, {others}}}}}",
-            "integral=[tool.y, tool.z]",
-            "observer={rate: 33, friction_rate: 8, state_rate: 333, identify_friction: [wall]}",
+            "sensors.encoders={resolution: 1.0e-5}",
+            f"law.gains=!Coefficients {{outputs: {{{points}, {others}}}}}",
+            "law.integral=[tool.y, tool.z]",
+            "estimator={rate: 33, friction_rate: 8, state_rate: 333, identify: [wall.friction]}",
             "duration=4",
         )
     )
@@ -239,7 +243,7 @@ def test_the_first_break_away_of_encoders_alone_does_not_swing():
     chosen = scenario(
         *NOISY,
         "plant.friction=0.45",
-        "encoders={resolution: 1.0e-5}",
+        "sensors.encoders={resolution: 1.0e-5}",
         f"references.tool.y={line}, start_time: 1.0}}",
         "references.tool.z=0.7",
         "references.wall.force=!PointToPoint {start: [1], end: [20], start_time: 0, end_time: 0.8}",
@@ -256,22 +260,24 @@ def test_the_first_break_away_of_encoders_alone_does_not_swing():
 
 def test_what_cannot_be_estimated_is_refused():
     with pytest.raises(ScenarioError, match="observer"):
-        build_scenario(scenario(*NOISY, "observer={rate: 20, state_rate: 100}"))
+        build_scenario(scenario(*NOISY, "estimator={rate: 20, state_rate: 100}"))
     with pytest.raises(ScenarioError, match="velocity_bandwidth"):
         build_scenario(
             scenario(
                 *NOISY,
-                "observer={rate: 20, state_rate: 100}",
-                "encoders={resolution: 1.0e-5, velocity_bandwidth: 500}",
+                "estimator={rate: 20, state_rate: 100}",
+                "sensors.encoders={resolution: 1.0e-5, velocity_bandwidth: 500}",
             )
         )
     with pytest.raises(ScenarioError, match="2000"):
-        build_scenario(scenario(*NOISY, "observer={rate: 20, state_rate: 2000}", "encoders={}"))
+        build_scenario(
+            scenario(*NOISY, "estimator={rate: 20, state_rate: 2000}", "sensors.encoders={}")
+        )
     with pytest.raises(ScenarioError, match="observer"):
         build_scenario(
             scenario(
                 "wall_flexible_contact",
-                "observer={rate: 20, state_rate: 100}",
-                "encoders={resolution: 1.0e-5}",
+                "estimator={rate: 20, state_rate: 100}",
+                "sensors.encoders={resolution: 1.0e-5}",
             )
         )

@@ -47,7 +47,7 @@ PAYLOAD = (
 TILT = ("constraints.0.rpy=[0, 0, 0]", "bounds.wall.rpy=[-0.15, 0.15]")
 JOINTS = [f"joint{i}" for i in range(1, 8)]
 FRICTION = (
-    f"known_forces=[!JointFriction {{joints: [{', '.join(JOINTS)}]}}]",
+    f"robot.known_forces=[!JointFriction {{joints: [{', '.join(JOINTS)}]}}]",
     *(f"bounds.{joint}.coulomb=[0, 10]" for joint in JOINTS),
 )
 COULOMB = dict(zip(JOINTS, (3.0, 3.0, 2.0, 2.0, 1.0, 1.0, 0.5), strict=True))
@@ -207,14 +207,14 @@ def rms(record, after: float):
 
 KILOGRAM = (
     *PAYLOAD,
-    "identified=[payload.mass, payload.center]",
-    "plant_parameters.payload.mass=1",
+    "estimator.identify=[payload.mass, payload.center]",
+    "plant.parameters.payload.mass=1",
 )
-TILTED = (*TILT, "identified=[wall.rpy]", "plant_parameters.wall.rpy=[0, 0, 0.0872664626]")
+TILTED = (*TILT, "estimator.identify=[wall.rpy]", "plant.parameters.wall.rpy=[0, 0, 0.0872664626]")
 RUBBING = (
     *FRICTION,
-    f"identified=[{', '.join(f'{joint}.coulomb' for joint in JOINTS)}]",
-    *(f"plant_parameters.{joint}.coulomb={value}" for joint, value in COULOMB.items()),
+    f"estimator.identify=[{', '.join(f'{joint}.coulomb' for joint in JOINTS)}]",
+    *(f"plant.parameters.{joint}.coulomb={value}" for joint, value in COULOMB.items()),
 )
 
 
@@ -270,10 +270,14 @@ def test_the_summary_says_what_is_known_and_what_the_motion_does_not_excite(tmp_
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["identified=[wall.position]"], "identified: .*'wall.position'"),
-        (["identified=[link2.mas]"], "identified: .*'link2.mass'"),
+        (["estimator.identify=[wall.position]"], "estimator.identify: .*'wall.position'"),
+        (["estimator.identify=[link2.mas]"], "estimator.identify: .*'link2.mass'"),
         (
-            ["identified=[link2.mass]", "bounds.link2.mass=[1, 20]", "encoders={resolution: 1e-5}"],
+            [
+                "estimator.identify=[link2.mass]",
+                "bounds.link2.mass=[1, 20]",
+                "sensors.encoders={resolution: 1e-5}",
+            ],
             "encoders",
         ),
     ],
@@ -284,14 +288,14 @@ def test_estimates_that_are_not_possible_are_refused(settings, message):
 
 
 def test_an_estimate_needs_an_observer():
-    with pytest.raises(ScenarioError, match="identified: "):
-        build_scenario(load_scenario("two_link_wall", ["identified=[link2.mass]"]))
+    with pytest.raises(ScenarioError, match=r"estimator\.rate: "):
+        build_scenario(load_scenario("two_link_wall", ["estimator.identify=[link2.mass]"]))
 
 
 @pytest.mark.slow
 def test_the_law_s_model_has_nothing_to_estimate():
     """Formerly `analyze` refused these, since its ideal run has no observer."""
-    estimates = ["identified=[link2.mass]", "bounds.link2.mass=[1, 20]", "duration=0.2"]
+    estimates = ["estimator.identify=[link2.mass]", "bounds.link2.mass=[1, 20]", "duration=0.2"]
     chosen = load_scenario("wall_guarded", [*estimates, "task={phases: [!Approach {within: 0.1}]}"])
     assert "identified" not in str(find_feasibility(chosen).problems)
 

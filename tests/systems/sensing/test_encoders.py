@@ -108,8 +108,8 @@ def test_noise_has_its_deviation_and_its_seed():
     assert_allclose(np.std(first, axis=1), [5e-6, 1e-3], rtol=0.05)
 
 
-SAMPLED = ("sampling={period: 2.0e-3, delay: 0.0}", "duration=0.1", "gains.all=[-10.0]")
-ROUGH = "encoders={resolution: 1.0e-4, velocity_bandwidth: 200.0, position_noise: 1.0e-5}"
+SAMPLED = ("sampling={period: 2.0e-3, delay: 0.0}", "duration=0.1", "law.gains.all=[-10.0]")
+ROUGH = "sensors.encoders={resolution: 1.0e-4, velocity_bandwidth: 200.0, position_noise: 1.0e-5}"
 
 
 @pytest.mark.parametrize(
@@ -149,11 +149,11 @@ def test_error_of_the_loop_is_what_the_encoders_drive_into_it():
     values, so that the ratio is known to a quarter; two of these are allowed.
     """
     period, w = 2e-3, 25.0
-    settings = (f"sampling={{period: {period}}}", f"gains.all=[-{w}]", "duration=0.6")
+    settings = (f"sampling={{period: {period}}}", f"law.gains.all=[-{w}]", "duration=0.6")
     exact = run_scenario(scenario("two_link_wall", *settings))[2]
     errors = []
     for delta in (0.0, 2e-5, 2e-4):
-        rough = f"encoders={{resolution: {delta}, velocity_bandwidth: 400.0}}"
+        rough = f"sensors.encoders={{resolution: {delta}, velocity_bandwidth: 400.0}}"
         loop, _, record = run_scenario(scenario("two_link_wall", rough, *settings))
         law = loop.controller.law
         xi, found = np.zeros(2), []
@@ -178,7 +178,7 @@ def test_seed_is_that_of_the_scenario():
     loop, _ = build_scenario(found)
 
     def end(seed):
-        chosen = scenario("two_link_wall", ROUGH, *SAMPLED, f"encoders.seed={seed}")
+        chosen = scenario("two_link_wall", ROUGH, *SAMPLED, f"sensors.encoders.seed={seed}")
         context = start_scenario(chosen, loop)
         return run(loop, context, 0.05, chosen.integrator)["state"][-1]
 
@@ -192,9 +192,8 @@ def test_encoders_and_force_sensor_of_one_seed_have_noise_of_their_own(seed):
     """Numbers of one generator would make errors of the force and of the positions follow."""
     found = scenario(
         "two_link_wall",
-        "force_feedback=!MeasuredForce {sample_period: 2.0e-3, noise_deviation: 0.1, "
-        f"seed: {seed}}}",
-        f"encoders={{position_noise: 1.0e-6, velocity_noise: 1.0e-3, seed: {seed}}}",
+        f"sensors.force={{sample_period: 2.0e-3, noise_deviation: 0.1, seed: {seed}}}",
+        f"sensors.encoders={{position_noise: 1.0e-6, velocity_noise: 1.0e-3, seed: {seed}}}",
         *SAMPLED,
     )
     loop, context = build_scenario(found)
@@ -213,13 +212,13 @@ def test_encoders_and_force_sensor_of_one_seed_have_noise_of_their_own(seed):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["encoders={resolution: -1.0}"], "resolution"),
-        (["encoders={resolution: [1.0e-5, 1.0e-5, 1.0e-5]}"], r"3.*2"),
-        (["encoders={velocity_bandwidth: 0.0}"], "velocity_bandwidth"),
-        (["encoders={velocity_bandwidth: 9.0, velocity_noise: 1.0}"], "velocity_bandwidth"),
-        (["encoders={position_bias: [[1.0, 2.0]]}"], "position_bias"),
-        (["encoders={seed: -1}"], "seed"),
-        (["encoders={}", "sampling="], "sampling"),
+        (["sensors.encoders={resolution: -1.0}"], "resolution"),
+        (["sensors.encoders={resolution: [1.0e-5, 1.0e-5, 1.0e-5]}"], r"3.*2"),
+        (["sensors.encoders={velocity_bandwidth: 0.0}"], "velocity_bandwidth"),
+        (["sensors.encoders={velocity_bandwidth: 9.0, velocity_noise: 1.0}"], "velocity_bandwidth"),
+        (["sensors.encoders={position_bias: [[1.0, 2.0]]}"], "position_bias"),
+        (["sensors.encoders={seed: -1}"], "seed"),
+        (["sensors.encoders={}", "sampling="], "sampling"),
     ],
 )
 def test_what_no_encoder_can_be_is_refused(settings, message):

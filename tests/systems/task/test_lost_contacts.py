@@ -18,8 +18,9 @@ outputs:
 - {{frame: tool, axes: z}}
 sampling: {{period: 0.001, delay: 0.001}}
 start: {{positions: {{joint1: 1.1653, joint2: -1.8326}}}}
-plant: !CompliantContact {{radius: 1.0e-5, stiffness: 1.0e5, friction: 0.2}}
-plant_disturbances: {pushes}
+plant: !CompliantContact
+  {radius: 1.0e-5, stiffness: 1.0e5, friction: 0.2}
+  disturbances: {pushes}
 task:
   retries: 1
   patience: 0.05

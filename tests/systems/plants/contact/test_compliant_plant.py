@@ -431,7 +431,7 @@ def test_gains_of_a_continuous_contact_need_a_period():
 
 @pytest.mark.slow
 def test_a_task_on_a_continuous_contact_is_sampled():
-    settings = ("plant=!CompliantContact {time_step: 0}", "gains={all: [-25]}")
+    settings = ("plant=!CompliantContact {time_step: 0}", "law.gains={all: [-25]}")
     found = scenario("wall_polish", *settings)
     with pytest.raises((ScenarioError, WiringError), match="sampling"):
         build_scenario(found)

@@ -22,8 +22,8 @@ from drake_dae.systems.plants.contact.contact_material import ball_properties, s
 # Without damping a compliant contact swings for ever. A ball without extension does not roll.
 CONTACT = (
     "plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, radius: 1.0e-5}",
-    "constraint_damping=!Poles {all: [-50.0]}",
-    "gains.all=[-25.0]",
+    "law.constraint_damping=!Poles {all: [-50.0]}",
+    "law.gains.all=[-25.0]",
 )
 ONE_LATE = "sampling={period: 1.0e-3, delay: 1.0e-3}"
 
@@ -106,7 +106,7 @@ def test_law_without_sampling_acts_at_each_step_at_once():
 
 def test_integrals_are_sums_over_the_same_instants():
     """sigma_(k+1) = sigma_k + T (z - r)(t_k) of what is logged."""
-    _, _, record = run_scenario(two_link(ONE_LATE, "integral=[tool.z]", "duration=0.05"))
+    _, _, record = run_scenario(two_link(ONE_LATE, "law.integral=[tool.z]", "duration=0.05"))
     summed = 1e-3 * np.cumsum(record["tracking_error"][:, 0])
     assert_allclose(record["integral"][1:, 0], summed[:-1], atol=1e-15)
 
@@ -264,7 +264,7 @@ def test_sphere_is_a_sphere():
 
 def test_wall_may_stand_elsewhere_than_the_law_believes():
     """2 mm farther: the robot goes there, since the law demands nothing of phi itself."""
-    found = two_link(ONE_LATE, "plant_parameters={wall.position: [1.202, 0.0, 0.0]}")
+    found = two_link(ONE_LATE, "plant.parameters={wall.position: [1.202, 0.0, 0.0]}")
     loop, context, record = run_scenario(found)
     own = loop.plant.GetMyContextFromRoot(context)
     tool = loop.plant.multibody.GetFrameByName("tool")
@@ -289,11 +289,14 @@ def test_analysis_and_pictures_stay(tmp_path):
         (["plant.stiffness=-1.0"], "stiffness"),
         (["plant.friction=-0.1"], "friction"),
         (
-            ["actuation=[!FlexibleJoints {stiffness: 8000, inertia: 0.5}]", "gains={all: [-4]}"],
+            [
+                "actuation=[!FlexibleJoints {stiffness: 8000, inertia: 0.5}]",
+                "law.gains={all: [-4]}",
+            ],
             "CompliantPlant",
         ),
-        (["known_forces=[{frame: tool}]"], r"known_forces.*plant_disturbances"),
-        (["plant_parameters={link1.mas: [1.0]}"], r"'link1\.mas'"),
+        (["robot.known_forces=[{frame: tool}]"], r"robot.known_forces.*plant.disturbances"),
+        (["plant.parameters={link1.mas: [1.0]}"], r"'link1\.mas'"),
         (
             ["constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 1.3, inside: true}"],
             "wall",

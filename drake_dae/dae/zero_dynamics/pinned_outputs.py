@@ -8,17 +8,17 @@ and the control u = B^-1 (-a + r^(mu)), which is (28) without an error; with mor
 outputs, the system's metric chooses u. On Z(R) the state moves by x' = f* + h* u.
 """
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold.search import CONSISTENT
+from drake_dae.dae.manifold.manifold import CONSISTENT
 from drake_dae.dae.states.tangents import coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
-from drake_dae.dae.zero_dynamics.pinned.pinned_point import PinnedPoint, Regularity
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
@@ -28,17 +28,43 @@ VANISHED = 1e-9
 number."""
 
 
-class PinnedOutputs:
-    """Z(R) and the motion on it. The arguments of all methods are arrays of the right sizes.
+@dataclass(frozen=True, eq=False)
+class PinnedPoint:
+    """A state on Z(R) with x', u, v, A of Assumption (2) and B of (5), which may be infinite.
 
-    Args:
-        structure: The structure of the system.
-
-    Attributes:
-        layout: The layout of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...).
-        residual_signals: The residuals of Z(R): the constraints, then the output errors, each with
-            its derivatives.
+    `pivot` is 0 exactly where A or B is singular; `unrest` is |E x'| relative to its terms.
     """
+
+    state: FloatArray
+    rate: FloatArray
+    control: FloatArray
+    constraint_input: FloatArray
+    A: FloatArray
+    B: FloatArray
+    pivot: FloatArray
+    unrest: FloatArray
+
+    @cached_property
+    def margins(self) -> tuple[float, float]:
+        """The smallest singular values of A and B; infinite without constraints."""
+
+        def margin(matrix: FloatArray) -> float:
+            if matrix.size == 1:  # A(x) of one contact; LAPACK takes twenty times as long.
+                return abs(matrix.item())
+            values = np.linalg.svd(matrix, compute_uv=False)
+            return float(np.min(values, initial=np.inf))
+
+        return margin(self.A), margin(self.B)
+
+    @cached_property
+    def signs(self) -> tuple[float, ...]:
+        """The signs of det A and det B; a matrix that is not square has none."""
+        matrices = [matrix for matrix in (self.A, self.B) if len(matrix) == matrix.shape[1]]
+        return tuple(float(np.linalg.slogdet(matrix)[0]) for matrix in matrices)
+
+
+class PinnedOutputs:
+    """Z(R) and the motion on it. R is a `reference` vector by `layout`."""
 
     def __init__(self, structure: Structure) -> None:
         self.structure = structure
@@ -85,11 +111,7 @@ class PinnedOutputs:
         )
 
     def state(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
-        """Returns a state on Z(R), to round-off.
-
-        Raises:
-            InconsistentStateError: None is found near the guess.
-        """
+        """Returns a state on Z(R) near a guess, to round-off, or raises InconsistentStateError."""
         name, outputs = self.system.name, self.describe(reference)
         state, converged = self.project(guess, reference, parameters)
         if converged:
@@ -158,24 +180,38 @@ class PinnedOutputs:
         """Returns states that are coordinates of Z(R), and the derivatives of all by them."""
         return coordinates(self.gradients(state, parameters), scale)
 
+    def point(
+        self, state: FloatArray, reference: FloatArray, parameters: FloatArray
+    ) -> PinnedPoint:
+        """Evaluates rate, inputs and matrices at a state on Z(R)."""
+        values = self._motion.evaluate(state, reference, parameters)
+        rate, u, v, A, B, pivot, unrest = (value.copy() for value in values)
+        A, B = A.reshape(v.size, v.size), B.reshape(self.system.num_outputs, u.size)
+        return PinnedPoint(state, rate, u, v, A, B, pivot, unrest)
+
+    def flaw(self, point: PinnedPoint) -> str:
+        """Returns why the motion is not determined at a point; empty if it is."""
+        if not (np.isfinite(point.A).all() and np.isfinite(point.B).all()):
+            return "A(x) or B(x) is not finite"
+        pairs = zip(point.margins, self._usual_margins, strict=True)
+        vanished = any(now < VANISHED * usual for now, usual in pairs)
+        if vanished or not point.pivot[0] > SINGULAR_PIVOT:
+            return "A(x) or B(x) is singular"
+        moving = np.concatenate([point.rate, point.control, point.constraint_input])
+        return "" if np.isfinite(moving).all() else "x' is not finite"
+
+    @cached_property
+    def _usual_margins(self) -> tuple[float, float]:
+        """The largest margins of A and B at the states of the structure."""
+        reference, parameters = np.zeros(self.layout.reference_size), self.system.parameter_values
+        margins = [
+            self.point(state, reference, parameters).margins for state in self.structure.states
+        ]
+        return max(a for a, _ in margins), max(b for _, b in margins)
+
     def rate(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> FloatArray:
         """Returns x' = f* + h* u, shape (n,)."""
         return self._motion.evaluate(state, reference, parameters)[0].copy()
-
-    @cached_property
-    def _slope(self) -> TracedFunction:
-        """The derivative of x' along a direction of state and reference."""
-        dx, dr = (
-            ca.SX.sym("dx", self.system.num_states),
-            ca.SX.sym("dR", self.layout.reference_size),
-        )
-        at, along = ca.vertcat(self.system.state, self._R), ca.vertcat(dx, dr)
-        return self.system.trace(
-            "slope of the pinned motion",
-            {"slope": ca.jtimes(ca.cse(self._rate), at, along)},
-            {**self._inputs, "dx": dx, "dR": dr},
-            often=False,
-        )
 
     def slopes(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
@@ -193,40 +229,40 @@ class PinnedOutputs:
         reference: FloatArray,
         parameters: FloatArray,
         directions: FloatArray,
+        of: int = 0,
     ) -> FloatArray:
-        """Returns the derivatives of x' along directions of (x, R), or only of x, as columns."""
+        """Returns the derivatives of x', or of (v, u), along directions of x or of (x, R)."""
         n, still = state.size, np.zeros(self.layout.reference_size)
         columns = [
             self._slope.evaluate(
                 state, reference, along[:n], along[n:] if along.size > n else still, parameters
-            )[0].copy()
+            )[of].copy()
             for along in directions.T
         ]
-        return np.array(columns).reshape(-1, n).T
+        return np.array(columns).reshape(directions.shape[1], -1).T
+
+    @cached_property
+    def _slope(self) -> TracedFunction:
+        """The derivatives of x' and (v, u) along a direction of state and reference."""
+        system, dr = self.system, ca.SX.sym("dR", self.layout.reference_size)
+        dx = ca.SX.sym("dx", system.num_states)
+        at, along = ca.vertcat(system.state, self._R), ca.vertcat(dx, dr)
+        slopes = {
+            name: ca.jtimes(ca.cse(moving), at, along)
+            for name, moving in (("rate", self._rate), ("inputs", self._moved))
+        }
+        inputs = {**self._inputs, "dx": dx, "dR": dr}
+        return system.trace("slope of the pinned motion", slopes, inputs, often=False)
 
     def sizes_of_slopes(
         self, state: FloatArray, reference: FloatArray, parameters: FloatArray
     ) -> FloatArray:
         """Returns the sizes of the terms of dx'/dx before cancellation, shape (n, n)."""
-        point = self.point(state, reference, parameters)
+        point, n = self.point(state, reference, parameters), state.size
         values = (point.rate, point.control, point.constraint_input, parameters)
-        n, inputs = state.size, point.constraint_input.size + point.control.size
-        mass, slope, fields = (m.reshape(n, -1) for m in self._balance(state, *values))
-        moved = [
-            self._input_slope.evaluate(state, reference, dx, parameters)[0].reshape(inputs).copy()
-            for dx in np.eye(n)
-        ]
-        return np.abs(np.linalg.inv(mass)) @ (
-            np.abs(slope) + np.abs(fields) @ np.abs(np.array(moved).T)
-        )
-
-    @cached_property
-    def _input_slope(self) -> TracedFunction:
-        """The derivative of v and u along a direction of the state."""
-        dx = ca.SX.sym("dx", self.system.num_states)
-        slope = ca.jtimes(ca.cse(self._moved), self.system.state, dx)
-        inputs = {**self._inputs, "dx": dx}
-        return self.system.trace("slope of inputs", {"slope": slope}, inputs, often=False)
+        mass, slope, fields = (m.reshape(n, -1) for m in self._balance.evaluate(state, *values))
+        moved = self.slopes_along(state, reference, parameters, np.eye(n), of=1)
+        return np.abs(np.linalg.inv(mass)) @ (np.abs(slope) + np.abs(fields) @ np.abs(moved))
 
     @cached_property
     def _balance(self) -> TracedFunction:
@@ -245,30 +281,3 @@ class PinnedOutputs:
             {"rate": rate, "u": u, "v": v},
             often=False,
         )
-
-    def point(
-        self, state: FloatArray, reference: FloatArray, parameters: FloatArray
-    ) -> PinnedPoint:
-        """Evaluates rate, inputs and matrices at a state on Z(R)."""
-        values = self._motion.evaluate(state, reference, parameters)
-        return PinnedPoint(state, *(value.copy() for value in values))
-
-    def regularity(self, point: PinnedPoint) -> Regularity:
-        """Determines whether the motion is determined at a point."""
-        if not (np.isfinite(point.A).all() and np.isfinite(point.B).all()):
-            return Regularity.MATRIX_NOT_FINITE
-        pairs = zip(point.margins, self._usual_margins, strict=True)
-        vanished = any(now < VANISHED * usual for now, usual in pairs)
-        if vanished or not point.pivot[0] > SINGULAR_PIVOT:
-            return Regularity.SINGULAR
-        moving = np.concatenate([point.rate, point.control, point.constraint_input])
-        return Regularity.REGULAR if np.isfinite(moving).all() else Regularity.RATE_NOT_FINITE
-
-    @cached_property
-    def _usual_margins(self) -> tuple[float, float]:
-        """The largest margins of A and B at the states of the structure."""
-        reference, parameters = np.zeros(self.layout.reference_size), self.system.parameter_values
-        margins = [
-            self.point(state, reference, parameters).margins for state in self.structure.states
-        ]
-        return max(a for a, _ in margins), max(b for _, b in margins)
