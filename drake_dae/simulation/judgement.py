@@ -259,7 +259,7 @@ def _of_outputs(
             f"{name} {until} its reference, by up to {numbers[1]:.2g}{unit} in the second half of "
             f"the run ({tolerance:.2g}{unit} tolerated)"
         )
-        cause = f"{name} is off likely because {', and '.join(reasons)}" if reasons else ""
+        cause = f"{name} is off likely because {', '.join(reasons)}" if reasons else ""
         yield RunFinding(FindingKind.REFERENCE, text, Outcome.BAD, *numbers, cause)
     if settled and not are_bad:
         since = max(output.within_since or 0.0 for *_, output in settled)
@@ -289,7 +289,7 @@ def _of_prediction(
         f"from {time:.3g} s on the error of {signal.name} is off the predicted one, by up to "
         f"{largest:.2g} {signal.unit}".rstrip()
     )
-    decides, cause = None, ", and ".join(reasons)
+    decides, cause = None, ", ".join(reasons)
     if not reasons:
         decides, text = Outcome.UNDECIDED, f"{text}, and nothing in the scenario explains it"
         finer = "smaller steps" if accuracy is None else f"an accuracy finer than {accuracy:g}"
