@@ -4,10 +4,11 @@ from . import errors as errors
 from .analysis.analyze import analyze as analyze
 from .analysis.report import Analysis as Analysis
 from .compiler.compile import compile_diagram as compile_diagram
-from .dae.beyond.advising.contact_advice import AdvisedGains as AdvisedGains
-from .dae.beyond.advising.contact_advice import advised_gains as advised_gains
-from .dae.beyond.advising.directions import SensedContact as SensedContact
+from .dae.beyond.advised_gains import AdvisedGains as AdvisedGains
+from .dae.beyond.advised_gains import SensedContact as SensedContact
+from .dae.beyond.advised_gains import advised_gains as advised_gains
 from .dae.beyond.contact_gains import ContactGains as ContactGains
+from .dae.beyond.contact_gains import contact_damping as contact_damping
 from .dae.beyond.contact_gains import contact_gains as contact_gains
 from .dae.beyond.disturbance import with_disturbance as with_disturbance
 from .dae.beyond.one_direction import SensorNoise as SensorNoise
@@ -16,9 +17,9 @@ from .dae.beyond.sampled import sampling_error as sampling_error
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
 from .dae.extension.extension import Extension as Extension
 from .dae.extension.extension import extend as extend
-from .dae.linearization.linearization import linearize as linearize
-from .dae.linearization.linearization import linearize_loop as linearize_loop
-from .dae.normal_form.normal_form import NormalForm as NormalForm
+from .dae.linearization import linearize as linearize
+from .dae.linearization import linearize_loop as linearize_loop
+from .dae.normal_form import NormalForm as NormalForm
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure
 from .dae.structure.constrained import find_constraint_structure as find_constraint_structure
 from .dae.structure.redundancy import drop_constraints as drop_constraints
@@ -28,7 +29,6 @@ from .dae.structure.structure import find_structure as find_structure
 from .dae.system.signals import Parameter as Parameter
 from .dae.system.signals import Signal as Signal
 from .dae.system.system import DaeSystem as DaeSystem
-from .dae.tracking.constraint_damping import contact_damping as contact_damping
 from .dae.tracking.gains import FeedbackGains as FeedbackGains
 from .dae.tracking.gains import gain_coefficients as gain_coefficients
 from .dae.tracking.gains import gain_matrices as gain_matrices

@@ -1,12 +1,15 @@
-"""Reads files that a user names, if they are regular files and not too large."""
+"""Files that a user names: read if they are not too large, written if they replace none."""
 
 import errno
 import os
 import stat
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 from zipfile import ZipFile
+
+from drake_dae.errors import ModelError
 
 MOST_BYTES = 1 << 28
 """The largest size of a file of data: so many bytes of numbers take gigabytes in Python."""
@@ -95,3 +98,30 @@ def read_text(path: str | Path, most: int = MOST_BYTES) -> str:
     """
     text = read_bytes(path, most).decode("utf-8-sig")
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def check_unwritten(files: Iterable[Path], force: bool) -> None:
+    """The rule of all commands: a file is replaced by --force alone, and what is no file never.
+
+    Raises:
+        ModelError: One of the files exists, or is a link, a folder or a device.
+    """
+    there = [path for path in files if os.path.lexists(path)]
+    for path in there:
+        if path.is_symlink() or not path.is_file():
+            kind = "a link" if path.is_symlink() else "a folder" if path.is_dir() else "a device"
+            raise ModelError(f"'{path}' is {kind}, which is never replaced; choose another name")
+    if there and not force:
+        names = ", ".join(f"'{path}'" for path in there)
+        are = "exists, and is" if len(there) == 1 else "exist, and are"
+        raise ModelError(f"{names} {are} not overwritten; choose another name, or --force")
+
+
+def check_folder(folder: Path) -> None:
+    """Checks that a path is a folder, or can become one.
+
+    Raises:
+        ModelError: It is a file or a device, or a link that leads nowhere.
+    """
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise ModelError(f"'{folder}' is a file, and no folder; name a folder")

@@ -6,8 +6,10 @@ from pathlib import Path
 
 from pydrake.systems.framework import Context
 
+from drake_dae.commands.run.folder import stage
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
+from drake_dae.files import check_folder, check_unwritten
 from drake_dae.running.export.export import export_code
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.export.steps.controller import export_controller
@@ -21,19 +23,23 @@ from drake_dae.scenario.shipped import find_scenario
 def run_command(options: argparse.Namespace) -> int:
     """Writes the code of the scenario that the options name; returns the exit code."""
     path = find_scenario(options.scenario)
-    scenario = load_scenario(path, options.settings)
-    loop, context = build_scenario(scenario)
     folder = options.out or Path(
         f"{path.stem}_{'c99' if options.format == 'c' else options.format}"
     )
-    files, missing = WRITERS[options.format](scenario, loop, context, path.stem, folder)
-    names = list(dict.fromkeys(file.name for file in files))
+    check_folder(folder)
+    scenario = load_scenario(path, options.settings)
+    loop, context = build_scenario(scenario)
+    folder.mkdir(parents=True, exist_ok=True)
+    with stage(folder) as temporary:
+        files, missing = WRITERS[options.format](scenario, loop, context, path.stem, temporary)
+        names = list(dict.fromkeys(file.name for file in files))
+        check_unwritten((folder / name for name in names), options.force)
     if options.json:
         print(json.dumps({"folder": str(folder), "files": names, "left_out": missing}, indent=2))
         return 0
     print(f"written to {folder}/: {', '.join(names)}")
     if options.format == "wasm":
-        print(f"{names[0]} has {files[0].stat().st_size / 1000:.0f} kB")
+        print(f"{names[0]} has {(folder / names[0]).stat().st_size / 1000:.0f} kB")
     if missing:
         print(f"not among them: {'; '.join(missing)}")
     return 0

@@ -11,6 +11,7 @@ from pathlib import Path
 from drake_dae.arrays import number_in
 from drake_dae.commands.options import program
 from drake_dae.errors import GeometryWarning, ScenarioError
+from drake_dae.files import check_unwritten
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.judging import find_feasibility
@@ -38,9 +39,7 @@ def _new(options: argparse.Namespace) -> int:
     """Writes a scenario for the robot that the options name."""
     robot = Path(options.robot)
     out = options.out or Path(f"{robot.name.split('.')[0]}_{options.surface}.yaml")
-    if out.exists():
-        text = f"'{out}' exists, and is not overwritten; choose another name"
-        raise ScenarioError(("--out", text))
+    check_unwritten([out], options.force)
     # The simulation reports what it leaves out, and Drake's parser warns of every tag.
     logging.getLogger("drake").setLevel(logging.ERROR)
     with warnings.catch_warnings():

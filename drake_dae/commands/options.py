@@ -38,6 +38,10 @@ class CommandParser(argparse.ArgumentParser):
         """Adds `--set`."""
         self.repeatable("--set", "KEY=VALUE", f"{text}; may be repeated", dest="settings")
 
+    def force(self) -> None:
+        """Adds `--force`."""
+        self.flag("--force", "replace files that exist")
+
     def json(self, text: str) -> None:
         """Adds `--json`."""
         self.flag("--json", f'{text}; for an error, its text under "error"')
@@ -142,6 +146,7 @@ def _add_play(commands: Any) -> None:
     )
     play.path("runs", "the folder of a run", metavar="RUN", nargs="+")
     play.path("--out", "the page of several runs (default: compare.html)", metavar="FILE")
+    play.force()
 
 
 def _add_analyze(commands: Any, scenario: CommandParser) -> None:
@@ -182,6 +187,7 @@ def _add_new(commands: Any) -> None:
         "the longest chain)",
     )
     new.path("--out", "the file (default: <robot>_<surface>.yaml)", metavar="FILE")
+    new.force()
 
 
 def _add_export(commands: Any, scenario: CommandParser) -> None:
@@ -198,6 +204,7 @@ def _add_export(commands: Any, scenario: CommandParser) -> None:
     )
     export.add_argument("--format", choices=("c", "wasm"), default="c", help="(default: c)")
     export.path("--out", "folder for the files (default: <scenario>_<format>, _c99 for c)")
+    export.force()
     export.json("print the names of the files as JSON")
 
 
@@ -217,6 +224,7 @@ def _add_page(commands: Any, scenario: CommandParser) -> None:
         "page",
         metavar="FILE",
     )
+    page.force()
     page.flag("--open", "open the page in a browser")
     page.json("print the files with their sizes as JSON")
 
@@ -234,6 +242,7 @@ def _add_pictures(commands: Any) -> None:
         "a .gif or .mp4 (by ffmpeg), or a .png for four moments side by side (default: film.gif in "
         "the folder)",
     )
+    film.force()
     plot = commands.add_parser(
         "plot",
         help="draw signals of runs over each other",
@@ -254,6 +263,7 @@ def _add_pictures(commands: Any) -> None:
         "paths, as write.plots=true does in a run",
     )
     plot.path("--out", "a .png, .pdf or .svg (default: plot.png)", metavar="FILE")
+    plot.force()
 
 
 def _add_sweep(commands: Any, scenario: CommandParser) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from drake_dae.commands.run.folder import ANIMATION, load_run, runs_by_name, stage
 from drake_dae.errors import ModelError
+from drake_dae.files import check_unwritten
 from drake_dae.pictures.side_by_side import side_by_side
 
 
@@ -23,6 +24,7 @@ def _play(options: argparse.Namespace) -> int:
     page = options.out or Path("compare.html")
     if page.suffix != ".html":
         raise ModelError(f"a page is an .html, got '{page}'")
+    check_unwritten([page], options.force)
     pages = {name: _animation(run) for name, run in runs_by_name(options.runs).items()}
     times = [load_run(run).time for run in options.runs]
     duration = max(float(time[-1] - time[0]) for time in times)
@@ -74,8 +76,9 @@ def _page(options: argparse.Namespace) -> int:
 
     path = find_scenario(options.scenario)
     name, scenario = path.stem, load_scenario(path, options.settings)
-    built = build_commanded(scenario)
     file, bundle = options.out or Path(f"{name}.html"), options.shared_bundle
+    check_unwritten([file], options.force)
+    built = build_commanded(scenario)
     title = scenario.description or name
     try:
         files = write_page(

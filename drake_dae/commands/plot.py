@@ -10,6 +10,7 @@ from drake_dae.commands.run.files import RunFiles
 from drake_dae.commands.run.folder import FILM, SCENARIO, load_run, runs_by_name, stage
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
+from drake_dae.files import check_unwritten
 from drake_dae.pictures.film import save_film
 from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.runs import plot_runs
@@ -35,8 +36,9 @@ def run_command(options: argparse.Namespace) -> int:
 def _render(options: argparse.Namespace) -> Path:
     """Films the run in a folder."""
     folder: Path = options.folder
-    _, loop, context, record = _run_again(folder)
     path: Path = options.out or folder / FILM
+    check_unwritten([path], options.force)
+    _, loop, context, record = _run_again(folder)
     with stage(path.parent, path.name) as temporary:
         save_film(loop, record, context, temporary / path.name)
     return path
@@ -60,7 +62,9 @@ def _plot_all(options: argparse.Namespace) -> int:
     if options.signals or options.errors or options.out is not None:
         raise ModelError("--all draws all plots of each run, without --signals, --errors or --out")
     problems = []
-    for folder in runs_by_name(options.runs).values():
+    folders = list(runs_by_name(options.runs).values())
+    check_unwritten((folder / name for folder in folders for name in PLOTS), options.force)
+    for folder in folders:
         scenario, loop, context, record = _run_again(folder)
         files, wanted = RunFiles(folder), Write(plots=True, animation=False)
         files.write_pictures(judge_run(scenario, loop, context, record), loop, context, wanted)
@@ -79,6 +83,7 @@ def _plot(options: argparse.Namespace) -> Path:
     path: Path = options.out or Path("plot.png")
     if path.suffix not in SUFFIXES:
         raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
+    check_unwritten([path], options.force)
     records = {name: load_run(run) for name, run in runs_by_name(options.runs).items()}
     names = [name for text in options.signals for name in text.split(",") if name]
     figure = plot_runs(records, names, options.errors)

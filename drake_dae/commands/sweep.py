@@ -10,6 +10,7 @@ from typing import Any
 
 from drake_dae.analysis.tables import count_of
 from drake_dae.errors import ModelError
+from drake_dae.files import check_folder
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 
@@ -39,6 +40,7 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     scenario = load_scenario(path, options.settings)
     variations = parse_variations(options.vary, options.random, options.seed, options.together)
     folder = options.out or Path("runs") / f"{path.stem}-sweep"
+    check_folder(folder)
     file = folder / JOURNAL
     others = [name for name in FILES if (folder / name).exists()]
     if others and not file.exists():

@@ -43,8 +43,7 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
     viscous = [c for c in scenario.constraints if getattr(c, "viscous_friction", None)]
     parameters = {**plant.parameters, **_without_viscous(c.name for c in viscous)}
     plant = replace(plant, parameters=parameters)
-    # One of the scenario's own plants, as the contract says.
-    return replace(scenario, plant=plant), (  # type: ignore[arg-type]
+    return replace(scenario, plant=plant), (
         f"the rollout runs !{name} in place of !{before}: the same equations of contact, traced. "
         "Drake's solver stops at a relative residual of 1e-6, and joints stop at their limits in "
         "Drake's plant alone"

@@ -68,7 +68,15 @@ def _live_figures(texts: Iterable[str], library: str, out: Path) -> None:
             continue
         print(f"makes the live figure {name}", flush=True)
         if command(
-            ["page", name, "--out", str(page), "--shared-bundle", str(folder / "meshcat.js")]
+            [
+                "page",
+                name,
+                "--force",
+                "--out",
+                str(page),
+                "--shared-bundle",
+                str(folder / "meshcat.js"),
+            ]
         ):
             page.write_text(NO_FIGURE.format(name=name), "utf-8")
         else:

@@ -42,6 +42,42 @@ def test_files_of_others_are_never_overwritten(name, tmp_path, capsys):
     assert (tmp_path / name).read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["new", "arm.urdf"],
+        ["plot", "one"],
+        ["render", "one"],
+        ["play", "one", "other"],
+        ["page", "two_link_wall"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_file_is_replaced_by_force_alone_and_what_is_none_never(words, tmp_path, capsys):
+    folder, target = tmp_path / "folder.html", tmp_path / "target.svg"
+    folder.mkdir()
+    target.write_text("mine")
+    link = tmp_path / "link.html"
+    link.symlink_to(target)
+    name = "svg" if words[0] == "plot" else "html"
+    file = tmp_path / f"file.{name}"
+    file.write_text("mine")
+    there = [(file, False)] + [
+        (path.rename(path.with_suffix(f".{name}")), True) for path in (folder, link)
+    ]
+    for path, force in there:
+        assert main([*words, f"--out={path}", *["--force"] * force]) == 1
+        assert f"'{path}'" in error_line(capsys)
+    assert (file.read_text(), target.read_text()) == ("mine", "mine")
+
+
+@pytest.mark.parametrize("command", ["simulate", "export", "sweep --vary=duration=[1]"])
+def test_a_folder_is_no_device(command, capsys):
+    name, *more = command.split()
+    assert main([name, "two_link_wall", *more, "--out=/dev/null"]) == 1
+    assert "'/dev/null'" in error_line(capsys)
+
+
 def test_a_scenario_is_not_overwritten_by_its_own_run(tmp_path, capsys):
     path = tmp_path / "scenario.yaml"
     text = find_scenario("two_link_wall").read_text()

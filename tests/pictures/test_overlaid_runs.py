@@ -118,6 +118,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["plot", *folders, "--errors"]) == 0
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "plot.png").unlink()
     assert main(["plot", *folders, "--all"]) == 0
     assert "one/: outputs.png, errors.png, residual.png, controls.png, path.png" in (
         capsys.readouterr().out
@@ -164,7 +165,7 @@ def test_plots_that_cannot_be_written_are_told(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Figure, "savefig", fill)
     (tmp_path / "outputs.png").write_bytes(b"of an earlier time")
     capsys.readouterr()
-    assert main(["plot", "--all", str(tmp_path)]) == 1
+    assert main(["plot", "--all", "--force", str(tmp_path)]) == 1
     said = f"error: {tmp_path}/outputs.png: No space left on device\n"
     told = capsys.readouterr()
     assert (told.out, told.err) == ("", said)

@@ -105,14 +105,6 @@ def test_columns_are_found_by_name_and_held_at_the_ends(delimiter, tmp_path):
     np.testing.assert_allclose(function(3.0)[:3], [0.6, 0.3, 0.0], atol=1e-9)
 
 
-def test_a_file_is_looked_for_beside_the_one_that_names_it(tmp_path):
-    wave(tmp_path)
-    path = CsvReference("wave.csv", ["y"], "t").in_folder(tmp_path)
-    assert path.file == str(tmp_path / "wave.csv")
-    assert path.in_folder(Path("/elsewhere")) == path
-    path.derivatives([2])
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

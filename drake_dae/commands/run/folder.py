@@ -14,6 +14,7 @@ from tempfile import mkdtemp
 
 from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
+from drake_dae.files import check_folder
 from drake_dae.pictures.plots import PLOTS
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.simulation.records.record import Record
@@ -57,8 +58,7 @@ def run_folder(folder: Path) -> Iterator[Path | None]:
     if "\0" in str(folder):
         raise ModelError(f"no path holds a null byte, got {brief(str(folder))}")
     try:
-        if folder.exists() and not folder.is_dir():
-            raise ModelError(f"'{folder}' is a file; name a folder")
+        check_folder(folder)
         lock, moved_to = _prepare(folder)
     except ModelError:
         raise
@@ -179,6 +179,10 @@ def _lock(file: int, folder: Path) -> None:
 def stage(folder: Path, *names: str) -> Iterator[Path]:
     """Makes a temporary folder for files, and moves these to the folder when they are complete.
 
+    Args:
+        folder: The folder.
+        names: The files; all that were made if there are none.
+
     Raises:
         OSError: A file cannot be written; the error has the path of the first of the names if it
             has no other path.
@@ -187,12 +191,12 @@ def stage(folder: Path, *names: str) -> Iterator[Path]:
     try:
         with _workplace(folder) as temporary:
             yield Path(temporary)
-            for name in names:
+            for name in names or os.listdir(temporary):
                 Path(temporary, name).replace(folder / name)
     except OSError as error:
         # Errors of NumPy, zipfile and Pillow have no path, or one in the removed temporary folder.
         if temporary is None or str(error.filename or temporary).startswith(temporary):
-            error.filename, error.filename2 = str(folder / names[0]), None
+            error.filename, error.filename2 = str(folder.joinpath(*names[:1])), None
         raise
 
 

@@ -26,12 +26,7 @@ class ChainFilter:
     w T (H. Kwakernaak, R. Sivan, Linear Optimal Control Systems, 1972, theorem 4.14): for k_o << w
     a pair at the distance w with the damping ratio 0.71, for the velocity, and one at -k_o, the
     rate at which a model error a is followed.
-
-    Attributes:
-        gain: K, shape (3, 1), or (3, 2) with a measured v.
-        covariance: The covariance of (q, v, a) after a correction, relative to sigma^2, shape (3,
-            3).
-        period: T in s.
+    `covariance` is that of (q, v, a) after a correction, relative to sigma^2.
     """
 
     gain: FloatArray
@@ -46,18 +41,7 @@ class ChainFilter:
         period: float,
         velocity_ratio: float | None = None,
     ) -> "ChainFilter":
-        """Designs the filter for two rates.
-
-        Args:
-            state_rate: w in 1/s.
-            disturbance_rate: k_o in 1/s.
-            period: T in s.
-            velocity_ratio: The standard deviation of a measured velocity over sigma, in 1/s; None
-                if no velocity is measured.
-
-        Raises:
-            ModelError: A number is not positive, or w T is above 1, where a sample is too long.
-        """
+        """Designs the filter for w and k_o, and for sigma_v / sigma if velocities are measured."""
         w, slow = positive("state_rate", state_rate), positive("disturbance_rate", disturbance_rate)
         if w * positive("period", period) > 1.0:
             raise ModelError(

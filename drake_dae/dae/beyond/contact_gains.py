@@ -1,11 +1,23 @@
 """Recommended gains of a law for compliant contact."""
 
+import warnings
 from dataclasses import dataclass
 
+import numpy as np
+from scipy.linalg import expm
+
 from drake_dae.arguments import checked
-from drake_dae.arrays import check_whole_number
-from drake_dae.dae.tracking.constraint_damping import best_damping, unstable_from, warn_of
-from drake_dae.errors import ModelError
+from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.errors import AdviceWarning, ModelError
+
+INTERVALS = 200
+"""The number of steps of an interval in the search for the best damping, which is refined once."""
+
+STIFFER = 2.0
+"""The contact may be stiffer than given by this factor, or softer by any factor."""
+
+STIFFNESSES = np.concatenate([np.geomspace(1e-3, 0.5, 10), np.linspace(0.5, STIFFER, 31)[1:]])
+"""The examined stiffnesses, relative to the given one."""
 
 _PHASE = 0.3
 """The allowed loss of phase by sampling and delay at the crossover frequency, in rad."""
@@ -119,3 +131,125 @@ def contact_gains(
     advice = f"a damping of {damping:.4g} 1/s with an integral of {force_gain:.4g} 1/s"
     warn_of(lost, stiffness, frequency * sample_time, advice)
     return ContactGains(1.5 * rate, force_gain, damping, 2.0 * rate, rate, rate / 2.0)
+
+
+@checked(ModelError)
+def contact_damping(
+    stiffness: float, mobility: float, sample_time: float = 0.0, delay: int = 1
+) -> float:
+    """Returns the damping c for which a contact of the stated stiffness settles fastest.
+
+    On a compliant contact, F = -k phi, a law with `constraint_damping=poles(-c)` leaves
+
+        phi'' + c phi' = A (F - lambda_d),    so    phi'' + c phi' + A k phi = -A lambda_d,
+
+    which is critically damped at c = 2 sqrt(A k). A changing reference force leaves an error of
+    about c lambda_d' / (A k).
+
+    A sampled law holds -c phi' for a sample time T, from a measurement `delay` samples before.
+    Between samples the contact oscillates freely, so (phi, phi', the held value) follow from the
+    previous sample by a matrix. c minimizes its spectral radius. For a slow contact c is 2 w, with
+    w = sqrt(A k). Without contact a delay of one sample gives z^2 - z + c T = 0, which does not
+    oscillate up to c = 1 / (4 T) and is stable up to c = 1 / T; so c stays of this size. At w T of
+    about 1 the held value lags by a quarter of a period and does not damp any more; then c is 0,
+    and the contact needs damping of its own or a shorter sample time.
+
+    The result is valid if the contact is stable for all lower stiffnesses and up to twice the given
+    one: with one sample of delay up to w T = 0.6, with none up to 1.3, with two up to 0.36, with
+    three up to 0.24. Beyond, a warning is issued: a contact that is stiffer by 10 % may diverge
+    there, and above w T = pi its oscillation is aliased.
+
+    Args:
+        stiffness: k in N/m, positive.
+        mobility: A(x) = J M^-1 J^T of the contact in 1/kg, positive: see
+            `ConstraintStructure.constraint_matrix`. Take the largest along the motion.
+        sample_time: T in s; 0 for a law that runs continuously.
+        delay: The delay of the control in samples.
+
+    Returns:
+        c in 1/s, from 0 to 2 sqrt(A k).
+
+    Warns:
+        AdviceWarning: The contact is outside the range in which the result is valid.
+
+    Raises:
+        ModelError: A number is not positive, or is negative.
+    """
+    best = best_damping(stiffness, mobility, sample_time, delay)
+    if sample_time:
+        frequency = float(np.sqrt(mobility * stiffness))
+        lost = unstable_from(frequency, sample_time, delay, best)
+        warn_of(lost, stiffness, frequency * sample_time, f"a damping of {best:.4g} 1/s")
+    return best
+
+
+def best_damping(stiffness: float, mobility: float, sample_time: float, delay: int) -> float:
+    """Acts as `contact_damping`, without a warning outside the range of validity."""
+    for name, value, least in (
+        ("stiffness", stiffness, "positive"),
+        ("mobility", mobility, "positive"),
+        ("sample_time", sample_time, "0 or more"),
+    ):
+        if not (value > 0.0 or (value == 0.0 and least != "positive")):
+            raise ModelError(f"{name} must be {least}, got {value:g}")
+    check_whole_number("delay", delay, 0)
+    frequency = float(np.sqrt(mobility * stiffness))
+    critical = 2.0 * frequency
+    if sample_time == 0.0:
+        return critical
+    step, low, high = _step(frequency, sample_time), 0.0, critical
+    for _ in range(2):
+        tried = np.linspace(low, high, INTERVALS + 1)
+        best = int(np.argmin([_radius(step, c, delay) for c in tried]))
+        low, high = tried[max(best - 1, 0)], tried[min(best + 1, INTERVALS)]
+    return float(tried[best])
+
+
+def unstable_from(
+    frequency: float, sample_time: float, delay: int, damping: float, integral: float = 0.0
+) -> float | None:
+    """Returns the lowest relative stiffness at which a contact is unstable, if there is one."""
+    for share in STIFFNESSES.tolist():
+        natural = frequency * share**0.5
+        added = integral * natural * sample_time
+        shown = natural * sample_time < np.pi
+        if not (shown and _radius(_step(natural, sample_time), damping, delay, added) < 1.0):
+            return share
+    return None
+
+
+def warn_of(lost: float | None, stiffness: float, swing: float, advice: str) -> None:
+    """Warns if a recommended gain is outside the range in which it is valid."""
+    if lost is None:
+        return
+    warnings.warn(
+        f"{advice} is outside of the range in which the recommendation is valid: a contact of "
+        f"{lost * stiffness:.3g} N/m, which is {lost:.3g} times the given {stiffness:.3g} N/m, is "
+        f"unstable with it. The contact oscillates by {swing:.3g} rad in a sample: sample more "
+        "often, make it softer, or choose the gains yourself",
+        AdviceWarning,
+        stacklevel=4,
+    )
+
+
+def _step(frequency: float, sample_time: float) -> FloatArray:
+    """The matrix of (phi, phi', held value) over a sample, phi in units of 1 / frequency."""
+    swing = np.zeros((3, 3))
+    swing[0, 1], swing[1, 0], swing[1, 2] = frequency, -frequency, 1.0
+    return np.asarray(expm(swing * sample_time)[:2])
+
+
+def _radius(step: FloatArray, damping: float, delay: int, integral: float = 0.0) -> float:
+    """The spectral radius of a contact whose damping is sampled, held and delayed."""
+    # (phi, phi', the integral, the held values from next to last).
+    matrix = np.zeros((3 + delay, 3 + delay))
+    matrix[:2, :2] = step[:, :2]
+    matrix[2, 0], matrix[2, 2] = integral, 1.0 if integral else 0.0
+    if delay == 0:
+        matrix[:2, 1] -= damping * step[:, 2]
+        matrix[:2, 2] -= step[:, 2]
+    else:
+        matrix[:2, 3] = step[:, 2]
+        matrix[3:-1, 4:] = np.eye(delay - 1)
+        matrix[-1, 1:3] = -damping, -1.0
+    return float(np.abs(np.linalg.eigvals(matrix)).max())

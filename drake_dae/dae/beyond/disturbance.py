@@ -126,12 +126,7 @@ class Observation:
 
     @classmethod
     def of(cls, structure: Structure, layout: DerivativeLayout) -> "Observation":
-        """Derives the functions from the structure of a system, for references of a layout.
-
-        Raises:
-            ModelError: The system has no disturbance, or a mass matrix that depends on the states
-                that d acts on.
-        """
+        """Derives the functions from the structure of a system, for references of a layout."""
         system = structure.system
         named = {p.name: p for p in system.exogenous.moving}
         if DISTURBANCE not in named:
@@ -200,14 +195,7 @@ class Observation:
 
 
 def _plane(system: DaeSystem, name: str, force: ca.SX, rows: Sequence[int]) -> ca.SX:
-    """T of a contact, shape (k, j).
-
-    Args:
-        system: The system.
-        name: Its coefficient of friction.
-        force: The force of a coefficient of 1 at the states whose rates contain d.
-        rows: These states.
-    """
+    """T of a contact, shape (k, j), by its coefficient of friction and the force of one of 1."""
     velocities = system.state[list(rows)]
     for contact in system.contacts:
         if contact.friction == name and contact.sliding is not None:

@@ -23,13 +23,8 @@ def shares(
 
     where c~ is c without the part that a contact force orthogonal to the sliding explains as well.
     So a payload that pulls the tool across its motion is no friction, although M^-1 couples both.
-
-    Args:
-        forces: The forces as columns, shape (k, c).
-        planes: T, the reactions of each contact if it sticks, shape (k, j).
-        velocity: The velocities, shape (k, 1).
-        metric: Columns d -> W d.
-        d: The disturbance, shape (k, 1).
+    Forces and planes T, the reactions of each contact if it sticks, are columns; the velocity has
+    shape (k, 1).
     """
     components = list[ca.SX]()
     for force, plane in zip(ca.horzsplit(forces), planes, strict=True):
@@ -51,13 +46,7 @@ def shares(
 
 
 def beside(planes: ca.SX, metric: Metric, d: ca.SX) -> ca.SX:
-    """Returns the part of d that is orthogonal to all T y in the metric of accelerations.
-
-    Args:
-        planes: T, shape (k, j), of any rank.
-        metric: Columns d -> W d.
-        d: Disturbances, as columns.
-    """
+    """Returns the part of d that is orthogonal to all T y in the metric of accelerations."""
     for direction, unit in _basis(planes, metric(planes)):
         d -= ca.mtimes(direction, ca.mtimes(unit.T, d))
     return d
@@ -67,9 +56,6 @@ def _basis(planes: ca.SX, moved: ca.SX) -> list[tuple[ca.SX, ca.SX]]:
     """Directions e that span T, orthogonal in the metric W, each with W e / (e^T W e).
 
     By modified Gram-Schmidt; for one that depends on those before it, the second is zero.
-
-    Args:
-        planes, moved: T and W T.
     """
     squares = ca.sum1(planes * moved)
     least = _FLAT * ca.mmax(squares) if squares.numel() else 0

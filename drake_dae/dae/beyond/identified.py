@@ -14,11 +14,7 @@ from drake_dae.trace.functions import TracedFunction
 
 
 def check_bounded(system: DaeSystem, parameters: Sequence[Parameter]) -> None:
-    """Checks that parameters have bounds, from which their estimation starts.
-
-    Raises:
-        ModelError: One has none.
-    """
+    """Raises ModelError if a parameter has no bounds, from which its estimation starts."""
     for parameter in parameters:
         if parameter.bounds is None or not np.all(parameter.low < parameter.high):
             raise ModelError(
@@ -35,15 +31,10 @@ class IdentifiedTerms:
     An error delta = theta* - theta leaves the disturbance d = -G delta in the balance of the
     momentum p, where G is the derivative of p' - S^T (E' x + f + g v + h u) with respect to theta.
     An error of a surface leaves a distance phi(x) that is not zero in contact.
-
-    Attributes:
-        parameters: The parameters, in the order of theta.
-        slopes: (x, u, v, parameters) -> the derivatives with respect to theta of p, of its rate
-            without inputs, and of the part from the inputs, shape (k, c) each; the distances phi
-            that depend on theta, shape (j,), with their derivatives, shape (j, c), and with their
-            second derivatives, one below the other, shape (j c, c).
-        pressed: The constraint input of each of these distances.
-        places: The indices in theta of what these distances depend on, as the place of a surface.
+    `slopes` is (x, u, v, parameters) -> the derivatives by theta of p, of its rate without inputs
+    and of the part from the inputs, (k, c) each; the distances phi that depend on theta, (j,), with
+    derivatives, (j, c), and second derivatives, one below the other, (j c, c). `pressed` are
+    the constraint inputs of these distances, `places` the indices in theta that they depend on.
     """
 
     parameters: tuple[Parameter, ...]
@@ -59,17 +50,7 @@ class IdentifiedTerms:
         momentum: dict[str, ca.SX],
         inputs: dict[str, ca.SX],
     ) -> "IdentifiedTerms":
-        """Derives the functions.
-
-        Args:
-            system: The system.
-            parameters: The parameters, each with bounds.
-            momentum: p, its rate without inputs, and the part from the inputs.
-            inputs: Name -> symbol of u and v.
-
-        Raises:
-            ModelError: A parameter has no bounds, or redundant constraints depend on one.
-        """
+        """Derives the functions from p, its rate without inputs, and the part from the inputs."""
         check_bounded(system, parameters)
         theta = ca.vertcat(ca.SX(0, 1), *(parameter.symbol for parameter in parameters))
         pressed = tuple(i for i in range(system.k.numel()) if ca.depends_on(system.k[i], theta))

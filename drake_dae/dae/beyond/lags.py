@@ -22,12 +22,7 @@ class Lags:
         r = d (1 - e^(-k t) (1 + k t + ... + (k t)^n / n!)),
 
     and r follows a ramp with a delay of (n + 1) / k.
-
-    Attributes:
-        rate: k in 1/s.
-        degree: n.
-        step, gain: The next sample of s is step s + gain d, shapes (n + 1, n + 1) and (n + 1,).
-        slopes: The matrix from s to r', ..., r^(n), shape (n, n + 1).
+    The next sample of s is step s + gain d, and slopes s are r', ..., r^(n).
     """
 
     rate: float
@@ -38,13 +33,7 @@ class Lags:
 
     @classmethod
     def of(cls, rate: float, period: float, degree: int) -> "Lags":
-        """Returns the sampled lags.
-
-        Args:
-            rate: k in 1/s.
-            period: The time between samples, s.
-            degree: n, the number of derivatives.
-        """
+        """Returns the lags of rate k, sampled each `period` seconds, with n = `degree`."""
         size = degree + 1
         both = np.zeros((size + 1, size + 1))
         both[:size, :size] = rate * (np.eye(size, k=-1) - np.eye(size))

@@ -31,14 +31,10 @@ class SensorNoise:
 
 @dataclass(frozen=True)
 class Direction:
-    """The motion in one direction, and its sampling.
+    """The motion in one direction, sampled each `period` seconds and delayed by some samples.
 
-    Attributes:
-        period: T in s.
-        delay: The number of samples until the control acts.
-        mobility: A in 1/kg, the acceleration per force in the model of the law.
-        stiffness: k of a contact in N/m; 0 for a free direction.
-        mass_error: The acceleration by a force, relative to that in the model of the law.
+    `mobility` is the acceleration per force in the model of the law, `mass_error` the true one
+    relative to it; `stiffness` in N/m is 0 in a free direction.
     """
 
     period: float
@@ -52,12 +48,8 @@ class Direction:
 class DirectionGains:
     """The gains of a law and its observer in a direction, in 1/s.
 
-    Attributes:
-        gains: The gains of the integral of the error, of the error, and of its derivative, in
-            1/s^3, 1/s^2 and 1/s; along a contact only the last is used, the damping c.
-        force_gain: K_i of the integral of a contact's force.
-        observer_rate: k_o, or k_n along a contact.
-        state_rate: w of a `StateEstimator`; None with a measured velocity.
+    `gains` are those of the integral of the error, of the error and of its derivative; along a
+    contact only the last is used, the damping c. `state_rate` is that of a `StateEstimator`.
     """
 
     gains: tuple[float, float, float]
@@ -70,12 +62,9 @@ class DirectionGains:
 class SampledLoop:
     """A sampled linear loop: x+ = A x + B n with noise n of deviation 1, and outputs C x + D n.
 
-    Attributes:
-        step, noise: A and B.
-        shown: The rows of the error (of a contact: of its force, in N) and of the acceleration that
-            the law commands, over (x, n).
-        push: The change of x during a sample by a disturbing acceleration of 1.
-        period: T in s.
+    `step` and `noise` are A and B. `shown` has the rows (C, D) of the error, of a contact that of
+    its force, and of the acceleration that the law commands. `push` is the change of x during a
+    sample by a disturbing acceleration of 1.
     """
 
     step: FloatArray
@@ -90,10 +79,7 @@ class SampledLoop:
         return float(np.abs(np.linalg.eigvals(self.step)).max())
 
     def deviations(self) -> tuple[float, float]:
-        """Returns the standard deviations of the error, and of the acceleration's changes.
-
-        They are infinite if the loop is not stable.
-        """
+        """Returns the standard deviations of the error, and of the acceleration's changes."""
         size = len(self.step)
         if not self.radius < 1.0:
             return np.inf, np.inf
@@ -108,10 +94,7 @@ class SampledLoop:
         return max(first, 0.0) ** 0.5, max(second, 0.0) ** 0.5
 
     def after_step(self) -> float:
-        """Returns sqrt(sum of squares) of the error after a disturbing acceleration steps to 1.
-
-        It is infinite if the loop is not stable.
-        """
+        """Returns sqrt(sum of squares) of the error after a disturbing acceleration steps to 1."""
         size = len(self.step)
         if not self.radius < 1.0:
             return np.inf
@@ -134,11 +117,6 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
         a = -c phi' - A K_i sigma_F - d                in a contact,
 
     with the sums sigma of the error and sigma_F of the force's error.
-
-    Args:
-        direction: The motion and its sampling.
-        rates: The gains.
-        noise: The noise of the measurements.
     """
     parts = ["e", "v", "sum", *(f"held{i}" for i in range(direction.delay))]
     parts += ["q", "w", "a"] if rates.state_rate else ["r", "before", "acted"]

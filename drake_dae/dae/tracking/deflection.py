@@ -8,9 +8,9 @@ import numpy as np
 from drake_dae.arrays import positive
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.tracking.constraint_damping import damping_gains
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.measured_force import force_outputs_of
+from drake_dae.dae.tracking.model_of_law import damping_gains
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization
 

@@ -14,11 +14,11 @@ from drake_dae.dae.structure.structure import Structure, structure_of
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.constraint_damping import damped
 from drake_dae.dae.tracking.deflection import Deflection
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.integral import IntegralAction
 from drake_dae.dae.tracking.measured_force import ForceMeasurement
+from drake_dae.dae.tracking.model_of_law import damped
 from drake_dae.errors import GainError, ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.given import result_of
@@ -32,9 +32,8 @@ class TrackingLaw:
         ubar_i = r_i^(mu_i) - sum_j K_ij (L_f*^(j-1) l*_i - r_i^(j-1)),
 
     with ubar_i = r_i where mu_i = 0. In closed loop the errors e_i = z_i - r_i (29) obey (30), (31)
-    exactly. If there are more controls than outputs, the system's `control_metric` and
-    `free_control` choose u. The law needs the state x. It does not need a measurement of the
-    constraint inputs, but can use one with `measured_force`; see `ForceMeasurement`.
+    exactly. If there are more controls than outputs, the system's `control_metric` chooses u. The
+    law needs the state x, but no measurement of the constraint inputs.
 
     The reference is output-major: r_1, r_1', ..., r_1^(mu_1), r_2, ...; it holds sum (mu_i + 1)
     numbers; with a `contact_stiffness` two more for each force.
@@ -43,39 +42,26 @@ class TrackingLaw:
         system: The system (1)-(3).
         gains: A design such as `poles(-4.0)`, or finished gains.
         structure: The structure of the system; found if None.
-        measured_force: Whether the law takes a measurement of v. In a diagram it needs a sensor
-            with state where mu_i = 0; see `ForceSensor`.
+        measured_force: Whether the law takes a measurement of v: see `ForceMeasurement`.
         force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
             semidefinite; only with measured_force.
         constraint_damping: Damping of constraints that the plant may violate, such as a compliant
-            contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi'; see
-            `dae.tracking.constraint_damping`. On N* it changes nothing. None for no damping.
+            contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi': see `damped`.
         contact_stiffness: k in N/m of compliant contacts, F = -k phi, for references of forces that
-            change fast: see `deflection`. None if it is not known.
+            change fast: see `Deflection`.
         integral: The names of the outputs whose errors are integrated as well, positions or
-            measured forces; see `IntegralAction`. They have one more pole.
+            measured forces: see `IntegralAction`. They have one more pole.
         latency: The mean time in s from the measurement of x to the moment when its control acts,
-            for a sampled law delay + period / 2: by it damping is compensated; see `acting_late`.
+            for a sampled law delay + period / 2: by it damping is compensated: see `acting_late`.
 
-    Attributes:
-        damped_structure: The structure with `constraint_damping` and `latency`; see `damped`.
-        layout: The layout of reference vectors and chains.
-        reference_signals: Names and units of R.
-        function: The law as (state, reference, measured_force, parameters) -> control and
-            tracking_error, with `all_parameters`; without measured force there is no such input.
-        measured_force: The measurement of v in the law; None without one.
-        deflection: The deflection of compliant contacts under the wanted forces, or None.
-        exogenous_degrees: The number of derivatives of each entry of w that the law needs.
-        coordinates_function: (state, reference, integral, parameters) -> the error coordinates.
-        integral: The integrated outputs; then `function` takes "integral" before the parameters,
-            and returns "integral_rate" as well.
-        control_takes_force: Whether the measured force enters the control in the same instant.
+    `function` is the law as (state, reference, measured_force, integral, parameters) -> control,
+    tracking_error and integral_rate, without what the law does not have, and with the parameters of
+    `all_parameters`. `layout` is that of reference vectors, and `reference_signals` names them.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
         GainError: The gains do not fit, or are not Hurwitz.
-        ModelError: The system is not a DaeSystem, the structure is that of another system, or force
-            is measured and no output is a constraint input.
+        ModelError: The structure is that of another system, or no output is a constraint input.
     """
 
     def __init__(
@@ -100,11 +86,14 @@ class TrackingLaw:
             more = self.deflection.more
         self.layout = DerivativeLayout(self.structure.output_degrees, more)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
-        self.measured_force = _measured_force(system, self.layout, measured_force, force_gain)
+        if not measured_force and numbers("force_gain", force_gain, GainError).any():
+            raise GainError("force_gain needs measured_force=True")
+        self.measured_force = (
+            ForceMeasurement.of(system, self.layout, force_gain) if measured_force else None
+        )
         self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
         self.gains = self.design(gains)
         self._last_gains: tuple[FeedbackGains | None, FloatArray] = None, np.empty(0)
-        self.coordinates_function = self._trace_error_coordinates()
         self.function = self._trace()
 
     def __repr__(self) -> str:
@@ -145,6 +134,14 @@ class TrackingLaw:
         self.control_takes_force = measured is not None and bool(
             ca.depends_on(ca.vertcat(control, output), measured.symbol)
         )
+        # The initial value of (30).
+        start = self.integral.coordinates(structure.chain - reference[layout.chained.tolist(), :])
+        self.coordinates_function = self.system.trace(
+            "error coordinates",
+            {"coordinates": start},
+            {"reference": reference, "integral": self.integral.symbol},
+            often=False,
+        )
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         self._ubar = ubar
         self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
@@ -163,27 +160,14 @@ class TrackingLaw:
         return dict(self._inputs)
 
     def trace_motion(self) -> TracedFunction | None:
-        """Traces x' and v of a plant that equals the law's model, under the law; see `motion_for`.
-
-        Returns:
-            A function of what `function` takes; None where there is none.
-        """
+        """Traces x' and v of a plant that equals the law's model, under the law."""
         if self.damped_structure is not self.structure:
             return None
         if (motion := self.structure.motion_for(self._ubar)) is None:
             return None
         rate, force, pivot = motion
-        outputs = {"rate": rate, "force": force}
-        name = f"{self.system.name} under its law"
+        outputs, name = {"rate": rate, "force": force}, f"{self.system.name} under its law"
         return TracedFunction(name, self._inputs, outputs, pivot, often=False)
-
-    def _trace_error_coordinates(self) -> TracedFunction:
-        """The error coordinates as a function of state and reference: the initial value of (30)."""
-        reference = ca.SX.sym("R", self.layout.reference_size)
-        chain = self.damped_structure.chain - reference[self.layout.chained.tolist(), :]
-        inputs = {"reference": reference, "integral": self.integral.symbol}
-        outputs = {"coordinates": self.integral.coordinates(chain)}
-        return self.system.trace("error coordinates", outputs, inputs, often=False)
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -320,13 +304,3 @@ class TrackingLaw:
             rates = self.gains.error_response(times, self.gains.error_matrix @ start)
             errors[:, self.integral.outputs] = rates[:, self.integral.outputs]
         return errors
-
-
-def _measured_force(
-    system: DaeSystem, layout: DerivativeLayout, is_measured: bool, gain: ArrayLike
-) -> ForceMeasurement | None:
-    if is_measured:
-        return ForceMeasurement.of(system, layout, gain)
-    if numbers("force_gain", gain, GainError).any():
-        raise GainError("force_gain needs measured_force=True")
-    return None

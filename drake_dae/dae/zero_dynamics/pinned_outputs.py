@@ -15,8 +15,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold.manifold import CONSISTENT
-from drake_dae.dae.states.tangents import coordinates, tangent
+from drake_dae.dae.manifold.manifold import CONSISTENT, coordinates, tangent
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.layout import Indices
 from drake_dae.errors import InconsistentStateError

@@ -16,6 +16,7 @@ from drake_dae.blocks.computations import Traced
 from drake_dae.compiler.wires import leaf_inputs
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
+from drake_dae.files import check_unwritten
 from drake_dae.running.bench.any_diagram import parts_of_diagram
 from drake_dae.running.bench.description import Bench, as_script, bench_of, shown_function
 from drake_dae.running.bench.inputs import with_input_values
@@ -73,7 +74,7 @@ def write_page(
         notes: Sentences that the page shows, for example which changes are not possible.
         shared_bundle: The path of a separate file for Meshcat's bundle (2.2 MB), which several
             pages can share; if None, the page contains the bundle. The page refers to the file by
-            a relative path.
+            a relative path. A file with other contents is not replaced.
 
     Returns:
         The paths of the written files.
@@ -168,8 +169,10 @@ def _with_shared_bundle(page: str, target: Path, bundle: Path) -> str:
     """Writes the bundle of a page as a file, and returns the page with a reference to it."""
     before, _, rest = page.partition(_BEGIN)
     code, _, after = rest.partition(_END)
-    bundle.parent.mkdir(parents=True, exist_ok=True)
-    bundle.write_text(code, encoding="utf-8")
+    if not bundle.is_file() or bundle.read_bytes() != code.encode():
+        check_unwritten([bundle], False)
+        bundle.parent.mkdir(parents=True, exist_ok=True)
+        bundle.write_bytes(code.encode())
     relative = os.path.relpath(bundle.resolve(), target.resolve().parent)
     address = html.escape(Path(relative).as_posix(), quote=True)
     return f'{before}<script src="{address}">{_END}{after}'

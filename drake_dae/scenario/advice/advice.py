@@ -6,7 +6,7 @@ import numpy as np
 
 from drake_dae.dae.beyond.contact_gains import ContactGains, contact_gains
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.tracking.constraint_damping import damping_gains
+from drake_dae.dae.tracking.model_of_law import damping_gains
 from drake_dae.errors import ScenarioError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.sensed import (

@@ -7,8 +7,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.beyond.advising.contact_advice import AdvisedGains, advised_gains
-from drake_dae.dae.beyond.advising.directions import EVERY, MODEL_ERROR, SensedContact
+from drake_dae.dae.beyond.advised_gains import (
+    EVERY,
+    MODEL_ERROR,
+    AdvisedGains,
+    SensedContact,
+    advised_gains,
+)
 from drake_dae.dae.beyond.one_direction import SensorNoise
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import GainError

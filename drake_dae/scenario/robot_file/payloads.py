@@ -10,8 +10,8 @@ from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import frame_named
+from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.forms.values import Triple
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Payload:
 
     frame: str
     mass: float
-    point: Triple = (0.0, 0.0, 0.0)
+    point: Vector = (0.0, 0.0, 0.0)
     name: str = "payload"
 
     def __post_init__(self) -> None:

@@ -1,22 +1,17 @@
 """The robot of a scenario: a file, and changes of it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pydantic
-from numpy.typing import ArrayLike
 
-from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
-from drake_dae.robots.joint_friction import JointFriction
-from drake_dae.robots.known_forces import KnownForce
+from drake_dae.robots.known_forces import Load
 from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.scenario.forms.forms import Choice, Form
+from drake_dae.scenario.forms.forms import Value
 from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.forms.values import Numbers, Triple
+from drake_dae.scenario.forms.values import FILE, in_folder
 from drake_dae.scenario.robot_file.payloads import Payload
 
 
@@ -29,8 +24,8 @@ class Pose:
         rpy_deg: Roll, pitch and yaw, in degrees.
     """
 
-    translation: Triple = (0.0, 0.0, 0.0)
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
+    translation: Vector = (0.0, 0.0, 0.0)
+    rpy_deg: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -47,55 +42,38 @@ class RobotPlacement:
     pose: Pose = Pose()
 
 
-def _actuators(value: Any) -> Any:
-    """Checks the value of `actuators`."""
-    if value is None or value == "all":
+def _actuators(value: Any, folder: Path) -> Any:
+    if value == "all" or (isinstance(value, list) and all(isinstance(v, str) for v in value)):
         return value
-    if isinstance(value, list) and all(isinstance(name, str) for name in value):
-        return value
-    if isinstance(value, dict) and TAG not in value:
-        for name, limit in value.items():
-            if limit is not None and not (type(limit) in (int, float) and 0 < limit < np.inf):
-                raise ValueError(
-                    f"the effort limit of {name} must be a positive number of N m or N, or nothing "
-                    f"for that of the file, got {brief(limit)}"
-                )
-        return value
-    raise ValueError(
-        f"expected all, a list of joints, or joints with effort limits, got {brief(value)}"
-    )
+    if not isinstance(value, dict) or TAG in value:
+        return None
+    limits = [limit for limit in value.values() if limit is not None]
+    return value if all(type(x) in (int, float) and 0 < x < np.inf for x in limits) else None
 
 
-Actuators = Annotated[
-    Any,
-    pydantic.PlainValidator(_actuators),
-    pydantic.PlainSerializer(lambda value: value),
-    pydantic.WithJsonSchema(
-        {
-            "anyOf": [
-                {"const": "all"},
-                {"type": "array", "items": {"type": "string"}},
-                {
-                    "type": "object",
-                    "additionalProperties": {"anyOf": [{"type": "number"}, {"type": "null"}]},
-                },
-                {"type": "null"},
-            ]
-        }
-    ),
-]
-"""The driven joints: "all", a list of names, or name -> effort limit."""
+ACTUATORS = Value(
+    "all, a list of joints, or joints with effort limits in N m or N, positive, or nothing for "
+    "that of the file",
+    {
+        "anyOf": [
+            {"const": "all"},
+            {"type": "array", "items": {"type": "string"}},
+            {"type": "object", "additionalProperties": {"type": ["number", "null"]}},
+        ]
+    },
+    _actuators,
+)
 
+
+def _robot_file(value: Any, folder: Path) -> Any:
+    is_package = isinstance(value, str) and value.startswith("package://")
+    return value if is_package else in_folder(value, folder)
+
+
+ROBOT_FILE = Value("the name of a file", {"type": "string"}, _robot_file)
 
 LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
 """The parts of a robot's file that a scenario can leave out."""
-
-
-KnownLoad = Annotated[
-    KnownForce | JointFriction,
-    Choice({Vector: Triple, ArrayLike: Numbers, Sequence[str]: list[str]}),
-]
-"""Known forces on a robot."""
 
 
 @dataclass(frozen=True)
@@ -140,16 +118,16 @@ class Robot:
             `plant.parameters`. And friction of joints.
     """
 
-    file: str = ""
-    packages: dict[str, str] = field(default_factory=dict)
+    file: Annotated[str, ROBOT_FILE] = ""
+    packages: dict[str, Annotated[str, FILE]] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
-    base: Annotated[RobotPlacement, Form()] | None = None
+    base: RobotPlacement | None = None
     locked: dict[str, float] = field(default_factory=dict)
-    actuators: Actuators = None
+    actuators: Annotated[Any, ACTUATORS] | None = None
     leave_out: list[LeftOut] = field(default_factory=list)
     description: str = ""
-    payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
-    known_forces: list[KnownLoad] = field(default_factory=list)
+    payloads: list[Payload] = field(default_factory=list)
+    known_forces: list[Load] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if bool(self.file) == bool(self.description):

@@ -16,7 +16,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
 from drake_dae.blocks.trials import state_tickets
-from drake_dae.dae.normal_form.normal_form import NormalForm
+from drake_dae.dae.normal_form import NormalForm
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError, SimulationError
 from drake_dae.systems.blocks.block import ParameterizedSystem
 from drake_dae.trace.functions import TracedFunction

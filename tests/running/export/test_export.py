@@ -241,7 +241,17 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert told.startswith("not among them: the whole controller")
     (tmp_path / "file").touch()
     assert main(["export", "two_link_wall", "--out", "file"]) == 1
-    assert "file: File exists" in capsys.readouterr().err
+    assert "'file'" in capsys.readouterr().err
+    # A Makefile of somebody else's remains, and no other file is written.
+    code = tmp_path / "two_link_wall_c99"
+    (code / "Makefile").write_text("all:")
+    (code / "two_link_wall.h").unlink()
+    assert main(["export", "two_link_wall"]) == 1
+    assert "Makefile" in capsys.readouterr().err
+    assert (code / "Makefile").read_text() == "all:"
+    assert not (code / "two_link_wall.h").exists()
+    assert main(["export", "two_link_wall", "--force"]) == 0
+    assert (code / "Makefile").read_text() != "all:"
 
 
 @pytest.mark.slow

@@ -63,7 +63,6 @@ def test_a_description_is_the_robot_of_its_file(fake, tmp_path):
     assert model.dae.name == "panda_description"
     save_scenario(scenario, tmp_path / "again.yaml")
     assert load_scenario(tmp_path / "again.yaml") == scenario
-    assert "file: ''" in (tmp_path / "again.yaml").read_text()
 
 
 def test_what_is_wrong_with_a_name_is_reported(fake, tmp_path):

@@ -14,7 +14,7 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Sine
 from runs import some
 
 from drake_dae import DaePlant, DaeSystem, TrackingController, find_structure
-from drake_dae.dae.normal_form.normal_form import NormalForm
+from drake_dae.dae.normal_form import NormalForm
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import (
     InconsistentStateError,

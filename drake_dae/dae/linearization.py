@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
-from drake_dae.dae.linearization.models import Linearization, LinearModel
-from drake_dae.dae.states.tangents import coordinates
+from drake_dae.dae.manifold.manifold import coordinates
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.system.layout import DerivativeLayout
+from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -22,6 +21,48 @@ from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
 SINGULAR = 1e-12
 """The equations of the motion are singular below this singular value, rows and columns scaled."""
+
+
+ComplexArray = np.typing.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """A linear model E x' = A x + B u, z = C x + D u, for small deviations."""
+
+    E: FloatArray
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    state_signals: tuple[Signal, ...]
+    input_signals: tuple[Signal, ...]
+    output_signals: tuple[Signal, ...]
+
+    def response(self, s: complex) -> ComplexArray:
+        """Returns the transfer matrix C (s E - A)^-1 B + D at a frequency s in 1/s."""
+        pencil = s * self.E - self.A
+        rows, columns = equilibration(np.abs(pencil))
+        try:
+            moved = np.linalg.solve(pencil / rows[:, None] / columns, self.B / rows[:, None])
+        except np.linalg.LinAlgError:
+            raise ModelError(f"s = {s:g} is a pole; evaluate the response at another s") from None
+        return np.asarray(self.C @ (moved / columns[:, None]) + self.D, dtype=complex)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """The linear models of one system at one state and input."""
+
+    descriptor: LinearModel
+    minimal: LinearModel
+    index: int
+    coordinates: Indices
+    basis: FloatArray
+    state: FloatArray
+    rate: FloatArray
+    control: FloatArray
+    constraint_input: FloatArray
 
 
 @checked(ModelError)
@@ -52,9 +93,8 @@ def linearize(
     p = system.num_controls
     u = np.zeros(p) if control is None else vector(f"{system.name}: control", control, p)
     plant = _PlantModel(structure, state, system.parameter_vector(parameters))
-    point = plant.at(u)
     no_feedback = np.zeros((p, system.num_states + system.num_constraints))
-    return plant.linearization(point, no_feedback, np.eye(p), system.control_signals)
+    return plant.linearization(u, no_feedback, np.eye(p), system.control_signals)
 
 
 @checked(ModelError)
@@ -94,7 +134,7 @@ def linearize_loop(
     measured = [np.zeros(m)] if law.measured_force else []
     moving = tuple(range(2 + len(measured)))
     slope = law.function.derivative(law.function.output_names.index("control"), moving)
-    free = plant.at(np.zeros(p))
+    _, free_force = plant.motion(np.zeros(p))
     # u = u_0 + K_v v and v = v_0 + beta u: the law is affine in the measured force.
     first = law.function(plant.state, R, *measured, values)[0].copy()
     gains = slope(plant.state, R, *measured, values)[0].reshape(p, -1).copy()
@@ -105,21 +145,12 @@ def linearize_loop(
             f"{system.name}: the measured force and the control do not determine each other at x = "
             f"{show(plant.state)}; take another force gain"
         )
-    control = np.linalg.solve(around, first + by_force @ free.constraint_input)
-    point = plant.at(np.asarray(control, dtype=np.float64))
+    control = np.asarray(np.linalg.solve(around, first + by_force @ free_force), dtype=np.float64)
     if measured:
-        gains = slope(plant.state, R, point.constraint_input, values)[0].reshape(p, -1).copy()
+        _, force = plant.motion(control)
+        gains = slope(plant.state, R, force, values)[0].reshape(p, -1).copy()
     feedback = np.hstack([gains[:, :n], by_force])
-    return plant.linearization(point, feedback, gains[:, n : n + R.size], law.reference_signals)
-
-
-@dataclass(frozen=True, eq=False)
-class _OperatingPoint:
-    """The motion at a state and a control: x', v and u."""
-
-    rate: FloatArray
-    constraint_input: FloatArray
-    control: FloatArray
+    return plant.linearization(control, feedback, gains[:, n : n + R.size], law.reference_signals)
 
 
 class _PlantModel:
@@ -200,22 +231,23 @@ class _PlantModel:
         m, p = self.system.num_constraints, self.system.num_controls
         return self._solve(np.vstack([self._h, np.zeros((m, p))]))
 
-    def at(self, control: FloatArray) -> _OperatingPoint:
-        """The motion at the state with a control."""
+    def motion(self, control: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """x' and v at the state with a control."""
         n = self.system.num_states
         push = np.concatenate([self._f[:, 0] + self._h @ control, -self._c_t[:, 0]])
         moved = self._solve(push[:, None])[:, 0]
-        return _OperatingPoint(moved[:n], moved[n:], control)
+        return moved[:n], moved[n:]
 
     def linearization(
         self,
-        point: _OperatingPoint,
+        control: FloatArray,
         feedback: FloatArray,
         forward: FloatArray,
         inputs: Sequence[Signal],
     ) -> Linearization:
         """The linear models with du = feedback (dx, dv) + forward dw."""
         system, structure, symbols = self.system, self.structure, self._symbols
+        rate, force = self.motion(control)
         n, m, p = system.num_states, system.num_constraints, system.num_controls
         x, v = system.state, symbols["constraint_input"]
         balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, symbols["control"])
@@ -230,7 +262,7 @@ class _PlantModel:
             "m": system.m,
         }
         slope, constraint_slope, k_slope, z_slope, z_force = self._values(
-            outputs, rate=point.rate, constraint_input=point.constraint_input, control=point.control
+            outputs, rate=rate, constraint_input=force, control=control
         )
         # In descriptor form, in (x, v).
         none = np.zeros((m, m))
@@ -270,7 +302,7 @@ class _PlantModel:
             free,
             basis,
             self.state,
-            point.rate,
-            point.control,
-            point.constraint_input,
+            rate,
+            control,
+            force,
         )

@@ -8,8 +8,7 @@ from problems import PROBLEMS, hanging_pendulum, in_other_units
 from runs import some
 from scipy.optimize import root
 
-from drake_dae.dae.linearization.linearization import linearize, linearize_loop
-from drake_dae.dae.linearization.models import Linearization, LinearModel
+from drake_dae.dae.linearization import Linearization, LinearModel, linearize, linearize_loop
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles

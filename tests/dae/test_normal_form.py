@@ -12,8 +12,8 @@ from problems import PROBLEMS, knife_edge, pendulum, pendulum_tension
 from runs import some
 from two_arms import two_arms
 
-from drake_dae.dae.normal_form import completion as completion_module
-from drake_dae.dae.normal_form.normal_form import NormalForm
+import drake_dae.dae.normal_form as completion_module
+from drake_dae.dae.normal_form import NormalForm
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError

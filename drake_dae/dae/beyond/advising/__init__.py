@@ -1,1 +1,0 @@
-"""Gains for a contact and given sensors, as an optimum."""
