@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 import scipy.linalg
 from arms import arm, law
-from problems import PROBLEMS, hanging_pendulum, in_other_units
+from problems import PROBLEMS, hanging_pendulum
 from runs import some
 from scipy.optimize import root
 
-from drake_dae.dae.linearization import Linearization, LinearModel, linearize, linearize_loop
+from drake_dae.dae.linearization import Linearization, linearize, linearize_loop
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles
 from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.errors import InconsistentStateError, ModelError
 
 Array = np.ndarray
 
@@ -92,13 +91,6 @@ def test_the_minimal_form_is_that_of_finite_differences(problem, moving):
     assert found.index == structure.index
 
 
-def poles_of(model: LinearModel) -> Array:
-    """Finite poles of a pencil."""
-    alpha, beta = scipy.linalg.eigvals(model.A, model.E, homogeneous_eigvals=True)
-    finite = np.abs(beta) > 1e-6 * np.abs(alpha)
-    return alpha[finite] / beta[finite]
-
-
 def at_rest() -> list[tuple[str, DaeSystem, Array, Array]]:
     """Systems with a state and a control for which x' = 0, by hand."""
     found = []
@@ -134,23 +126,6 @@ def test_both_forms_have_the_same_transfer_functions(system, x, u):
         )
     names = [signal.name for signal in found.minimal.state_signals]
     assert names == [system.state_signals[i].name for i in found.coordinates]
-
-
-def test_a_pendulum_by_hand():
-    """x'' = v x + u_x, y'' = v y - g: hanging at L, x'' = -(g/L) x + u/m, its transfer function."""
-    system = hanging_pendulum(1.0)
-    found = linearize(system, [0.0, -1.0, 0.0, 0.0])
-    assert found.index == 3
-    values = np.sort_complex(np.linalg.eigvals(found.minimal.A))
-    np.testing.assert_allclose(values.real, 0.0, atol=1e-12)
-    np.testing.assert_allclose(
-        np.sort_complex(poles_of(found.descriptor)), values, rtol=1e-6, atol=1e-6
-    )
-    np.testing.assert_allclose(np.abs(values), np.sqrt(9.81), rtol=1e-12)
-    with pytest.raises(InconsistentStateError, match=r"N\*"):
-        linearize(system, [0.0, -1.3, 0.0, 0.0])
-    with pytest.raises(ModelError, match="control"):
-        linearize(system, control=np.zeros(3))
 
 
 @pytest.mark.parametrize("name", ["pendulum", "two_link_arm", "circuit", "flexible_pendulum"])
@@ -203,40 +178,3 @@ def test_a_loop_with_measured_force(gain):
     np.testing.assert_allclose(found.control, measured, rtol=1e-9, atol=1e-9)
     # And as a descriptor form, with the force among the unknowns.
     assert found.descriptor.A.shape[0] == robot.model.dae.num_states + 1
-
-
-def test_the_loop_of_another_plant():
-    """A heavier load than the law knows: the response at s = 0 is off, as the law's plant says."""
-    robot = arm("two_link")
-    tracking = law("two_link")
-    reference = np.zeros(tracking.layout.reference_size)
-    own = linearize_loop(tracking, reference)
-    values = robot.model.dae.parameter_values
-    place = robot.model.dae.parameter_slice("link2.mass")
-    values[place] *= 1.3
-    other = linearize_loop(tracking, reference, parameters=values)
-    assert not np.allclose(own.minimal.A, other.minimal.A)
-
-
-def test_units_change_nothing():
-    system = hanging_pendulum(1.0)
-    first = linearize(system, [0.0, -1.0, 0.0, 0.0])
-    unit = np.array([1e-6, 1e5, 1e3, 1e-4])
-    other = in_other_units(system, unit, np.ones(1), np.ones(1), np.ones(1), np.ones(1))
-    second = linearize(other, np.array([0.0, -1.0, 0.0, 0.0]) / unit)
-    for s in FREQUENCIES:
-        np.testing.assert_allclose(first.minimal.response(s), second.minimal.response(s), rtol=1e-9)
-        np.testing.assert_allclose(
-            first.descriptor.response(s), second.descriptor.response(s), rtol=1e-9
-        )
-
-
-def test_a_pole_is_named():
-    system = DaeSystem.from_functions(
-        2, f=lambda x: [x[1], 0], h=lambda x: [0, 1], l=lambda x: x[0]
-    )
-    found = linearize(system)
-    assert (found.index, found.minimal.A.shape) == (0, (2, 2))
-    with pytest.raises(ModelError, match=r"\b0[. ]"):
-        found.minimal.response(0.0)
-    np.testing.assert_allclose(found.minimal.response(2.0j), [[-0.25]], rtol=1e-14)

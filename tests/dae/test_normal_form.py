@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from actuated import actuated, states
 from arms import arm, consistent_states, numbers
-from problems import PROBLEMS, knife_edge, pendulum, pendulum_tension
+from problems import PROBLEMS, knife_edge
 from runs import some
 from two_arms import two_arms
 
-import drake_dae.dae.normal_form as completion_module
 from drake_dae.dae.normal_form import NormalForm
-from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
+from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import NewtonModel, newton
@@ -145,23 +144,6 @@ def test_robot_inverse_is_58():
             np.testing.assert_allclose(state, [*q, *v], rtol=0, atol=1e-9)
 
 
-def test_the_jacobian_is_singular_exactly_where_b_is():
-    """Theorem 2.1 by closed forms: |det dPhi/dx| is y^2 for the pendulum, B is y^2/(m L^2).
-
-    For the knife edge with z = (force, heading) it is m |w|, and det B is w/I.
-    """
-    flat = form("pendulum")
-    for x in ([0.4, -0.6, 0.1, 0.1], [0.5, 0.6, 0.3, -0.2], [0.8, 0.0, 0.0, 0.4]):
-        determinant = np.linalg.det(flat.jacobian(x))
-        assert abs(determinant) == pytest.approx(x[1] ** 2, abs=1e-15)
-    turning = form("knife_edge_force")
-    assert [s.name for s in turning.completion_signals] == ["x", "y"]
-    for rate in (1.3, -0.4, 0.0):
-        x = [0.2, 0.1, 0.3, 0.8 * np.cos(0.3), 0.8 * np.sin(0.3), rate]
-        determinant = np.linalg.det(turning.jacobian(x))
-        assert abs(determinant) == pytest.approx(3.0 * abs(rate), abs=1e-14)
-
-
 @pytest.mark.equation(22)
 def test_chosen_completions_are_named_states():
     """The shafts' velocities behind damped joints, the knife edge's position."""
@@ -207,24 +189,6 @@ def test_combinations_of_states_where_no_single_state_will_do(small):
         np.testing.assert_allclose(normal_form.state(coordinates), x, rtol=0, atol=1e-13)
 
 
-def test_a_given_completion():
-    """Angle and angular velocity of the pendulum under z = tension, where d = 2."""
-    system = pendulum_tension().system
-    x, y, vx, vy = ca.vertsplit(system.state)
-    structure = find_structure(system)
-    xi = ca.vertcat(ca.atan2(x, -y), (x * vy - y * vx) / (x**2 + y**2))
-    normal_form = NormalForm(structure.system, xi, structure=structure)
-    assert [s.name for s in normal_form.completion_signals] == ["xi0", "xi1"]
-    angle, rate = 0.7, -0.3
-    state = normal_form.state([0.0, 0.0, angle, rate])
-    s, c = np.sin(angle), np.cos(angle)
-    expected = 0.8 * np.array([s, -c, rate * c, rate * s])
-    np.testing.assert_allclose(state, expected, rtol=0, atol=1e-15)
-    # Given states keep their names.
-    named = NormalForm(structure.system, ca.vertcat(vx, x), structure=structure)
-    assert [s.name for s in named.completion_signals] == ["vx", "x"]
-
-
 @pytest.mark.parametrize(
     ("completion", "message"),
     [
@@ -244,50 +208,6 @@ def test_completions_that_do_not_complete_are_refused(completion, message):
     structure = find_structure(system)
     with pytest.raises(ModelError, match=message):
         NormalForm(structure.system, completion(system.state), structure=structure)
-
-
-def test_a_differential_that_vanishes_is_named_whatever_round_off_leaves_of_it(monkeypatch):
-    """The rest of 1e-20 may have a direction, which says nothing."""
-    system = knife_edge().system
-    structure, found = find_structure(system), completion_module.find_margin
-
-    def with_round_off(*arguments):
-        margin = found(*arguments)
-        matrix = margin.matrix.copy()
-        matrix[-2] = 1e-20 * matrix[-1]
-        return replace(margin, matrix=matrix)
-
-    monkeypatch.setattr(completion_module, "find_margin", with_round_off)
-    x = system.state
-    with pytest.raises(ModelError, match=r"'xi0' = .*-(0\.00)?3"):
-        NormalForm(structure.system, ca.vertcat((x[0] + 0.003) ** 2, x[1]), structure=structure)
-
-
-def test_outputs_that_repeat_each_other_are_refused():
-    system = DaeSystem.from_functions(
-        3,
-        f=lambda x: [0, 0, x[0]],
-        h=lambda x: [[1, 1], [1, 1], [0, 0]],
-        l=lambda x: [x[0], x[1]],
-        name="twins",
-    )
-    structure, violation = examine_structure(system)
-    assert violation is not None
-    with pytest.raises(ModelError, match="twins"):
-        NormalForm(structure.system, structure=structure)
-
-
-def test_the_inverse_stays_on_the_branch_of_its_guess():
-    """The pendulum has two states for each x; full Newton steps would jump between them."""
-    normal_form = form("pendulum")
-    for guess, sign in (([-0.79, -0.126, 0.0, 0.0], -1.0), ([0.3, 0.75, 0.0, 0.0], 1.0)):
-        guess = normal_form.structure.manifold.project(guess)
-        for x in (0.79, -0.7999, 0.1, 0.79999):
-            y = sign * np.sqrt(0.8**2 - x**2)
-            state = normal_form.state([0.0, 0.0, x, 0.5], guess)
-            # The condition is 1 / y.
-            expected = [x, y, 0.5, -x * 0.5 / y]
-            np.testing.assert_allclose(state, expected, rtol=0, atol=1e-14 / y**2 + 1e-13)
 
 
 def outputs_of_a_state(outputs, nominal_state):
@@ -348,15 +268,6 @@ def test_coordinates_out_of_reach_are_named():
         tension.state([0.0, 0.0, 0.9, 0.0])
 
 
-def test_parameters_move_the_inverse():
-    system = pendulum().system
-    normal_form = form("pendulum")
-    values = system.parameter_values.copy()
-    values[system.parameter_slice("length")] = 1.0
-    state = normal_form.state([0.0, 0.0, 0.9, 0.0], parameters=values)
-    np.testing.assert_allclose(state, [0.9, -np.sqrt(0.19), 0.0, 0.0], rtol=0, atol=1e-15)
-
-
 def test_wrong_inputs():
     normal_form = form("pendulum")
     with pytest.raises(ModelError, match="coordinates"):
@@ -372,11 +283,6 @@ def test_wrong_inputs():
     )
     with pytest.raises(ModelError, match=r"\[-1\.\]"):
         NormalForm(logarithm).state([0.0], [-1.0])
-
-
-def test_something_else_than_a_system_is_refused():
-    with pytest.raises(ModelError, match="system"):
-        NormalForm(3.0)
 
 
 def leaning() -> DaeSystem:
@@ -397,18 +303,3 @@ def leaning() -> DaeSystem:
         nominal_state=[0.02, 0.4, 0.0, 0.1],
         name="leaning",
     )
-
-
-def test_the_inverse_where_a_state_is_round_off_on_the_manifold():
-    """On N* x0 = x2 = 0, so that Newton's method leaves them at 1e-20 or so; off N* they are 0.5.
-
-    Phi is regular there: y = k, y' = L_f k, zeta = (sin x1, x3 cos x1).
-    """
-    normal_form = NormalForm(leaning())
-    random = np.random.default_rng(0)
-    for _ in range(200):
-        state = random.uniform([-0.5, -0.8, -0.5, -0.5], [0.5, 0.8, 0.5, 0.5])
-        assert np.linalg.cond(normal_form.jacobian(state)) < 100.0
-        found = normal_form.state(normal_form.coordinates(state))
-        # Round-off of Phi, times the condition of its Jacobian.
-        np.testing.assert_allclose(found, state, rtol=0, atol=1e-13)
