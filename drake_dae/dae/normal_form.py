@@ -128,6 +128,39 @@ class NormalForm:
             1
         ]
 
+    def rates(
+        self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """Returns the state realization (26)-(27), the rates of (zeta, xi) at a state on N*:
+
+            zeta_i,j' = zeta_i,j+1,    zeta_i,mu_i' = a_i(x) + B_i(x) u,
+            xi' = L_f* xi + L_h* xi u.
+
+        With `state`, which is Phi^-1(0, zeta, xi), these are n - sum r_i ordinary differential
+        equations without constraints.
+
+        Args:
+            state: x, shape (n,).
+            control: u, shape (p,).
+            parameters: Values of all parameters; the defaults if None.
+
+        Raises:
+            ModelError: An argument has a wrong shape.
+        """
+        structure, dae, layout = self.structure, self.system, self.structure.layout
+        u = structure.derivatives.control
+        highest = structure.drift + ca.mtimes(structure.control_matrix, u)  # (26)
+        chain = ca.SX(structure.chain)
+        if layout.chain_size:
+            chain = ca.vertcat(chain[1:, 0], 0)
+        chain[layout.ends.tolist()] = highest[layout.dynamic.tolist(), :]
+        moving = structure.derivatives.expand(structure.derivatives.rate)
+        rate = ca.jtimes(self.completion, dae.state, moving) + dae.exogenous.rate(self.completion)
+        values = ca.vertcat(chain, rate if self.completion.numel() else ca.SX(0, 1))  # (27)
+        function = structure.trace("state realization", values, True)
+        p = dae.parameter_vector(parameters)
+        return function(dae.state_vector(state), vector("control", control, dae.num_controls), p)[0]
+
     def state(
         self,
         coordinates: ArrayLike,

@@ -10,9 +10,9 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.simulation.records.record import Record, Recorded
-from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.parameterized import function_along
 from drake_dae.systems.plants.contract import Plant
 
 

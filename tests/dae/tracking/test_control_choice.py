@@ -13,6 +13,7 @@ from drake_dae import (
     DaePlant,
     DaeSystem,
     LoopSettings,
+    NormalForm,
     Parameter,
     SinusoidReference,
     TrackingController,
@@ -171,6 +172,21 @@ def test_zero_dynamics_are_those_under_the_chosen_control():
     assert_allclose(sorted(found.eigenvalues.real), [-0.6, -0.6], atol=1e-9)
     grows = spare(lambda x: ca.vertcat(0.7 * x[3], 0.0))
     assert ZeroDynamics(grows).stability().verdict is Verdict.UNSTABLE
+
+
+@pytest.mark.equation(27)
+def test_the_realization_moves_as_the_plant(law):
+    """(26), (27) are the rates of the plant's state, in the coordinates."""
+    random, structure = np.random.default_rng(3), law.structure
+    form, plant = NormalForm(law.system, structure=structure), DaePlant(law.system)
+    context = plant.CreateDefaultContext()
+    for _ in range(3):
+        x, u = consistent(law, random), random.uniform(-1.0, 1.0, 4)
+        plant.set_state(context, x)
+        plant.GetInputPort("control").FixValue(context, u)
+        expected = form.jacobian(x) @ plant.EvalTimeDerivatives(context).CopyToVector()
+        found = form.rates(x, u)
+        assert_allclose(found, expected[-found.size :], rtol=1e-9, atol=1e-9)
 
 
 def test_the_controller_has_the_gradients_of_the_choice(law):

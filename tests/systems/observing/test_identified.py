@@ -271,7 +271,7 @@ def test_the_summary_says_what_is_known_and_what_the_motion_does_not_excite(tmp_
     ("settings", "message"),
     [
         (["estimator.identify=[wall.position]"], "estimator.identify: .*'wall.position'"),
-        (["estimator.identify=[link2.mas]"], "estimator.identify: .*'link2.mass'"),
+        (["estimator.identify=[link2.mas]"], "identify: .*'link2.mass'"),
         (
             [
                 "estimator.identify=[link2.mass]",
