@@ -353,7 +353,7 @@ EQUAL = """<mujoco model="m"><worldbody>
             GRIPPER.replace("</robot>", BALLS),
             ["robot.file: ", "CoincidentPoints"],
         ),
-        ("robot.xml", EQUAL, ["robot.file: ", "equality", "ignored", "!JointCoupler"]),
+        ("robot.xml", EQUAL, ["robot.file: ", "[equality/joint]", "!JointCoupler"]),
     ],
 )
 def test_what_a_robot_file_holds_besides_is_refused_and_not_dropped(file, robot, words, tmp_path):
