@@ -14,13 +14,12 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import number_in
 from drake_dae.commands.options import program
-from drake_dae.commands.run.report import report_run
 from drake_dae.errors import DrakeDaeError, GeometryWarning, ScenarioError, SimulationError
 from drake_dae.files import check_unwritten
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.judging import find_feasibility, judge_run
 from drake_dae.scenario.new import new_scenario
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
@@ -86,10 +85,10 @@ def _check(scenario: Scenario, end: float) -> str:
         context = start_scenario(completed.scenario, loop)
         config = completed.scenario.integrator
         run = simulate(loop.diagram, context, scenario.duration, config, look=look)
-        report = report_run(completed.scenario, loop, context, loop.record(context), run)
+        summary = judge_run(completed.scenario, loop, context, loop.record(context), run)
     except DrakeDaeError as error:
         return str(error)
-    return str(report.job)
+    return str(summary.judgement)
 
 
 def _tip(text: str) -> tuple[str, Vector]:

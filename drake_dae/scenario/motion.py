@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from drake_dae.analysis.limits import SignalLimits
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.system import DaeSystem
@@ -16,10 +15,10 @@ from drake_dae.references.by_name import assign, in_order
 from drake_dae.references.reference import stack_references
 from drake_dae.robots.links_behind import links_behind
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.feasibility.limits import robot_limits
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_state
+from drake_dae.simulation.limits import robot_limits
 
 _TIMES = 201
 """The number of times at which a completed scenario is examined."""
@@ -27,8 +26,8 @@ _TIMES = 201
 _NEARLY_SINGULAR = 0.1
 """B(x) is nearly singular where its smallest singular value is this part of the usual one."""
 
-_DISTANCE_LEFT = 1e-6
-"""The excess over a limit of a joint that counts, in rad or m: a start may be on the limit."""
+_SLACK = 1e-6
+"""The excess over a limit that counts, in its unit."""
 
 
 def references_of(
@@ -109,34 +108,17 @@ def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> s
         return str(error)
     if motion.ending is not None:
         return str(motion.ending)
-    nq = model.links.q.numel()
-    positions, (low, high) = motion.states[:, :nq], model.links.position_limits
-    outside = np.maximum(low - positions, positions - high)
     limits = robot_limits(model, scenario.judgement.friction_cones)
-    excess = _worst(limits, motion)
-    if np.max(outside, initial=-1.0) > _DISTANCE_LEFT:
-        row, joint = np.unravel_index(np.argmax(outside), outside.shape)
-        signal = model.links.position_signals[joint]
-        found = (
-            f"{signal.name} has {positions[row, joint]:.4g} {signal.unit} at {times[row]:.4g} s, "
-            f"and its limits are {low[joint]:.4g} and {high[joint]:.4g}"
-        )
-    elif excess:
-        found = excess
-    else:
-        behind = links_behind(model, motion.times, motion.states, motion.parameters)
-        return "; ".join(map(str, behind))
-    return found + _singularity(model, motion)
-
-
-def _worst(limits: SignalLimits, motion: PinnedMotion) -> str:
-    """The largest excess over a limit, as a phrase."""
     rows = zip(
         motion.states, motion.controls, motion.constraint_inputs, motion.parameters, strict=True
     )
     values = np.array([limits.pinned_values(*row)[0].copy() for row in rows])
-    worst = limits.worst(values, motion.times, np.abs(values).max(axis=0, initial=0.0))
-    return "" if worst is None else str(worst)
+    for one in limits.ranges(motion.times, values):
+        # A start may be on the limit of a joint.
+        if one.excess and abs(one.excess.value - one.excess.limit) > _SLACK:
+            return f"{one.excess}{_singularity(model, motion)}"
+    behind = links_behind(model, motion.times, motion.states, motion.parameters)
+    return "; ".join(map(str, behind))
 
 
 def _singularity(model: RobotModel, motion: PinnedMotion) -> str:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.parsing import GetScopedFrameByName, PackageMap
+from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
@@ -48,15 +48,11 @@ from drake_dae.scenario.postures import Posture, Postures, tool_axis
 from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.loops import actuators_of, closing_joints, joints_of
-from drake_dae.scenario.robot_file.packages import find_packages
-from drake_dae.scenario.robot_file.reading import read_robot
-from drake_dae.scenario.robot_file.robot import LeftOut, Robot, RobotPlacement
+from drake_dae.scenario.robot_file.reading import parts_to_leave_out, read_robot, unknown_packages
+from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
 SurfaceKind = Literal["plane", "cylinder", "sphere"]
-
-_LEFT_OUT: tuple[LeftOut, ...] = ("joint_friction", "inertia", "empty_limits")
-"""Parts that must be left out of a file are found by trying."""
 
 _NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
 """Names of joints of grippers and wheels: they are locked, if others are left."""
@@ -257,10 +253,10 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, dict
 
 def _read(file: str) -> tuple[MultibodyPlant, Robot]:
     """The plant of a robot, with what must be left out of its file."""
-    everything = Robot(file, _folders_above(file), actuators="all", leave_out=[*_LEFT_OUT])
+    robot = Robot(file, _folders_above(file), actuators="all")
 
-    def read(*kinds: LeftOut) -> MultibodyPlant:
-        plant, _ = read_robot(replace(everything, leave_out=[*kinds]))
+    def read() -> MultibodyPlant:
+        plant, _ = read_robot(robot)
         if closing := closing_joints(plant):
             raise ModelError(
                 f"joints close loops ({', '.join(joint.name() for joint in closing)}), and a new "
@@ -269,34 +265,22 @@ def _read(file: str) -> tuple[MultibodyPlant, Robot]:
         finalize(plant)
         return plant
 
-    needed: list[LeftOut] = []
     with warnings.catch_warnings():  # The scenario's own robot reports it.
         warnings.simplefilter("ignore", RobotFileWarning)
-        try:
+        robot = replace(robot, leave_out=parts_to_leave_out(robot))
+        plant = read()
+        if not any(map(_has_room, joints_of(plant))):
+            robot = replace(robot, leave_out=[*robot.leave_out, "empty_limits"])
             plant = read()
-        except ModelError as problem:
-            try:
-                read(*_LEFT_OUT)
-            except ModelError:
-                raise problem from None
-            for kind in _LEFT_OUT:
-                try:
-                    read(*(other for other in _LEFT_OUT if other != kind))
-                except ModelError:
-                    needed.append(kind)
-            plant = read(*needed)
-        if not any(map(_has_room, joints_of(plant))) and "empty_limits" not in needed:
-            needed.append("empty_limits")
-            plant = read(*needed)
-    return plant, replace(everything, leave_out=needed)
+    return plant, robot
 
 
 def _folders_above(file: str) -> dict[str, str]:
     """Unknown packages -> folders of that name above the file or beside it."""
     folders: dict[str, str] = {}
-    with suppress(RuntimeError, ValueError, OSError):  # The reader of the file reports it.
+    with suppress(ModelError, ScenarioError, OSError, RuntimeError):  # The reader reports it.
         above = [*Path(file).resolve().parents]
-        for name in find_packages(file, PackageMap())[1]:
+        for name in unknown_packages(Robot(file)):
             beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
             found = [*(folder for folder in above if folder.name == name), *beside]
             folders.update({name: str(found[0])} if found else {})

@@ -180,8 +180,8 @@ def test_only_what_must_be_left_out_is(tmp_path):
     both = friction.replace('ixx="0.02"', 'ixx="9"', 1)
     empty = arm(2).replace('lower="-2.9" upper="2.9"', 'lower="0" upper="0"')
     for text, wanted in (
-        (friction, ["joint_friction"]),
-        (both, ["joint_friction", "inertia"]),
+        (friction, ["dynamics/friction"]),
+        (both, ["dynamics/friction", "inertia"]),
         (empty, ["empty_limits"]),
     ):
         (tmp_path / "arm.urdf").write_text(text)

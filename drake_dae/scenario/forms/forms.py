@@ -338,8 +338,8 @@ class Reader(Generic[T]):
             text = f"{tag}needs the key '{last}'; {listed}"
         elif kind == "extra_forbidden":
             near = get_close_matches(last, names, n=1)
-            maybe = f"did you mean '{near[0]}'? " if near else ""
-            text, place = f"{tag}has no key '{last}'; {maybe}{listed}", ".".join([*keys, last])
+            listed = f"did you mean '{near[0]}'?" if near else listed
+            text, place = f"{tag}has no key '{last}'; {listed}", ".".join([*keys, last])
         elif kind == "value_error":
             text = str(error["ctx"]["error"])
         elif (family := self._family(hint)) is not None:
