@@ -209,17 +209,9 @@ def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -
 
 
 def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) -> TrackingLaw:
-    """The law of a scenario with gains.
-
-    Its latency is the mean time from a sample to the moment when its control acts, for rigid
-    joints. A plant that steps by h damps with the speed at the end of each step: h / 2 later than
-    the mean, and h later than a law without sampling, which acts at each step.
-    """
+    """The law of a scenario, after `advised`."""
     settings, is_measured = scenario.law, scenario.sensors.force is not None
     damping = settings.constraint_damping
-    sampling, material = scenario.sampling, scenario.plant.material
-    step = 0.0 if material is None else material.time_step
-    latency = step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
     keys = ["sensors.force", "law.gains"] if is_measured else ["law.gains"]
     keys += [f"law.{key}" for key in ("constraint_damping", "integral") if getattr(settings, key)]
     if settings.contact_stiffness is not None:
@@ -238,8 +230,21 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             constraint_damping=None if damping is None else damping.design(),
             integral=settings.integral or (),
             contact_stiffness=settings.contact_stiffness,
-            latency=0.0 if model.stages else latency,
+            latency=latency_of(scenario, model),
         )
+
+
+def latency_of(scenario: Scenario, model: RobotModel) -> float:
+    """The mean time from a sample to the moment when its control acts, for rigid joints, in s.
+
+    A plant that steps by h damps with the speed at the end of each step: h / 2 later than the mean,
+    and h later than a law without sampling, which acts at each step.
+    """
+    sampling, material = scenario.sampling, scenario.plant.material
+    step = 0.0 if material is None else material.time_step
+    if model.stages:
+        return 0.0
+    return step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
 
 
 def _observed(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
