@@ -104,7 +104,6 @@ class ReferenceGenerator(DifferentiableSystem):
         function = self.function if context is None else self._in(context)
         return signal_along(function, self.get_output_port().size(), moments)
 
-    @checked(ReferenceSignalError)
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of its references in a context.
 
@@ -122,7 +121,7 @@ class ReferenceGenerator(DifferentiableSystem):
             raise ReferenceSignalError(error)
         size = self.reference_parameters[name].size
         given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
-        if given.shape not in ((), (size,)):
+        if given.shape not in ((), (size,)) or not all_finite(given):
             raise ReferenceSignalError(f"parameter '{name}' has {size} entries, got {value!r}")
         values = context.get_numeric_parameter(0).CopyToVector()
         values[self.places(name)] = given
