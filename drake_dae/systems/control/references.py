@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
+from drake_dae.arrays import FloatArray, all_finite, numbers, unknown_name, vector
 from drake_dae.blocks.computations import PARAMETERS, TIME, Block, Computation
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.dae.system.layout import DerivativeLayout
@@ -122,7 +122,9 @@ class ReferenceGenerator(DifferentiableSystem):
         size = self.reference_parameters[name].size
         given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
         if given.shape not in ((), (size,)) or not all_finite(given):
-            raise ReferenceSignalError(f"parameter '{name}' has {size} entries, got {value!r}")
+            raise ReferenceSignalError(
+                f"parameter '{name}' takes {size} finite numbers, got {value!r}"
+            )
         values = context.get_numeric_parameter(0).CopyToVector()
         values[self.places(name)] = given
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
