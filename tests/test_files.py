@@ -311,7 +311,8 @@ ADD = "directives:\n- add_directives: {{file: 'package://mine/{}'}}\n".format
         ),
         (
             {"0.xml": MJCF.format(2 * INCLUDE("1.xml"))}
-            | {f"{i}.xml": MJCF.format(2 * INCLUDE(f"{i + 1}.xml")) for i in range(1, 30)},
+            | {f"{i}.xml": MJCF.format(2 * INCLUDE(f"{i + 1}.xml")) for i in range(1, 30)}
+            | {"30.xml": MJCF.format("")},
             "1000",
         ),
     ],

@@ -34,7 +34,7 @@ from drake_dae.scenario.completion.of_task import complete_task
 from drake_dae.scenario.forms.keys import at, each
 from drake_dae.scenario.parts.written import WrittenConstraint, WrittenOutput, make
 from drake_dae.scenario.robot_file.links import RobotLinks, robot_links
-from drake_dae.scenario.robot_file.payloads import Payload
+from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario
 
 _LARGE = 30.0

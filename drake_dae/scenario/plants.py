@@ -16,7 +16,7 @@ from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.robot_file.payloads import Payload
+from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant

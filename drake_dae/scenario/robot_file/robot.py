@@ -2,17 +2,17 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 
+from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.robots.known_forces import Load
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.forms.forms import Value
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.forms.values import FILE, in_folder
-from drake_dae.scenario.robot_file.payloads import Payload
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,26 @@ class RobotPlacement:
 
     weld: str
     pose: Pose = Pose()
+
+
+@dataclass(frozen=True)
+class Payload:
+    """A point mass attached to a robot.
+
+    Attributes:
+        frame: Name of the frame to which it is attached.
+        mass: Its mass, in kg; the parameter "<name>.mass".
+        point: Its position in the frame, m.
+        name: The name of its body.
+    """
+
+    frame: str
+    mass: float
+    point: Vector = (0.0, 0.0, 0.0)
+    name: str = "payload"
+
+    def __post_init__(self) -> None:
+        positive("the mass of a payload", self.mass)
 
 
 def _actuators(value: Any, folder: Path) -> Any:
@@ -72,8 +92,17 @@ def _robot_file(value: Any, folder: Path) -> Any:
 
 ROBOT_FILE = Value("the name of a file", {"type": "string"}, _robot_file)
 
-LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
-"""The parts of a robot's file that a scenario can leave out."""
+
+def _part(value: Any, folder: Path) -> Any:
+    is_part = isinstance(value, str) and 0 < value.find("/") < len(value) - 1
+    return value if is_part or value in ("inertia", "empty_limits") else None
+
+
+LEFT_OUT = Value(
+    '"<parent>/<name>" of an element or attribute, inertia, or empty_limits',
+    {"type": "string"},
+    _part,
+)
 
 
 @dataclass(frozen=True)
@@ -108,11 +137,11 @@ class Robot:
             name -> effort limit in N m or N, or "all" revolute and prismatic joints that mimic no
             other. Without a number the limit is that of the file. Controls have this order, after
             those of the file's own actuators.
-        leave_out: Parts of the file that are left out, and are errors otherwise. joint_friction:
-            Coulomb friction of joints. inertia: impossible inertias, which are replaced by the
-            nearest possible ones. empty_limits: position limits that are empty intervals, such as 0
-            to 0. constraints: all constraints of the file except joints, such as <equality> of
-            MJCF; write them under `constraints` instead.
+        leave_out: What is left out of the file: elements and attributes by "<parent>/<name>", as
+            "joint/stiffness" or "equality/weld". Drake reads not all that a file says; what of it
+            changes the equations is an error until it is named here. Besides, inertia: impossible
+            moments of inertia, which the nearest possible ones replace; empty_limits: position
+            limits that are empty intervals, such as 0 to 0.
         payloads: Masses attached to the robot, known to plant and law.
         known_forces: Known forces on frames; "<name>.force" is zero unless it is in `exogenous` or
             `plant.parameters`. And friction of joints.
@@ -124,7 +153,7 @@ class Robot:
     base: RobotPlacement | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Annotated[Any, ACTUATORS] | None = None
-    leave_out: list[LeftOut] = field(default_factory=list)
+    leave_out: list[Annotated[str, LEFT_OUT]] = field(default_factory=list)
     description: str = ""
     payloads: list[Payload] = field(default_factory=list)
     known_forces: list[Load] = field(default_factory=list)
