@@ -17,9 +17,9 @@ from .dae.beyond.sampled import sampling_error as sampling_error
 from .dae.extension.dynamic_extension import dynamic_extension as dynamic_extension
 from .dae.extension.extension import Extension as Extension
 from .dae.extension.extension import extend as extend
-from .dae.linearization.linearization import linearize as linearize
-from .dae.linearization.linearization import linearize_loop as linearize_loop
-from .dae.normal_form.normal_form import NormalForm as NormalForm
+from .dae.linearization import linearize as linearize
+from .dae.linearization import linearize_loop as linearize_loop
+from .dae.normal_form import NormalForm as NormalForm
 from .dae.structure.constrained import ConstraintStructure as ConstraintStructure
 from .dae.structure.constrained import find_constraint_structure as find_constraint_structure
 from .dae.structure.redundancy import drop_constraints as drop_constraints
@@ -120,7 +120,6 @@ from .symbolic import from_symbolic as from_symbolic
 from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
-from .systems.control.drake_references import SystemReference as SystemReference
 from .systems.control.drake_references import TrajectoryReference as TrajectoryReference
 from .systems.control.limits import ControlLimits as ControlLimits
 from .systems.control.references import ReferenceGenerator as ReferenceGenerator
@@ -136,7 +135,6 @@ from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
 from .systems.plants.contact.disturbance_forces import DisturbanceForce as DisturbanceForce
 from .systems.plants.contract import Plant as Plant
 from .systems.plants.dae_plant import DaePlant as DaePlant
-from .systems.plants.realization import StateRealization as StateRealization
 from .systems.plants.robot_plant import RobotPlant as RobotPlant
 from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor

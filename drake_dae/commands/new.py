@@ -13,8 +13,8 @@ from drake_dae.commands.options import program
 from drake_dae.errors import GeometryWarning, ScenarioError
 from drake_dae.files import check_unwritten
 from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.new.new_scenario import new_scenario
 from drake_dae.scenario.shipped import find_scenario
 

@@ -2,8 +2,6 @@
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping
-from typing import Any
 
 from drake_dae.errors import MachineCodeError, ScenarioError
 from drake_dae.scenario.shipped import find_scenario
@@ -17,7 +15,9 @@ def run_command(options: argparse.Namespace) -> int:
     if options.command == "cache":
         _cache(options.clear)
         return 0
-    print(json.dumps(editor_schema(), indent=1))
+    from drake_dae.scenario.scenario import scenario_schema  # `print` needs no Drake.
+
+    print(json.dumps(scenario_schema(), indent=1))
     return 0
 
 
@@ -53,34 +53,3 @@ def _cache(is_cleared: bool) -> None:
         print(f"compiler  {' '.join(find_compiler().command)}")
     except MachineCodeError as error:
         print(f"compiler  none: {error}")
-
-
-def editor_schema() -> dict[str, Any]:
-    """`scenario_schema` without the entries "_tag", so that editors complete and check keys.
-
-    An editor passes the value after a tag, so any form fits where a tag chooses.
-    """
-    from drake_dae.scenario.scenario import scenario_schema  # `print` needs no Drake.
-
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$comment": f"Tags, for an editor: {', '.join(custom_tags())}",
-        **scenario_schema(tags=False),
-        "patternProperties": {"^_": True},
-    }
-
-
-def custom_tags() -> list[str]:
-    """All tags, as the YAML language server takes them: "!Sphere mapping"."""
-    from drake_dae.scenario.scenario import scenario_schema
-
-    return [f"{tag} mapping" for tag in dict.fromkeys(_tags(scenario_schema()))]
-
-
-def _tags(schema: Mapping[str, Any]) -> Iterator[str]:
-    for value in schema.values():
-        for part in value if isinstance(value, list) else [value]:
-            if isinstance(part, dict):
-                if "_tag" in part:
-                    yield part["_tag"]["const"]
-                yield from _tags(part)

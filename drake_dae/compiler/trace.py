@@ -7,7 +7,6 @@ import casadi as ca
 from pydrake.systems.framework import Context, PortDataType, System
 
 from drake_dae.blocks.computations import (
-    DERIVATIVE,
     HELD,
     NOISE,
     PARAMETERS,
@@ -136,7 +135,7 @@ class Expressions:
                 f"the output port '{name}' of '{system.get_name()}' cannot be traced. What depends "
                 "on it only runs in Drake's Simulator"
             )
-        if DERIVATIVE in computation.outputs and system in self._under:
+        if system in self._under and name in self._under[system][1].outputs:
             block, computation = self._under[system]
         return self.call(block, computation).results[computation.outputs.index(name)]
 

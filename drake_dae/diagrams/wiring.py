@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from drake_dae.arguments import checked
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -32,7 +32,6 @@ from drake_dae.pictures.scene.view import add_live_view
 from drake_dae.references import Reference, references_by_name
 from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
-from drake_dae.systems.control.drake_references import SystemReference
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
 
@@ -41,7 +40,7 @@ from drake_dae.systems.plants.contract import Plant
 def make_closed_loop(
     plant: Plant,
     law: TrackingLaw,
-    references: Sequence[Reference] | Mapping[str, Reference | float] | System,
+    references: Sequence[Reference] | Mapping[str, Reference | float],
     settings: LoopSettings | None = None,
     *,
     scene_graph: SceneGraph | None = None,
@@ -55,8 +54,7 @@ def make_closed_loop(
         plant: A `RobotPlant`, or any other `Plant`.
         law: A law for the plant's system, or for a model of the same structure.
         references: References that together cover all controlled outputs, in their order; or name
-            -> reference, as `references_by_name` takes them; or a Drake System with R(t), as for a
-            `SystemReference` with all degrees of the law.
+            -> reference, as `references_by_name` takes them.
         settings: Sensors, drives, sampling and other parts of the loop; none if None.
         scene_graph: The scene graph with which the robot's MultibodyPlant was registered before
             parsing, for drawings of its geometry; None without drawings.
@@ -77,8 +75,6 @@ def make_closed_loop(
     """
     settings = settings or LoopSettings()
     check_law(plant.dae, law)
-    if isinstance(references, System):
-        references = [SystemReference(references, law.layout.reference_degrees)]
     if isinstance(references, Mapping):
         names = [signal.name for signal in law.system.output_signals]
         references = references_by_name(references, names, law.layout.reference_degrees)
@@ -169,16 +165,14 @@ def wire_loop(
         ways = parts.sensor, parts.sampling, [] if observer is None else [observer]
         noise = add_force_feedback(builder, plant, controller, *ways)
 
-    # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
+    # Every signal has its own name: it is exported, and logged at each step.
     named = {
         **signals_of_plant(plant, moving, reference, law, control),
         **signals_of_parts(plant, controller, measured, limits, observer, parts.sensor),
     }
     if reference is not None:
         named |= further_signals(reference)
-    sources = {"reference": reference, "exogenous": moving}
-    by_time = {name for name, block in sources.items() if block is None or block.follows_time}
-    log, logged = log_signals(builder, plant, controller, control, named, by_time)
+    log = log_signals(builder, plant, controller, named)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
     if meshcat is not None:
@@ -193,7 +187,6 @@ def wire_loop(
         controller,
         reference,
         log,
-        logged,
         {name: tuple(signals) for name, (_, signals) in named.items()},
         scene_graph,
         parts.sensor,

@@ -1,12 +1,10 @@
 """A reference from a CSV file."""
 
 import csv
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 
@@ -50,7 +48,7 @@ class CsvReference(SplineReference):
             tolerance.
     """
 
-    file: str
+    file: str | Path
     columns: Sequence[str]
     time: str = "time"
     smoothing: float | None = None
@@ -70,9 +68,6 @@ class CsvReference(SplineReference):
     @property
     def size(self) -> int:
         return len(self.columns)
-
-    def in_folder(self, folder: Path) -> Self:
-        return replace(self, file=os.path.abspath(folder / self.file))
 
     @cached_property
     def table(self) -> FloatArray:

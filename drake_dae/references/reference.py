@@ -3,9 +3,8 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -37,8 +36,8 @@ class Reference(ABC):
        one function; None if there is no such expression.
     7. Numbers that a study changes in a context are `parameters`, and `with_parameters` is the same
        reference with other values, or with symbols. Most references have none.
-    8. A reference with a file reads it when it is used. `in_folder` makes its path absolute.
-       `remark` describes approximations of the file's data.
+    8. A reference with a file reads it when it is used. `remark` describes
+       approximations of the file's data.
     """
 
     parameters: Mapping[str, Any] = MappingProxyType({})
@@ -74,10 +73,6 @@ class Reference(ABC):
 
     def with_parameters(self, values: Mapping[str, Any]) -> "Reference":
         """Returns the same reference with other values of its parameters, or columns of symbols."""
-        return self
-
-    def in_folder(self, folder: Path) -> Self:
-        """Returns the same reference with its file relative to a folder."""
         return self
 
     @property

@@ -1,27 +1,17 @@
-"""Reading and writing of scenario files, with changes at dotted keys."""
+"""Scenario files: read with changes at dotted keys, and written."""
 
 import pickle
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from drake_dae import references
 from drake_dae.arguments import checked
 from drake_dae.errors import ScenarioError
 from drake_dae.files import read_text
-from drake_dae.scenario.forms.typed_yaml import (
-    MOST_TEXT,
-    TAG,
-    dump_yaml,
-    load_yaml,
-    put_entry,
-    set_entry,
-)
+from drake_dae.scenario.forms.typed_yaml import MOST_TEXT, TAG, dump_yaml, load_lines, load_yaml
 from drake_dae.scenario.scenario import Scenario, scenario_reader
 from drake_dae.scenario.shipped import shipped_scenarios
-from drake_dae.systems.task import phases
 
 
 def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -34,7 +24,7 @@ def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     for part in {key.partition(".")[0] for key in changes} & varied.keys():
         varied[part] = pickle.loads(pickle.dumps(varied[part]))  # Thrice as fast as deepcopy.
     for key, value in changes.items():
-        put_entry(varied, key, value, scenario_reader().free_names)
+        scenario_reader().put(varied, key, value)
     return varied
 
 
@@ -50,9 +40,10 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
 
     Raises:
         ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
-            given twice, or values are not valid; all problems are listed.
+            given twice, or values are not valid; all problems are listed, with their lines.
     """
-    path = shipped_scenarios().get(str(path), Path(path))
+    shipped = shipped_scenarios()
+    path = shipped.get(str(path), Path(path))
     try:
         text = read_text(path, 4 * MOST_TEXT)
     except UnicodeDecodeError:
@@ -60,51 +51,30 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     except (OSError, ValueError) as error:  # A null byte in the path.
         raise ScenarioError((str(path), getattr(error, "strerror", None) or str(error))) from None
     _check_no_robot(path, text)
-    data = load_yaml(text, str(path))
+    data, line_of = load_lines(text, str(path))
     data = {} if data is None else data
     if isinstance(data, dict):
         # Drake's convention: keys with an underscore are a place for anchors.
         data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
+    changed = []
     for setting in settings:
-        set_entry(data, setting, scenario_reader().free_names)
-    is_shipped = path in shipped_scenarios().values()
+        key, separator, value = setting.partition("=")
+        if not separator or not all(key.split(".")):
+            raise ScenarioError((f"--set {setting}", "expected key=value, for example duration=5"))
+        scenario_reader().put(data, key, load_yaml(value, key))
+        changed.append(key)
     try:
-        folder = Path().absolute() if is_shipped else path.absolute().parent
+        folder = Path().absolute() if path in shipped.values() else path.absolute().parent
     except OSError as error:
         raise ScenarioError(("", f"the working directory is gone: {error}")) from None
-    scenario = scenario_reader().read(data, folder)
-    # Absolute, so that the scenario as run can be written anywhere.
-    robot = scenario.robot
-    file = robot.file
-    try:
-        here = folder.resolve()
-        if file and not file.startswith("package://"):
-            file = str((here / file).resolve())
-        packages = {name: str((here / folder).resolve()) for name, folder in robot.packages.items()}
-    except (OSError, RuntimeError, ValueError) as error:
-        # A link that leads to itself; a null byte.
-        raise ScenarioError(("robot", f"no path: {error}")) from None
 
-    def located(value: Any) -> Any:
-        """A value with absolute file names in its references."""
-        if isinstance(value, Mapping):
-            return {name: located(inner) for name, inner in value.items()}
-        if isinstance(value, list):
-            return [*map(located, value)]
-        if isinstance(value, phases.Phase):
-            return replace(
-                value, **{f.name: located(getattr(value, f.name)) for f in fields(value)}
-            )
-        return value.in_folder(here) if isinstance(value, references.Reference) else value
+    def place_of(key: str) -> str:
+        """Where a key stands in the file; empty if it is one of the settings."""
+        is_set = any(f"{key}.".startswith(f"{other}.") for other in changed)
+        line = None if is_set else line_of(key)
+        return "" if line is None else f"[{path.name}:{line}]"
 
-    task = scenario.task
-    return replace(
-        scenario,
-        robot=replace(robot, file=file, packages=packages),
-        references=located(scenario.references),
-        exogenous=located(scenario.exogenous),
-        task=None if task is None else replace(task, phases=located([*task.phases])),
-    )
+    return scenario_reader().read(data, folder, place_of)
 
 
 _ROBOT = re.compile(r"<(?:robot|sdf|mujoco)\b|^directives\s*:", re.MULTILINE)
@@ -124,7 +94,7 @@ def _check_no_robot(path: Path, text: str) -> None:
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
-    """Writes a scenario file that `load_scenario` reads back equal.
+    """Writes a scenario file that `load_scenario` reads back equal: what differs from defaults.
 
     Args:
         scenario: The scenario.

@@ -32,9 +32,9 @@ from drake_dae.robots.outputs import PositionOutput
 from drake_dae.scenario.completion.completion import Completed, complete
 from drake_dae.scenario.completion.of_task import complete_task
 from drake_dae.scenario.forms.keys import at, each
-from drake_dae.scenario.parts.written import WrittenForm, make
+from drake_dae.scenario.parts.written import WrittenConstraint, WrittenOutput, make
 from drake_dae.scenario.robot_file.links import RobotLinks, robot_links
-from drake_dae.scenario.robot_file.payloads import Payload
+from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario
 
 _LARGE = 30.0
@@ -212,7 +212,7 @@ def _near_constraints() -> Iterator[None]:
 
 
 def _constraints(
-    forms: Sequence[Constraint | WrittenForm[Constraint]],
+    forms: Sequence[WrittenConstraint],
     loops: Sequence[Constraint],
     links: MultibodyExpressions,
 ) -> list[Constraint]:
@@ -272,7 +272,7 @@ def _check_compliances(compliances: Mapping[str, float], bound: ConstraintSet) -
 
 
 def _outputs(
-    forms: Sequence[PositionOutput | WrittenForm[PositionOutput]],
+    forms: Sequence[WrittenOutput],
     constraints: Sequence[Constraint],
     links: Links,
 ) -> list[PositionOutput]:

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import Annotated, ClassVar, cast
+from typing import ClassVar, cast
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
@@ -15,11 +15,8 @@ from drake_dae.arrays import brief
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.scenario.forms.forms import Form
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.forms.values import Triple
-from drake_dae.scenario.robot_file.payloads import Payload
+from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
@@ -68,10 +65,8 @@ class ScenarioPlant(ABC):
     """
 
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
-    payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
-    disturbances: list[Annotated[DisturbanceForce, Form({Vector: Triple})]] = field(
-        default_factory=list
-    )
+    payloads: list[Payload] = field(default_factory=list)
+    disturbances: list[DisturbanceForce] = field(default_factory=list)
     carries: ClassVar[bool] = False
     adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()

@@ -18,7 +18,7 @@ from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.divergence import RecordWatch
+from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.record import Record, RecordAfter
 
 ROWS = 1000
@@ -43,8 +43,7 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
     viscous = [c for c in scenario.constraints if getattr(c, "viscous_friction", None)]
     parameters = {**plant.parameters, **_without_viscous(c.name for c in viscous)}
     plant = replace(plant, parameters=parameters)
-    # One of the scenario's own plants, as the contract says.
-    return replace(scenario, plant=plant), (  # type: ignore[arg-type]
+    return replace(scenario, plant=plant), (
         f"the rollout runs !{name} in place of !{before}: the same equations of contact, traced. "
         "Drake's solver stops at a relative residual of 1e-6, and joints stop at their limits in "
         "Drake's plant alone"
@@ -112,7 +111,7 @@ def roll_scenario(
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    watched = _DivergenceWatch(scenario, loop, look)
+    watched = _RolloutWatch(scenario, loop, look)
     (rollout,) = run_loop(
         loop,
         start,
@@ -136,7 +135,7 @@ def _seeds(scenario: Scenario) -> dict[str, int]:
     return seeds
 
 
-class _DivergenceWatch:
+class _RolloutWatch:
     """Ends a rollout that diverges."""
 
     def __init__(
@@ -145,7 +144,7 @@ class _DivergenceWatch:
         loop: ClosedLoop,
         look: Callable[[RecordAfter], bool] = lambda record: False,
     ) -> None:
-        self._watch = RecordWatch(loop.plant, scenario.duration)
+        self._watch = DivergenceWatch(loop.plant, scenario.duration)
         self._look, self._may_diverge = look, scenario.judgement.may_diverge
         self._time: float | None = None
         self._next = time.perf_counter() + PERIOD

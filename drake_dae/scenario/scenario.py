@@ -4,68 +4,40 @@ A scenario is YAML. The library's dataclasses are written with their fields as k
 between several classes is written with the name as a tag, for example `surface: !Sphere`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import listed
-from drake_dae.errors import ModelError
-from drake_dae.scenario import plants
-from drake_dae.scenario.forms.forms import Form
-from drake_dae.scenario.forms.problems import without_tags
-from drake_dae.scenario.forms.reader import Reader
-from drake_dae.scenario.forms.values import Interval
-from drake_dae.scenario.parts import parts as parts
-from drake_dae.scenario.parts.families import (
-    Constraint,
-    Estimator,
-    ForceOutput,
-    Judgement,
-    Law,
-    Output,
-    Plant,
-    Reference,
-    Sampling,
-    Sensors,
-    Stage,
-    Task,
-)
+from drake_dae.references import Reference
+from drake_dae.robots.actuation.stage import Stage
+from drake_dae.robots.force_outputs import ForceOutput
+from drake_dae.scenario.forms import values
+from drake_dae.scenario.forms.forms import Reader
+from drake_dae.scenario.parts.families import CONFIG, FAMILIES, KEYS, VALUES
+from drake_dae.scenario.parts.parts import Estimator, Judgement, Law, Sensors, Start, Write
+from drake_dae.scenario.parts.task import ScenarioTask
+from drake_dae.scenario.parts.written import WrittenConstraint, WrittenOutput
+from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.simulation.simulate import check_config, check_duration
+from drake_dae.systems.control.sampling import Sampling
 from drake_dae.trace.compiled import Compiled
 
-T = TypeVar("T")
+
+def _duration(duration: float) -> float:
+    check_duration(duration)
+    return duration
 
 
-def _checked(check: Callable[[T], None]) -> Callable[[T], T]:
-    """The check as a function that returns its argument, as pydantic needs it."""
-
-    def checked(value: T) -> T:
-        check(value)
-        return value
-
-    return checked
-
-
-_INTEGRATOR = {"integration_scheme": "runge_kutta5", "accuracy": 1e-6, "use_error_control": True}
-_INTEGRATOR_TEXTS = {
-    "integration_scheme": "One of Drake's: runge_kutta5, runge_kutta3, implicit_euler, radau3, ...",
-    "max_step_size": "The longest step, in s; with fixed steps the step.",
-    "accuracy": "The relative error of a step that error control allows.",
-    "use_error_control": "Whether the steps have the length that the accuracy needs, or all "
-    "max_step_size.",
-    "start_time": "When the run begins, in s.",
-    "target_realtime_rate": "How many seconds pass in the run per second of the clock; 0 is as "
-    "fast as it goes.",
-    "publish_every_time_step": "Of Drake, which is about to remove it; the record has every step "
-    "without it.",
-}
+def _config(config: SimulatorConfig) -> SimulatorConfig:
+    check_config(config)
+    return config
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -106,7 +78,7 @@ class Scenario:
         estimator: The estimator of a disturbance and of parameters, for a sampled law with measured
             force; none if left out while `law.gains` are given.
         saturation: Whether controls are limited to the effort limits of the robot's file.
-        judgement: What counts in the verdict of a run.
+        judgement: Tolerances and friction cones for the verdict of a run.
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
             of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list, "tool.y, elbow".
             Completed outputs without a reference keep their initial value.
@@ -121,32 +93,30 @@ class Scenario:
 
     description: str = field(default="", kw_only=True)
     robot: Robot
-    constraints: list[Constraint] = field(default_factory=list)
+    constraints: list[WrittenConstraint] = field(default_factory=list)
     compliances: dict[str, float] | None = None
-    outputs: list[Output] = field(default_factory=list)
+    outputs: list[WrittenOutput] = field(default_factory=list)
     tool_axis: Literal["normal", "fixed", "free"] = "normal"
-    forces: list[ForceOutput] | None = None
+    forces: list[str | ForceOutput] | None = None
     actuation: list[Stage] = field(default_factory=list)
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
-    bounds: dict[str, Interval] = field(default_factory=dict)
-    exogenous: dict[str, list[Reference]] = field(default_factory=dict)
-    plant: Plant = field(default_factory=plants.IdealConstraints)
-    law: Law = field(default_factory=parts.Law)
+    bounds: dict[str, Annotated[Any, values.INTERVAL]] = field(default_factory=dict)
+    exogenous: dict[str, list[Reference | float]] = field(default_factory=dict)
+    plant: ScenarioPlant = field(default_factory=IdealConstraints)
+    law: Law = field(default_factory=Law)
     sampling: Sampling | None = None
-    sensors: Sensors = field(default_factory=parts.Sensors)
+    sensors: Sensors = field(default_factory=Sensors)
     estimator: Estimator | None = None
     saturation: bool = False
-    judgement: Judgement = field(default_factory=parts.Judgement)
-    references: dict[str, Reference] = field(default_factory=dict)
-    task: Task | None = None
-    start: parts.Start = field(default_factory=parts.Start)
-    duration: Annotated[float, AfterValidator(_checked(check_duration))] = 10.0
-    integrator: Annotated[
-        SimulatorConfig,
-        Form(defaults=_INTEGRATOR, texts=_INTEGRATOR_TEXTS),
-        AfterValidator(_checked(check_config)),
-    ] = field(default_factory=lambda: SimulatorConfig(**_INTEGRATOR))
-    write: parts.Write = field(default_factory=parts.Write)
+    judgement: Judgement = field(default_factory=Judgement)
+    references: dict[str, Reference | float] = field(default_factory=dict)
+    task: ScenarioTask | None = None
+    start: Start = field(default_factory=Start)
+    duration: Annotated[float, AfterValidator(_duration)] = 10.0
+    integrator: Annotated[SimulatorConfig, AfterValidator(_config)] = field(
+        default_factory=lambda: SimulatorConfig(**CONFIG)
+    )
+    write: Write = field(default_factory=Write)
     compiled: Compiled = "auto"
 
     @property
@@ -164,41 +134,33 @@ class Scenario:
 
     def __eq__(self, other: object) -> bool:
         # Arrays and Drake's SimulatorConfig cannot be compared directly.
-        return isinstance(other, Scenario) and scenario_reader().write(
-            self
-        ) == scenario_reader().write(other)
+        return isinstance(other, Scenario) and scenario_data(self) == scenario_data(other)
 
 
 @cache
-def scenario_reader(keys: tuple[str, ...] = ()) -> Reader[Scenario]:
-    """The reader and writer of scenarios as plain data, of some keys or of all."""
-    return Reader(Scenario, keys)
+def scenario_reader() -> Reader[Scenario]:
+    """The reader and writer of scenarios as plain data."""
+    return Reader(Scenario, FAMILIES, VALUES, KEYS)
 
 
-@checked(ModelError)
-def scenario_schema(tags: bool = True) -> dict[str, Any]:
-    """The JSON Schema of a scenario as plain data.
+def scenario_schema() -> dict[str, Any]:
+    """The JSON Schema of a scenario for editors of YAML, which see the value after a tag."""
+    reader = scenario_reader()
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$comment": f"Tags, for an editor: {', '.join(f'{tag} mapping' for tag in reader.tags)}",
+        **reader.schema,
+        "patternProperties": {"^_": True},
+    }
 
-    Args:
-        tags: Whether the data have tags as entries "_tag", as for `read_scenario`. Without tags, as
-            from a plain reader of YAML or an editor, any form of a family fits.
-    """
-    schema = scenario_reader().schema
-    return schema if tags else dict(without_tags(schema))
 
-
-def scenario_data(scenario: Scenario, keys: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Converts a scenario to plain data, the inverse of `read_scenario`.
-
-    Args:
-        scenario: The scenario.
-        keys: The keys that are needed, which takes less time than all; all if empty.
-    """
-    return dict(scenario_reader(keys).write(scenario))
+def scenario_data(scenario: Scenario) -> dict[str, Any]:
+    """Converts a scenario to plain data, the inverse of `read_scenario`."""
+    return dict(scenario_reader().write(scenario))
 
 
 def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
-    """Makes a scenario from plain data, with the paths of its robot unchanged.
+    """Makes a scenario from plain data.
 
     Args:
         data: Plain data.

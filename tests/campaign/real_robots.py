@@ -155,7 +155,7 @@ def outcome(file: Path, surface: str, settings: list[str], limit: float) -> tupl
             process.join()
             return "hang", f"no end within {limit:g} s"
         text = out.read_text(errors="replace")
-        verdict = re.search(r"^(Tracked as predicted|Not .*|The run .*)", text, re.MULTILINE)
+        verdict = re.search(r"^(GOOD|BAD|UNDECIDED).*", text, re.MULTILINE)
         if process.exitcode == 0:
             return "ran", verdict[0] if verdict else text[-200:]
         return ("refused" if "Traceback" not in text else "raw"), " ".join(text.split())[-600:]

@@ -4,14 +4,11 @@ import pytest
 from problems import PROBLEMS, changed
 from runs import some
 
-from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.derivatives import Derivatives, lie_derivative
 from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.signals import Parameter
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
-from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.lie import lie_derivative
 
 
 def motion_of(system: DaeSystem) -> Derivatives:
@@ -56,25 +53,6 @@ def test_derivatives_are_those_along_the_constrained_motion(problem):
         np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-10 * np.abs(two).max())
 
 
-def test_the_parts_with_and_without_control_are_those_of_what_unknowns_stand_for(problem):
-    """By unknowns from order to order, and by CasADi's derivative of the expanded expression."""
-    system = problem.system
-    motion = motion_of(system)
-    x, u, p = system.state, motion.control, system.parameter_symbol
-    along = ca.vertcat(ca.sin(x[0]) + ca.sumsqr(x) * x[-1], motion.constraint_input)
-    second = motion.derivative(motion.derivative(along))
-    drift, matrix = motion.by_control(second)
-    whole = motion.expand(second)
-    ours = ca.Function("ours", [x, p], [drift, matrix])
-    expanded = ca.Function("expanded", [x, u, p], [whole, ca.jacobian(whole, u)])
-    state, values = problem.consistent(np.random.default_rng(1)), system.parameter_values
-    found, wanted = ours(state, values), expanded(state, np.zeros(u.numel()), values)
-    for one, two in zip(found, wanted, strict=True):
-        scale = np.abs(two.full()).max(initial=0.0)
-        # Second derivatives, sums of hundreds of terms.
-        np.testing.assert_allclose(one.full(), two.full(), rtol=1e-11, atol=1e-12 * scale)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
 def test_the_rate_is_that_of_the_elimination(problem):
@@ -97,21 +75,6 @@ def test_the_rate_is_that_of_the_elimination(problem):
     np.testing.assert_allclose(rate, by_hand, rtol=1e-13, atol=1e-13)
     expected = problem.known(state).constraint_matrix
     np.testing.assert_allclose(matrix.reshape(expected.shape), expected, rtol=1e-12, atol=1e-12)
-
-
-def test_structural_zeros_in_the_motion():
-    """A mass that nothing moves: its acceleration is structurally zero; E is not 1 in any row."""
-    system = DaeSystem.from_functions(
-        4,
-        f=lambda x: [x[1], 0, x[3], 0],
-        h=lambda x: [0, 0, 0, 1],
-        l=lambda x: x[2] + x[0],
-    )
-    system = changed(system, mass_matrix=np.diag([7.0, 2.0, 5.0, 3.0]))
-    structure = find_structure(system)
-    assert structure.output_degrees == (2,)
-    # 5 x2' = x3 and 3 x3' = u.
-    assert float(structure.control_matrix) == pytest.approx(1 / 15, rel=1e-15)
 
 
 def with_inertia(arm: DaeSystem, **fields) -> DaeSystem:
@@ -158,30 +121,6 @@ def test_a_robot_with_a_mass_matrix():
         )
 
 
-def test_factors_are_made_once_for_systems_with_the_same_e():
-    """Also for another f; not for another E, whose motion is by its own E, to round-off."""
-    system, made = with_inertia(PROBLEMS["two_link_arm"]().system), []
-
-    def factorize(rows):
-        made.append(rows)
-        return PositiveDefiniteFactorization(system.mass_matrix[rows, rows])
-
-    system = changed(system, factorize=factorize)
-    heavy = ca.diagcat(ca.SX.eye(2), 2 * system.mass_matrix[2:, 2:])
-    pulled = system.f + ca.vertcat(0, 0, 1, 2)
-    drawn = np.random.default_rng(0)
-    for each in (system, changed(system, f=pulled), changed(system, mass_matrix=heavy)):
-        motion = motion_of(each)
-        rate, force = motion.expand(motion.rate), motion.expand(motion.constraint_input)
-        balance = ca.mtimes(each.mass_matrix, rate) - each.f
-        balance -= ca.mtimes(each.g, force) + ca.mtimes(each.h, motion.control)
-        inputs = {"x": each.state, "u": motion.control}
-        numbers = TracedFunction("balance", inputs, {"balance": balance, "rate": rate})
-        left, moved = numbers(drawn.uniform(0.5, 1.0, 4), drawn.uniform(0.5, 1.0, 2))
-        assert np.abs(left).max() < 1e-12 * np.abs(moved).max()
-    assert made == [[2, 3], [2, 3]]
-
-
 def test_the_implicit_form_may_be_given_in_fewer_operations():
     arm = PROBLEMS["two_link_arm"]().system
     plain = with_inertia(arm)
@@ -211,59 +150,6 @@ def test_the_implicit_form_may_be_given_in_fewer_operations():
     for wrong in wrongs:
         with pytest.raises(ModelError, match="'implicit'"):
             find_structure(with_inertia(arm, implicit=wrong))
-
-
-def test_an_implicit_form_of_small_states_is_taken():
-    """sqrt(y) near 1e-5: states drawn by 0.1 would be outside of its domain."""
-    y = ca.SX.sym("y", 3)
-    system = DaeSystem(
-        state=y,
-        f=-ca.sqrt(y),
-        g=[],
-        h=ca.SX.eye(3),
-        k=[],
-        l=y,
-        m=[],
-        mass_matrix=2 * ca.SX.eye(3),
-        nominal_state=[1e-5] * 3,
-        implicit=lambda x, v: (2 * x + ca.sqrt(y), ca.SX(0, 1)),
-    )
-    assert find_structure(system).output_degrees == (1, 1, 1)
-
-
-def test_what_is_symmetric_at_the_default_parameters_alone_is_not_taken_as_symmetric():
-    """c = k' has the gradient g^T only for s = 1; the law and the motion hold for s = 2, too."""
-    x, scale = ca.SX.sym("x", 4), Parameter("s", 1.0)
-    place, speed = x[:2], x[2:]
-    system = DaeSystem(
-        state=x,
-        f=ca.vertcat(speed, 0, -9.81),
-        g=ca.vertcat(0, 0, 2 * scale.symbol * place[0], 2 * place[1]),
-        h=ca.vertcat(0, 0, 1, 0),
-        k=ca.dot(place, place) - 1,
-        l=place[0],
-        m=[0],
-        parameters=(scale,),
-        nominal_state=[0.6, -0.8, 0.0, 0.0],
-    )
-    structure = find_structure(system)
-    motion = structure.derivatives
-    function = TracedFunction(
-        "motion",
-        {"x": x, "u": motion.control, "s": scale.symbol},
-        {"rate": motion.expand(motion.rate)},
-    )
-    rng = np.random.default_rng(0)
-    for factor in (1.0, 2.0):
-        angle, rate, u = rng.normal(size=3)
-        place_now = np.array([np.sin(angle), -np.cos(angle)])
-        speed_now = rate * np.array([np.cos(angle), np.sin(angle)])
-        gradient = 2 * place_now
-        force = gradient * [factor, 1.0]
-        free = np.array([u, -9.81])
-        v = -(2 * speed_now @ speed_now + gradient @ free) / (gradient @ force)
-        found = function(np.concatenate([place_now, speed_now]), [u], [factor])[0]
-        np.testing.assert_allclose(found[2:], free + force * v, rtol=1e-12, atol=1e-12)
 
 
 def test_the_inverse_holds_no_unknown_whose_slope_cancels():

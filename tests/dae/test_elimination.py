@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from problems import PROBLEMS, Problem
 
+from drake_dae.dae.derivatives import lie_derivative, lie_derivative_along
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 
 
 def states(problem: Problem) -> list[np.ndarray]:
@@ -131,27 +131,6 @@ def test_constraint_inputs_keep_the_constraint(problem):
         value = function(state, controls, system.parameter_values)[0]
         # Terms up to 1e3 cancel.
         np.testing.assert_allclose(value, 0.0, atol=1e-11)
-
-
-def test_what_cannot_act_is_structurally_zero():
-    """Drake reads direct feedthrough from these zeros."""
-    arm = find_structure(PROBLEMS["two_link_arm"]().system).elimination
-    assert arm.h_star[:2, :].nnz() == 0
-    assert arm.n_star[1, :].nnz() == 0
-    assert arm.n_star[0, :].nnz() == 2
-    # Here n* = m beta is zero by cancellation, and by an elimination that fills beta.
-    for name in ("knife_edge_force", "mixed_degrees"):
-        assert find_structure(PROBLEMS[name]().system).elimination.n_star.nnz() == 0
-
-
-def test_without_constraints_nothing_is_eliminated():
-    problem = PROBLEMS["flexible_pendulum"]()
-    elimination = problem.structure.elimination
-    assert elimination.alpha.shape == (0, 1)
-    assert elimination.beta.shape == (0, 1)
-    assert ca.is_equal(elimination.f_star, problem.system.f, 1)
-    assert elimination.n_star.nnz() == 0
-    assert float(elimination.pivot) == 1.0
 
 
 def test_the_pivot_says_where_a_is_singular():

@@ -1,9 +1,8 @@
 """Relative degrees belong to all numbers that a system may have, not to its defaults alone."""
 
 import casadi as ca
-import numpy as np
 import pytest
-from problems import pendulum, system_of
+from problems import pendulum
 from runs import some
 
 from drake_dae import DaePlant, analyze
@@ -11,7 +10,6 @@ from drake_dae.analysis.findings import Finding
 from drake_dae.dae.structure.assumptions import ViolationKind
 from drake_dae.dae.structure.constrained import find_constraint_structure
 from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.signals import Parameter
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 
@@ -100,18 +98,6 @@ def test_bounds_of_one_value_restrict_it_by_the_users_word(name, moves):
     assert find_structure(after).output_degrees == (3,)
 
 
-@pytest.mark.parametrize("bounds", [None, {"w": (0.2, 0.9)}])
-@pytest.mark.parametrize("moves", [False, True])
-def test_elsewhere_the_degree_is_that_of_the_family(bounds, moves):
-    """With the default 0.5 and its factor of two, or bounds that do not hold 0, mu = 1."""
-    signals = ["w"] if moves else []
-    system = integrators(
-        2, lambda x, p: x[0] + p.w * x[1], {"w": 0.5}, bounds=bounds, exogenous=signals
-    )
-    assert find_structure(system).output_degrees == (1,)
-    assert not [a for a in analyze(system).assumptions if a.finding is Finding.VIOLATED]
-
-
 def test_a_feedthrough_that_depends_on_numbers():
     """z = x_0 + w v, and v = x_0 - u: mu = 0 except at w = 0, where nothing acts at all."""
     system = DaeSystem.from_functions(
@@ -148,30 +134,6 @@ def test_a_constraint_whose_degree_depends_on_the_rate_of_a_signal():
     assert find_constraint_structure(chain_that_moves(["w"], drift=1)).constraint_degrees == (4,)
 
 
-@pytest.mark.parametrize(
-    ("k", "cause"),
-    [
-        (lambda x, p: [x[0], x[0] + p.w * x[1]], ViolationKind.REDUNDANT),
-        (lambda x, p: [x[0], p.w * x[1]], ViolationKind.NO_FORCE),
-        (lambda x, p: [x[0] + x[1], x[0] + x[1] + ca.sin(p.w) * x[1]], ViolationKind.REDUNDANT),
-    ],
-)
-def test_a_constraint_that_is_there_with_other_numbers_alone(k, cause):
-    """Redundant, or none at all, with the defaults: the words say which numbers change that."""
-    system = DaeSystem.from_functions(
-        4,
-        f=lambda x, p: [x[2], x[3], 0, 0],
-        g=lambda x, p: [[0, 0], [0, 0], [1, 0], [0, 1]],
-        k=k,
-        parameters={"w": 0.0, "c": 1.0},
-        exogenous=["w"],
-    )
-    with pytest.raises(AssumptionError) as caught:
-        find_constraint_structure(system)
-    assert caught.value.violation.cause is cause
-    assert caught.value.violation.deciding.names[0] == "w"
-
-
 def test_a_rank_of_b_that_depends_on_numbers():
     with pytest.raises(AssumptionError, match="a = ") as caught:
         find_structure(coupled(lambda p: [[1, p.a], [p.b, 1]]))
@@ -205,27 +167,6 @@ def test_a_rank_of_a_within_bounds():
             find_constraint_structure(system.with_bounds({"w": (low, 5.0)}))
 
 
-@pytest.mark.slow
-def test_where_no_state_is_consistent_with_numbers_nearer_ones_are_taken():
-    """x_0^2 + x_1^2 = 4 w^2 - 4 has none for w < 1; the default is 1.05."""
-    system = DaeSystem.from_functions(
-        4,
-        f=lambda x, p: [x[2], x[3], 0, 0],
-        g=lambda x, p: [0, 0, x[0], x[1]],
-        h=lambda x, p: [0, 0, -x[1], x[0]],
-        k=lambda x, p: x[0] ** 2 + x[1] ** 2 + 4 - 4 * p.w**2,
-        l=lambda x, p: x[0] + (p.w - 1.05) * x[2],
-        m=lambda x, p: 0,
-        parameters={"w": 1.05},
-        nominal_state=[0.2, 0.6, 0.0, 0.0],
-        bounds={"w": (0.1, 1.1)},
-    )
-    with pytest.raises(AssumptionError) as caught:
-        find_structure(system)
-    assert caught.value.violation.cause is ViolationKind.NUMBERS
-    assert caught.value.violation.deciding.names == ("w",)
-
-
 @pytest.mark.parametrize(
     ("bounds", "words"),
     [
@@ -239,27 +180,6 @@ def test_bounds_that_make_no_sense(bounds, words):
     system = integrators(2, lambda x, p: x[0] * p.gain, {"gain": 2.0})
     with pytest.raises(ModelError, match=words):
         system.with_bounds(bounds)
-
-
-def test_bounds_keep_the_symbols_of_derivatives():
-    """Expressions hold them."""
-    signal = Parameter("w", [0.0, 1.0], exogenous=True)
-    still = system_of(2, f=lambda x: [x[1], 0], h=lambda x: [0, 1], l=lambda x: [x[0]])
-    system = DaeSystem(
-        state=still.state,
-        f=still.f + ca.vertcat(0, signal.rate[1]),
-        g=[],
-        h=still.h,
-        k=[],
-        l=still.l,
-        m=[],
-        parameters=(signal,),
-    ).with_bounds({"w": ([-1.0, 0.5], 2.0)})
-    assert find_structure(system).output_degrees == (2,)
-    (parameter,) = system.parameters
-    assert ca.is_equal(parameter.rate, signal.rate)
-    np.testing.assert_array_equal(parameter.low, [-1.0, 0.5])
-    np.testing.assert_array_equal(parameter.high, [2.0, 2.0])
 
 
 def test_values_out_of_bounds_are_refused_where_they_are_set():

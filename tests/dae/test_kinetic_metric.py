@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from actuated import actuated
 from arms import arm, consistent_states, numbers
 
 from drake_dae.dae.manifold.manifold import Manifold
@@ -78,27 +77,3 @@ def test_a_robot_is_moved_as_multibody_plant_says(name):
         np.testing.assert_allclose(moved[:size], state[:size], rtol=0, atol=2e-15)
         found = moved[size:] - state[size:] - off
         np.testing.assert_allclose(found, least(mass, J, J @ off), rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["flexible", "flexible motor", "hydraulic"])
-def test_what_no_constraint_force_reaches_stays_as_it_is(kind):
-    """Motors behind springs, currents and pressures are not moved by a velocity that is off."""
-    structure = actuated("two_link", kind).structure
-    state = structure.states[1]
-    names = [signal.name for signal in structure.system.state_signals]
-    reached = find_reached(structure.system)
-    start = state.copy()
-    start[reached] += 1e-6
-    found = structure.manifold.settle(start)
-    others = np.setdiff1d(np.arange(len(names)), reached)
-    positions = [i for i in others if abs(found[i] - state[i]) > 0.0]
-    # What is left are positions of links: the velocities alone were off, so they stay too.
-    assert not positions
-    assert structure.manifold.is_consistent(found)
-
-
-def find_reached(system: DaeSystem) -> np.ndarray:
-    """The states that constraint inputs accelerate: velocities of links."""
-    g = ca.Function("g", [system.state, system.parameter_symbol], [system.explicit.g])
-    values = np.array(g(system.nominal_state, system.parameter_values))
-    return np.flatnonzero(np.abs(values).max(axis=1) > 1e-9 * np.abs(values).max())

@@ -39,29 +39,6 @@ def test_how_near_to_singular_is_singular_is_said_and_can_be_set(off):
         find_structure(nearly_singular(0.1, least_margin=0.3))
 
 
-def nearly_apart(off, **more):
-    """Two constraints in nearly one direction."""
-    return DaeSystem.from_functions(
-        4,
-        f=lambda x: [x[2], x[3], 0, 0],
-        g=lambda x: [[0, 0], [0, 0], [1, 1], [0, off]],
-        h=lambda x: [0, 0, 0, 0],
-        k=lambda x: [x[0], x[0] + off * x[1]],
-        l=lambda x: [],
-        m=lambda x: ca.SX(0, 2),
-        **more,
-    )
-
-
-def test_so_it_is_for_constraints():
-    from drake_dae.dae.structure.constrained import find_constraint_structure
-
-    with pytest.raises(AssumptionError, match="least_margin"):
-        find_constraint_structure(nearly_apart(1e-4))
-    allowed = nearly_apart(1e-4, least_margin=1e-10)
-    assert find_constraint_structure(allowed).constraint_degrees == (2, 2)
-
-
 @pytest.mark.parametrize("small", [1e-12, 3e-13, -3e-12])
 def test_how_small_is_nothing_can_be_set(small):
     """A control that acts on z' by 1e-12 beside 1: mu = 1 if that is meant, and 2 if not."""
@@ -79,14 +56,6 @@ def test_how_small_is_nothing_can_be_set(small):
     with pytest.warns(NegligibleWarning, match=r"'z0'.*1e-11"):
         assert find_structure(system()).output_degrees == (2,)
     assert find_structure(system(negligible=1e-14)).output_degrees == (1,)
-
-
-@pytest.mark.parametrize("typed", [1e-17, -2e-16, np.cos(np.pi / 2)])
-def test_a_zero_that_was_rounded_is_one_without_a_word(typed):
-    system = DaeSystem.from_functions(
-        2, f=lambda x: [x[1], 0], h=lambda x: [typed, 1], l=lambda x: x[0], state_scale=[1.0, 1.0]
-    )
-    assert find_structure(system).output_degrees == (2,)
 
 
 @pytest.mark.parametrize("key", ["least_margin", "negligible"])
@@ -128,14 +97,3 @@ def test_an_escape_within_a_finite_time_is_no_jump_of_the_reference(name):
     motion = dynamics.motion(reference, np.linspace(0.0, 5.0, 21))
     assert motion.ending.cause is EndCause.UNBOUNDED
     assert motion.ending.time == pytest.approx(when, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("rate", "start", "jump"),
-    [(lambda a: -a, 1.0, 1.0), (lambda a: -1 / (2 * a), 1.0, np.inf)],
-)
-def test_a_jump_and_the_end_of_the_domain_are_no_escape(rate, start, jump):
-    dynamics = ZeroDynamics(beside(rate, start))
-    motion = dynamics.motion(lambda t: np.array([float(t > jump), 0.0]), np.linspace(0.0, 5.0, 21))
-    assert motion.ending.cause is EndCause.NO_WAY_ON
-    assert motion.ending.time == pytest.approx(1.0, abs=1e-3)

@@ -11,8 +11,6 @@ from arms import (
     numbers,
     shipped,
 )
-from pydrake.systems.framework import LeafSystem
-from pydrake.systems.primitives import Integrator
 from runs import run
 
 from drake_dae import (
@@ -21,21 +19,8 @@ from drake_dae import (
     SinusoidReference,
     make_closed_loop,
 )
-from drake_dae.errors import ReferenceSignalError, WiringError
 
 ARMS = ["two_link", "seven_joint"]
-
-
-class Goal(LeafSystem):
-    """R(t) of tool.z = 0.3 + 0.1 sin 2t and of a force of 20 N, for degrees 2 and 0."""
-
-    def __init__(self):
-        super().__init__()
-        self.DeclareVectorOutputPort("goal", 4, self._calc, {self.time_ticket()})
-
-    def _calc(self, context, output):
-        sin, cos = np.sin(2 * context.get_time()), np.cos(2 * context.get_time())
-        output.SetFromVector([0.3 + 0.1 * sin, 0.2 * cos, -0.4 * sin, 20.0])
 
 
 @pytest.mark.parametrize(
@@ -43,22 +28,14 @@ class Goal(LeafSystem):
     [
         [SinusoidReference(0.3, 0.1, 2.0), ConstantReference(20.0)],
         {"wall.force": 20.0, "tool": SinusoidReference(0.3, 0.1, 2.0)},
-        Goal(),
     ],
 )
-def test_references_come_in_order_by_name_or_from_a_system(references):
+def test_references_come_in_order_or_by_name(references):
     plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
     loop = make_closed_loop(plant, law("two_link"), references)
     sin, cos = np.sin(1.4), np.cos(1.4)
     wanted = [0.3 + 0.1 * sin, 0.2 * cos, -0.4 * sin, 20.0]
     np.testing.assert_allclose(loop.reference.reference(0.7), wanted, rtol=1e-14)
-
-
-def test_a_system_that_needs_more_than_the_time_is_reported_where_it_goes():
-    plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
-    for planner in (Integrator(4), [Integrator(4)]):
-        with pytest.raises((ReferenceSignalError, WiringError), match="reference"):
-            make_closed_loop(plant, law("two_link"), planner)
 
 
 @pytest.mark.slow

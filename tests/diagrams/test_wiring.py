@@ -12,9 +12,7 @@ from drake_dae import (
     DcMotors,
     ForceSensor,
     LoopSettings,
-    NormalForm,
     RobotPlant,
-    StateRealization,
     TrackingLaw,
     build_scenario,
     make_closed_loop,
@@ -101,8 +99,8 @@ def test_all_signals_are_in_one_log_of_which_the_record_is_cut(name):
     Simulator(loop.diagram, context).Initialize()
     record = loop.record(context)
     assert record.time.tolist() == [0.0]
-    assert {"state", "measured_force"} <= {*loop.logged}
-    for signal, names in loop.logged.items():
+    assert {"state", "measured_force"} <= {*loop.signals}
+    for signal, names in loop.signals.items():
         port = loop.diagram.GetOutputPort(signal)
         np.testing.assert_array_equal(record[signal], [port.Eval(context)], err_msg=signal)
         assert record.signals[signal].signals == names
@@ -186,10 +184,3 @@ def test_a_gain_without_effect_is_refused():
         build_scenario(
             scenario("two_link_flexible", "sensors.force.time_constant=0.01", "law.force_gain=2")
         )
-
-
-def test_a_state_realization_is_no_plant_for_the_closed_loop():
-    chosen = law("two_link")
-    realization = StateRealization(NormalForm(chosen.structure.system, structure=chosen.structure))
-    with pytest.raises(WiringError, match=r"plant.*StateRealization"):
-        make_closed_loop(realization, chosen, [ConstantReference([0.2, 20.0])])

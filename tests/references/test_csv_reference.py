@@ -32,15 +32,6 @@ def test_the_error_of_smoothing_is_the_reported_one(order, tmp_path):
     np.testing.assert_allclose(found[:, 2], -0.4 * np.sin(2 * times), atol=5e-3)
 
 
-def test_deviation_is_the_largest_at_the_rows(tmp_path):
-    """At the ends, where a motion of 0.2 and 0.3 per s is held: it is rounded like a corner."""
-    path = CsvReference(str(wave(tmp_path, ";")), ["y", "z"], "t")
-    function = path.derivatives([0, 0])
-    off = [abs(function(0.0)[0]), abs(function(5.0)[1] - 1.5)]
-    np.testing.assert_allclose(path.deviation, off, rtol=1e-3)
-    assert np.all(path.deviation < 0.3 * 0.01)
-
-
 def raster(folder: Path, strokes: int, length: float, times: tuple[float, float]) -> Path:
     """Strokes to and fro along y, each begun beside the last one, with rows at their ends alone."""
     rows, time = ["time,y,z"], 0.0
@@ -80,22 +71,6 @@ def test_smoothing_that_loses_the_rows_is_refused_with_what_is_lost(tmp_path):
         CsvReference(file, ["z", "y"], smoothing=2.0).derivatives([2, 2])
 
 
-def test_a_column_that_stays_is_met_to_round_off(tmp_path):
-    file = tmp_path / "still.csv"
-    file.write_text("time,y,z\n0,5.1,0\n1,5.1,0\n3,5.1,0\n")
-    assert np.all(CsvReference(str(file), ["y", "z"]).deviation < 1e-14)
-
-
-@pytest.mark.parametrize("length", [1000.1, 999.99, 5.0, 1.0 / 3.0])
-def test_the_reported_least_smoothing_is_accepted(length, tmp_path):
-    file = tmp_path / "long.csv"
-    file.write_text(f"time,y\n0,0\n{length / 2},1\n{length},0\n")
-    with pytest.raises(ReferenceSignalError, match="smoothing") as refused:
-        CsvReference(str(file), ["y"], smoothing=1e-9).derivatives([2])
-    least = float(str(refused.value).split()[3])
-    CsvReference(str(file), ["y"], smoothing=least).derivatives([2])
-
-
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 def test_columns_are_found_by_name_and_held_at_the_ends(delimiter, tmp_path):
     path = CsvReference(str(wave(tmp_path, delimiter)), ["z", "y"], "t", start_time=1.0)
@@ -103,14 +78,6 @@ def test_columns_are_found_by_name_and_held_at_the_ends(delimiter, tmp_path):
     np.testing.assert_allclose(function(0.0), np.zeros(5), atol=1e-15)
     np.testing.assert_allclose(function(9.0), [1.5, 0, 0, 0.1 * np.sin(10.0), 0], atol=1e-15)
     np.testing.assert_allclose(function(3.0)[:3], [0.6, 0.3, 0.0], atol=1e-9)
-
-
-def test_a_file_is_looked_for_beside_the_one_that_names_it(tmp_path):
-    wave(tmp_path)
-    path = CsvReference("wave.csv", ["y"], "t").in_folder(tmp_path)
-    assert path.file == str(tmp_path / "wave.csv")
-    assert path.in_folder(Path("/elsewhere")) == path
-    path.derivatives([2])
 
 
 @pytest.mark.parametrize(

@@ -76,15 +76,6 @@ def test_a_line_takes_as_long_as_by_hand():
     np.testing.assert_allclose(quarter[1::2], [0.06, 0.08], atol=1e-15)
 
 
-def test_lines_stay_on_a_line():
-    path = MEMBERS["long line"]
-    points = course(path)[:, :, 0]
-    share = (points[:, 0] - 0.1) / 0.6
-    np.testing.assert_allclose(points[:, 1], 0.2 - 0.8 * share, atol=1e-15)
-    assert np.all(np.diff(share) >= 0)
-    np.testing.assert_allclose(points[[0, -1]], [[0.1, 0.2], [0.7, -0.6]], atol=1e-15)
-
-
 def test_circles_stay_on_a_circle():
     path = MEMBERS["turns"]
     points = course(path)[:, :, 0] - [0.5, 0.1]

@@ -1,6 +1,5 @@
 """References by name: which outputs a name means, and that rows arrive where they belong."""
 
-import casadi as ca
 import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
@@ -75,13 +74,3 @@ def test_what_stands_together_stays_one():
 def test_refusals(references, message):
     with pytest.raises(ReferenceSignalError, match=message):
         references_by_name(references, ["a.x", "a.y"], [2, 2])
-
-
-def test_a_symbol_of_time_is_enough():
-    """All rows are one expression, so that a closed loop is one function of time."""
-    found = references_by_name(
-        {"b, a": ExpressionReference(lambda t: [t, 2 * t])}, ["a", "b"], [1, 1]
-    )
-    time = ca.SX.sym("t")
-    rows = ca.vertcat(*[reference.expression([1], time) for reference in found])
-    np.testing.assert_array_equal(ca.DM(ca.substitute(rows, time, 3.0)), [[6], [2], [3], [1]])

@@ -93,5 +93,5 @@ def test_every_shipped_scenario_is_commanded(name):
     assert any(".push." in each for each in names)
     assert "links that are pushed" not in parts
     is_ideal = given.plant.material is None
-    is_held = is_ideal and (given.task or given.observer) is not None
+    is_held = is_ideal and (given.task or given.estimator) is not None
     assert ("surfaces that are dragged" in parts) is is_held

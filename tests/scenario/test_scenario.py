@@ -1,14 +1,11 @@
 """What a scenario file says is what the library makes of it."""
 
-import json
 from copy import deepcopy
 from dataclasses import fields
 
-import jsonschema
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
-from runs import some
 from scenario_texts import lever, run, two_link
 from two_arms import GRASP, two_arms
 
@@ -39,40 +36,15 @@ from drake_dae import (
     Torus,
     build_scenario,
     load_scenario,
-    scenario_schema,
 )
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.files import save_scenario
-from drake_dae.scenario.forms.typed_yaml import TAG, load_yaml
 from drake_dae.scenario.parts import parts as forms
 from drake_dae.scenario.parts import written
 from drake_dae.scenario.robot_file.robot import Pose, Robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", some(["two_link_wall", "two_link_flexible_motors", "wall_polish"], first=1)
-)
-def test_a_schema_without_tags_is_for_plain_readers(name):
-    """Of YAML without its tags, as a plain validator gets it."""
-    schema = scenario_schema(tags=False)
-    assert TAG not in json.dumps(schema)
-    jsonschema.Draft202012Validator.check_schema(schema)
-
-    def plain(data):
-        if isinstance(data, dict):
-            return {key: plain(value) for key, value in data.items() if key != TAG}
-        return [*map(plain, data)] if isinstance(data, list) else data
-
-    data = load_yaml(find_scenario(name).read_text(), name)
-    validator = jsonschema.Draft202012Validator(schema)
-    validator.validate(plain(data))
-    for wrong in ({**plain(data), "nothing": 1}, {**plain(data), "duration": "long"}):
-        with pytest.raises(jsonschema.ValidationError):
-            validator.validate(wrong)
 
 
 def test_every_form_reads_back_equal(tmp_path):

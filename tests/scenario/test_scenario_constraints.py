@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from pydrake.geometry import SceneGraph
-from runs import run_scenario, scenario_validator
+from runs import run_scenario, scenario_validator, untagged
 
 from drake_dae import build_scenario, load_scenario
+from drake_dae.analysis.limits import LimitKind
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import find_scenario
 
@@ -264,7 +265,7 @@ def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_pat
     at once. The constraint is looked at by Drake: projection leaves round-off."""
     text, robot, holds, outputs = CASES[name]
     path = scenario_file(tmp_path, text, robot)
-    scenario_validator().validate(load_yaml(path.read_text(), "own"))
+    scenario_validator().validate(untagged(load_yaml(path.read_text(), "own")))
     loop, _, record = run_scenario(load_scenario(path))
     assert [signal.name for signal in loop.plant.dae.output_signals] == outputs
     distance = np.abs(record["tracking_error"] - loop.predicted_error(record)).max(axis=0)
@@ -286,7 +287,7 @@ def test_a_cart_can_be_analyzed(tmp_path):
     scenario = load_scenario(scenario_file(tmp_path, ROLL, CART))
     report = find_feasibility(scenario)
     assert report.analysis.structure.constraint_degrees == (1, 1, 1)
-    assert len(report.constraint_forces) == 3
+    assert len(report.of(LimitKind.FORCE)) == 3
 
 
 @pytest.mark.slow
@@ -352,7 +353,7 @@ EQUAL = """<mujoco model="m"><worldbody>
             GRIPPER.replace("</robot>", BALLS),
             ["robot.file: ", "CoincidentPoints"],
         ),
-        ("robot.xml", EQUAL, ["robot.file: ", "equality", "ignored", "!JointCoupler"]),
+        ("robot.xml", EQUAL, ["robot.file: ", "[equality/joint]", "!JointCoupler"]),
     ],
 )
 def test_what_a_robot_file_holds_besides_is_refused_and_not_dropped(file, robot, words, tmp_path):

@@ -181,10 +181,10 @@ law:
 def test_constraints_of_a_file_may_be_left_out_and_written_in_the_scenario(tmp_path):
     (tmp_path / "linked.xml").write_text(LINKED)
     (tmp_path / "mine.yaml").write_text(LINKED_SCENARIO)
-    with pytest.raises(ScenarioError, match=r"leave_out: \[constraints\]"):
+    with pytest.raises(ScenarioError, match=r"leave_out: \[equality/joint\]"):
         scenario_model(load_scenario(tmp_path / "mine.yaml"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        chosen = load_scenario(tmp_path / "mine.yaml", ["robot.leave_out=[constraints]"])
+        chosen = load_scenario(tmp_path / "mine.yaml", ["robot.leave_out=[equality/joint]"])
         (coupler,) = scenario_model(chosen).constraints
     assert (coupler.follower, coupler.ratio) == ("j1", 2.0)

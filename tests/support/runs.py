@@ -112,6 +112,13 @@ def scenario(name: str, *settings: str) -> Scenario:
     return load_scenario(find_scenario(name), settings)
 
 
+def untagged(data: Any) -> Any:
+    """Plain data as a reader of YAML without tags, such as an editor, has them."""
+    if isinstance(data, dict):
+        return {key: untagged(value) for key, value in data.items() if key != "_tag"}
+    return [*map(untagged, data)] if isinstance(data, list) else data
+
+
 @cache
 def scenario_validator() -> jsonschema.Draft202012Validator:
     """Of the JSON Schema of scenarios, which takes a second to check itself."""

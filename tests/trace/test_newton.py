@@ -25,22 +25,6 @@ def test_a_root_is_found_to_round_off():
     np.testing.assert_allclose(found, expected, rtol=4e-16)
 
 
-def test_steps_are_damped_where_full_ones_run_off():
-    """atan: from |x| > 1.39 full steps grow without end."""
-    found, converged = solve(np.arctan, lambda x: np.array([1 / (1 + x**2)]), [20.0])
-    assert converged
-    np.testing.assert_allclose(found, 0.0, atol=1e-15)
-
-
-def test_iterates_outside_the_domain_are_refused():
-    """log x from 10: the full step goes to -13."""
-    found, converged = solve(np.log, lambda x: np.array([1 / x]), [10.0])
-    assert converged
-    np.testing.assert_allclose(found, 1.0, rtol=1e-15)
-    at = newton(np.array([-1.0]), lambda x: shortest_steps(np.log(x)[None], np.log))
-    assert at == (-1.0, False)
-
-
 def test_convergence_is_quadratic():
     """From 10% off a circle: errors 1e-1, 1e-2, 1e-4, 1e-8, 1e-16, so that four steps do."""
     iterates = []
@@ -102,17 +86,3 @@ def test_steps_are_the_shortest():
     step, regular, _ = shortest_steps(np.zeros((0, 6)), lambda at: np.zeros(0))
     np.testing.assert_array_equal(step(x), np.zeros(6))
     assert regular
-
-
-@pytest.mark.parametrize("rows", [3, 5])
-def test_steps_of_dependent_gradients_are_those_of_least_squares(rows):
-    """The last row is the first one again; 5 rows are more than there are columns."""
-    gradients = np.random.default_rng(1).normal(size=(rows, 4))
-    gradients /= np.linalg.norm(gradients, axis=1)[:, None]
-    gradients[-1] = gradients[0]
-    residual = np.arange(1.0, rows + 1.0)
-    step, regular, _ = shortest_steps(gradients, lambda at: residual)
-    assert not regular
-    expected = np.linalg.lstsq(gradients, -residual)[0]
-    np.testing.assert_allclose(step(np.zeros(4)), expected, atol=1e-13)
-    assert shortest_steps(np.full((1, 4), np.nan), lambda at: residual) is None

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, number, numbers, positive, vector
-from drake_dae.dae.linearization.linearization import linearize, linearize_loop
-from drake_dae.dae.linearization.models import ComplexArray, Linearization
+from drake_dae.dae.linearization import ComplexArray, Linearization, linearize, linearize_loop
 from drake_dae.dae.tracking.model_of_law import acting_late
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError

@@ -6,17 +6,18 @@ from math import isfinite
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.manifold.newton_steps import FOUND, STAYS, shortest_step, trace_first_steps
 from drake_dae.dae.manifold.settling import Settling
-from drake_dae.dae.system.layout import DerivativeLayout
+from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction, count_operations
 from drake_dae.trace.newton import NewtonModel, newton, norm, shortest_steps
-from drake_dae.trace.round_off import are_dependent, positive
+from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
 CONSISTENT = 1e-8
 """A state counts as consistent, and is projected without a message, if its distance from N*
@@ -275,3 +276,26 @@ class Manifold:
                 f"{self.system.name}: a state has shape ({self.system.num_states},), got {x.shape}"
             )
         return x
+
+
+def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
+    """Returns a basis T of the tangent space, orthonormal in scaled states, shape (n, n - k)."""
+    rows = unit_rows(gradients * scale)
+    return scale[:, None] * np.linalg.svd(rows)[2][len(rows) :].T
+
+
+def coordinates(gradients: FloatArray, scale: FloatArray) -> tuple[Indices, FloatArray]:
+    """Returns n - k states that are coordinates, and the derivatives of all states by them.
+
+    Unlike an orthonormal basis this one leaves a triangular system triangular. The arguments are
+    those of `tangent`.
+    """
+    basis = tangent(gradients, scale) / scale[:, None]
+    count = basis.shape[1]
+    free = np.sort(scipy.linalg.qr(basis.T, mode="r", pivoting=True)[1][:count])
+    rest = np.setdiff1d(np.arange(scale.size), free)
+    rows = unit_rows(gradients * scale)
+    moved = np.zeros(basis.shape)
+    moved[free] = np.eye(count)
+    moved[rest] = -np.linalg.solve(rows[:, rest], rows[:, free])
+    return free, scale[:, None] * moved / scale[free]

@@ -56,7 +56,9 @@ class TrackingLaw:
 
     `function` is the law as (state, reference, measured_force, integral, parameters) -> control,
     tracking_error and integral_rate, without what the law does not have, and with the parameters of
-    `all_parameters`. `layout` is that of reference vectors, and `reference_signals` names them.
+    `all_parameters`; `outputs` are these as expressions of `inputs`, and `pivot` is 0 where the
+    matrix that `regular` names is singular. `layout` is that of reference vectors, and
+    `reference_signals` names them.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
@@ -143,14 +145,17 @@ class TrackingLaw:
             often=False,
         )
         numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
-        self._ubar = ubar
+        self._ubar, self.outputs, self.pivot = ubar, outputs, pivot
         self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
+        self.regular = (
+            f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}"
+        )
         return TracedFunction(
             f"{self.system.name} tracking law",
             self._inputs,
             outputs,
             pivot,
-            f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}",
+            self.regular,
             compiled=self.system.compiled,
         )
 

@@ -18,7 +18,7 @@ from drake_dae.blocks.trials import PACE_STEPS
 from drake_dae.errors import InconsistentStateError, NonFiniteError, SimulationError
 from drake_dae.running.rollout.program import RolloutProgram
 from drake_dae.running.rollout.run import Run, RunEnding, RunProblem
-from drake_dae.systems.blocks.block import ParameterizedSystem
+from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plants.contract import Plant
 
 STATES = (STATE, "estimated_state")
@@ -90,8 +90,9 @@ def _reason(
         given = dict(zip(call.computation.sources, arguments, strict=True))
         if not isinstance(call.block.system, ParameterizedSystem) or PARAMETERS not in given:
             return error
-        inputs = [given["control"]] if "control" in given else []
-        return call.block.system.explained(error, given[PARAMETERS], *inputs)
+        values = {"parameters": given[PARAMETERS]}
+        values |= {f"input {name}": given[name] for name in ("control",) if name in given}
+        return call.block.system.explained(error, values)
     return None
 
 

@@ -18,8 +18,7 @@ from drake_dae.robots.outputs import (
 )
 from drake_dae.scenario.completion.postures import Posture
 from drake_dae.scenario.completion.tool_axis import ToolAxis, tool_axis
-from drake_dae.scenario.parts.families import Output
-from drake_dae.scenario.parts.written import TiltFromNormalForm, make
+from drake_dae.scenario.parts.written import TiltFromNormalForm, WrittenOutput, make
 from drake_dae.scenario.scenario import Scenario
 
 
@@ -58,7 +57,7 @@ class Candidates:
         outputs: Sequence[PositionOutput],
         bound: ConstraintSet,
     ) -> None:
-        self._forms: list[Output] = []
+        self._forms: list[WrittenOutput] = []
         self.signals: list[Signal] = [s for output in outputs for s in output.signals(links)]
         self._given = len(self.signals)
         rows = [output.expression(links) for output in outputs]
@@ -67,7 +66,7 @@ class Candidates:
             _ToolContact(name, t, tool_axis(links, t)) for name, t in touching if t is not None
         ]
 
-        def add(forms: Iterable[Output]) -> list[int]:
+        def add(forms: Iterable[WrittenOutput]) -> list[int]:
             first = len(self.signals)
             for form in forms:
                 output = make(form, bound.constraints)
@@ -98,12 +97,12 @@ class Candidates:
             if k != axis
         ]
 
-    def form(self, row: int) -> Output:
+    def form(self, row: int) -> WrittenOutput:
         """The form of a completed row in a scenario."""
         return self._forms[row - self._given]
 
 
-def _points(place: _ToolContact, taken: set[str]) -> list[Output]:
+def _points(place: _ToolContact, taken: set[str]) -> list[WrittenOutput]:
     frame, point = place.touch.frame, place.touch.point
     # Names are unique: the constraint's name is used if the frame's is taken.
     other = f"{place.constraint}_point"
@@ -113,17 +112,17 @@ def _points(place: _ToolContact, taken: set[str]) -> list[Output]:
     ]
 
 
-def _tilts(place: _ToolContact) -> list[Output]:
+def _tilts(place: _ToolContact) -> list[WrittenOutput]:
     axis = place.axis.axis
     return [TiltFromNormalForm(place.constraint, axis, other) for other in "xyz".replace(axis, "")]
 
 
-def _directions(place: _ToolContact) -> list[Output]:
+def _directions(place: _ToolContact) -> list[WrittenOutput]:
     axis = place.axis.axis
     return [AxisCoordinates(place.touch.frame, axis, component) for component in "xyz"]
 
 
-_JOINED = {
+_JOINED: dict[type, str] = {
     PointCoordinates: "axes",
     AxisCoordinates: "components",
     TiltFromNormalForm: "components",
@@ -132,12 +131,13 @@ _JOINED = {
 """Which attribute of an output holds its rows."""
 
 
-def merged(forms: Iterable[Output]) -> list[Output]:
+def merged(forms: Iterable[WrittenOutput]) -> list[WrittenOutput]:
     """The same rows in fewer outputs: neighbours that differ only in their rows are joined."""
     outputs: list[Any] = []
+    form: Any
     for form in forms:
         key = _JOINED[type(form)]
-        last = outputs[-1] if outputs else None
+        last: Any = outputs[-1] if outputs else None
         if type(last) is type(form) and replace(form, **{key: getattr(last, key)}) == last:
             outputs[-1] = replace(form, **{key: getattr(last, key) + getattr(form, key)})
         else:

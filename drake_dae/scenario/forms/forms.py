@@ -1,158 +1,363 @@
-"""Dataclasses as forms of plain data, checked by pydantic with all problems at once.
+"""Dataclasses as forms of plain data: read by pydantic, put by dotted keys, written, described.
 
-A dataclass is its own form: its fields, defaults and checks apply to the data. A field whose type
-is not plain data is `written` as another type. A tag chooses among the classes of a family.
+A dataclass is its own form: its fields are keys, with its defaults and its checks, and its
+docstring explains them. A tag, as in `surface: !Sphere`, chooses among the classes of a family.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from copy import copy
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
-from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from difflib import get_close_matches
+from functools import cache, cached_property
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Generic,
+    Literal,
+    NotRequired,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
+import numpy as np
 import pydantic
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import ErrorDetails, core_schema
+from typing_extensions import TypedDict
 
-from drake_dae.scenario.forms.docstrings import attribute_texts, introduction
+from drake_dae.arrays import brief
+from drake_dae.errors import ScenarioError
 from drake_dae.scenario.forms.typed_yaml import TAG
 
 T = TypeVar("T")
 
-PLAIN = {str: "text", float: "a number"}
-"""The names of plain values in a choice by tag."""
+_STRICT = pydantic.ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
-
-@dataclass(frozen=True, eq=False)
-class Form:
-    """Annotates a dataclass, or a Drake class with `__fields__`: data have the keys of its fields.
-
-    Attributes:
-        written: Annotation of a field -> the type of its data.
-        defaults: Name of a field -> its default in data, if it differs from that of the class.
-        tag: The tag that chooses the class, "!Sphere"; empty if there is no choice.
-        needs_tag: Whether the tag is required: without it another class is chosen.
-        texts: Name of a field -> its text, if the docstring of the class has none.
-        keys: The keys of data, in less time than for all fields; all fields if empty.
-    """
-
-    written: Mapping[Any, Any] = field(default_factory=dict)
-    defaults: Mapping[str, Any] = field(default_factory=dict)
-    tag: str = ""
-    needs_tag: bool = False
-    texts: Mapping[str, str] = field(default_factory=dict)
-    keys: tuple[str, ...] = ()
-
-    def __get_pydantic_json_schema__(
-        self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        schema = handler(source)
-        return {**schema, "description": introduction(schema.get("description", ""))}
-
-    def __get_pydantic_core_schema__(
-        self, source: type[Any], handler: pydantic.GetCoreSchemaHandler
-    ) -> CoreSchema:
-        # A form at several places, as a reference, is made once: this halves the time of a reader.
-        traits = self.tag, self.needs_tag, repr(self.defaults), repr(self.texts)
-        key = source, id(self.written), traits, self.keys
-        if key not in _MADE:
-            _MADE[key] = self, self._core_schema(source, handler)
-        return copy(_MADE[key][1])  # pydantic adds to it.
-
-    def _core_schema(self, source: type[Any], handler: pydantic.GetCoreSchemaHandler) -> CoreSchema:
-        texts = {**attribute_texts(source), **self.texts}
-        fields_in_data = list(_fields_of(source, self.defaults))
-        entries = {
-            name: core_schema.typed_dict_field(
-                handler.generate_schema(
-                    Annotated[self._type_in_data(hint), _Explained(texts.get(name, ""), default)]
-                ),
-                required=default is MISSING,
-            )
-            for name, hint, default in fields_in_data
-            if not self.keys or name in self.keys
-        }
-        names, tag = list(entries), {TAG: self.tag} if self.tag else {}
-        # Drake's own defaults are not written: another Drake may not have the key any more.
-        drakes = {} if is_dataclass(source) else {n: d for n, _, d in fields_in_data}
-        unwritten = {name: drakes[name] for name in drakes if name not in self.defaults}
-        if tag:
-            literal = core_schema.literal_schema([self.tag])
-            entries[TAG] = core_schema.typed_dict_field(literal, required=self.needs_tag)
-
-        def make(data: dict[str, Any]) -> Any:
-            data.pop(TAG, None)
-            return source(**{**self.defaults, **data})
-
-        def dump(made: Any, dump_data: Callable[[Any], Any]) -> Any:
-            values = [(name, getattr(made, name)) for name in names]
-            told = {n: v for n, v in values if n not in unwritten or v != unwritten[n]}
-            return dump_data({**tag, **told})
-
-        data = core_schema.typed_dict_schema(
-            entries,
-            cls=source,
-            extra_behavior="forbid",
-            config=core_schema.CoreConfig(strict=True, allow_inf_nan=False),
-        )
-        return core_schema.no_info_after_validator_function(
-            make,
-            data,
-            serialization=core_schema.wrap_serializer_function_ser_schema(dump, schema=data),
-        )
-
-    def _type_in_data(self, hint: Any) -> Any:
-        """The type in data of a field with an annotation."""
-        if is_dataclass(hint):
-            return Annotated[hint, Form(self.written)]
-        members = _members(hint)
-        for annotation, form in self.written.items():
-            if _members(annotation) <= members:
-                return form | None if type(None) in members else form
-        # In data a tuple is a list.
-        return Annotated[hint, pydantic.Strict(False)] if get_origin(hint) is tuple else hint
-
-
-_MADE: dict[Any, tuple[Form, CoreSchema]] = {}
-"""What a `Form` makes of a class, with the form itself, whose `written` is known by identity."""
+_WORDS = {
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "text",
+    "list_type": "a list",
+    "dict_type": "names with values",
+}
+"""What is expected, by pydantic's name of the problem."""
 
 
 @dataclass(frozen=True)
-class _Explained:
-    """Adds the text of a field, and its default, to the JSON Schema of its type."""
+class Family:
+    """The classes among which a tag chooses.
 
-    text: str
+    Attributes:
+        members: Tag -> class; the first one is chosen without a tag.
+        plain: A type that may stand in place of a member: str or float; None for none.
+    """
+
+    members: Mapping[str, type]
+    plain: type | None = None
+
+    def tag_of(self, data: Any) -> str | None:
+        """The tag that data have, or stand for."""
+        if isinstance(data, dict):
+            return str(data.get(TAG, next(iter(self.members))))
+        kinds = (int, float) if self.plain is float else (self.plain or (),)
+        return "plain" if isinstance(data, kinds) and not isinstance(data, bool) else None
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of a form: the type of its value, its default (`MISSING` if it has none), its text."""
+
+    hint: Any
     default: Any
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """Annotates the type of values that a function converts.
+
+    Attributes:
+        words: What is expected.
+        schema: The JSON Schema.
+        convert: The function of a value and the folder of relative file names; it returns None for
+            a value that is wrong.
+    """
+
+    words: str
+    schema: Mapping[str, Any]
+    convert: Callable[[Any, Path], Any]
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: pydantic.GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        return core_schema.with_info_plain_validator_function(self._read)
 
     def __get_pydantic_json_schema__(
-        self, source: CoreSchema, handler: pydantic.GetJsonSchemaHandler
+        self, source: Any, handler: pydantic.GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        schema = dict(handler(source))
-        combined = "\n\n".join(filter(None, (self.text, schema.get("description"))))
-        schema.update({"description": combined} if combined else {})
-        schema.update({"default": self.default} if _is_plain(self.default) else {})
-        return schema
+        return dict(self.schema)
+
+    def _read(self, value: Any, info: core_schema.ValidationInfo) -> Any:
+        converted = self.convert(value, info.context or Path())
+        if converted is None:
+            raise ValueError(f"expected {self.words}, got {shown(value)}")
+        return converted
 
 
-def _is_plain(value: Any) -> bool:
-    """Whether a default is plain data, and not an object."""
-    if isinstance(value, (list, tuple)):
-        return all(map(_is_plain, value))
-    return value is None or value == {} or isinstance(value, (bool, int, float, str))
+def shown(data: Any) -> str:
+    """A value as the user wrote it, but short."""
+    if data is None:
+        return "nothing"
+    text = str(data[TAG]) if isinstance(data, dict) and TAG in data else brief(data)
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _fields_of(source: type[Any], defaults: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """The name, the annotation and the default of each field, `MISSING` where it has none."""
-    if not is_dataclass(source):
-        made: Any = source()
-        for item in made.__fields__:
-            yield item.name, item.type, defaults.get(item.name, getattr(made, item.name))
-        return
-    hints = get_type_hints(source, include_extras=True)
-    for item in fields(source):
-        if item.init:
-            factory = item.default_factory
-            default = item.default if factory is MISSING else factory()
-            yield item.name, hints[item.name], defaults.get(item.name, default)
+class Reader(Generic[T]):
+    """Makes a dataclass of plain data, and plain data of it.
+
+    Args:
+        form: The dataclass.
+        families: Type in annotations -> the family that stands for it in data.
+        values: Type in annotations -> the pydantic type of its data.
+        keys: The keys of classes that are no dataclasses, or differ from them in data.
+    """
+
+    def __init__(
+        self,
+        form: type[T],
+        families: Mapping[Any, Family] | None = None,
+        values: Mapping[Any, Any] | None = None,
+        keys: Mapping[type, Mapping[str, Key]] | None = None,
+    ) -> None:
+        self._form, self._families, self._values = form, families or {}, values or {}
+        self._keys = keys or {}
+        self._types: dict[Any, Any] = {}
+        self._tags = {
+            cls: tag for family in self._families.values() for tag, cls in family.members.items()
+        }
+        self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(self._type(form))
+
+    @cached_property
+    def schema(self) -> dict[str, Any]:
+        """The JSON Schema of the plain data, as an editor of YAML sees them: without tags."""
+        return dict(_without_tags(self._adapter.json_schema()))
+
+    @property
+    def tags(self) -> list[str]:
+        """All tags."""
+        return list(dict.fromkeys(self._tags.values()))
+
+    def read(
+        self,
+        data: Any,
+        folder: Path | None = None,
+        place_of: Callable[[str], str] = lambda key: "",
+    ) -> T:
+        """Makes the dataclass of plain data.
+
+        Args:
+            data: The plain data.
+            folder: The folder of relative file names; None for the working directory.
+            place_of: Where a key stands, to be added to a problem with it.
+
+        Raises:
+            ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
+                listed.
+        """
+        try:
+            return self._adapter.validate_python(data, context=folder)
+        except pydantic.ValidationError as error:
+            problems = [self._problem(details, data) for details in error.errors()]
+            raise ScenarioError(*((k, f"{t} {place_of(at)}") for k, t, at in problems)) from None
+
+    def write(self, value: Any) -> Any:
+        """Plain data that read as this value: of a form the keys that differ from the defaults."""
+        if type(value) in self._keys or is_dataclass(value):
+            data = {TAG: self._tags[type(value)]} if type(value) in self._tags else {}
+            for name, key in self.keys_of(type(value)).items():
+                written = self.write(getattr(value, name))
+                if key.default is MISSING or written != self.write(key.default):
+                    data[name] = written
+            return data
+        if isinstance(value, Mapping):
+            return {name: self.write(inner) for name, inner in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [self.write(inner) for inner in value]
+        if isinstance(value, (np.ndarray, np.generic)):
+            return value.tolist()
+        return str(value) if isinstance(value, Path) else value
+
+    def put(self, data: Any, key: str, value: Any) -> None:
+        """Sets an entry of plain data, in place.
+
+        Args:
+            data: Lists and dictionaries.
+            key: A dotted key, "a.b.0.c"; names that a user chooses may have dots themselves.
+            value: Plain data.
+
+        Raises:
+            ScenarioError: There is no such entry.
+        """
+        parts, path = key.split("."), ""
+        hint: Any = self._form
+        if not all(parts):
+            raise ScenarioError((brief(key), "expected a dotted key, for example start.errors"))
+        while True:
+            chosen = get_origin(_only(hint)) in (dict, Mapping)
+            count = _name_length(data, parts) if chosen else 1
+            slot: str | int = ".".join(parts[:count])
+            if isinstance(data, list):
+                if not (str(slot).isascii() and str(slot).isdecimal() and int(slot) < len(data)):
+                    indices = ", ".join(map(str, range(len(data)))) or "none"
+                    raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
+                slot = int(slot)
+            elif not isinstance(data, dict):
+                raise ScenarioError((path, f"{brief(data)} has no entry '{slot}'"))
+            parts = parts[count:]
+            if not parts:
+                data[slot] = value
+                return
+            if (family := self._family(hint)) is not None:
+                hint = family.members.get(family.tag_of(data) or "")
+            hint = self._inside(hint, slot)
+            path = f"{path}.{slot}" if path else str(slot)
+            if isinstance(data, dict) and data.get(slot) is None:
+                data[slot] = {}
+            data = data[slot]
+
+    def keys_of(self, form: type) -> Mapping[str, Key]:
+        """The keys of a form."""
+        return self._keys.get(form) or keys_of(form)
+
+    def _family(self, hint: Any) -> Family | None:
+        members = _members(hint)
+        return next((f for base, f in self._families.items() if base in members), None)
+
+    def _is_form(self, hint: Any) -> bool:
+        return isinstance(hint, type) and (hint in self._keys or is_dataclass(hint))
+
+    def _type(self, hint: Any) -> Any:
+        """The pydantic type of data for an annotation."""
+        if get_origin(hint) is Annotated:
+            inner, *more = get_args(hint)
+            return _annotated(self._type(inner), *more)
+        members = _members(hint)
+        value = next((v for base, v in self._values.items() if _members(base) <= members), None)
+        value = Annotated[Any, value] if isinstance(value, Value) else value
+        if value is None and (family := self._family(hint)) is not None:
+            if id(family) not in self._types:
+                self._types[id(family)] = self._choice(family)
+            value = self._types[id(family)]
+        if value is not None:
+            return value | None if NoneType in members else value
+        if self._is_form(hint):
+            if hint not in self._types:
+                self._types[hint] = self._data(hint)
+            return self._types[hint]
+        origin, parts = get_origin(hint), get_args(hint)
+        if origin in (Union, UnionType):
+            return Union[tuple(self._type(part) for part in parts)]  # noqa: UP007
+        if origin in (list, Sequence):
+            return list[self._type(parts[0])]  # type: ignore[misc]
+        if origin in (dict, Mapping):
+            return dict[str, self._type(parts[1])]  # type: ignore[misc]
+        return hint
+
+    def _data(self, form: type, tag: str = "", needs_tag: bool = False) -> Any:
+        """The type of the data of a form."""
+        entries: dict[str, Any] = {}
+        for name, key in self.keys_of(form).items():
+            more = {} if key.default is MISSING else {"default": self.write(key.default)}
+            about = pydantic.Field(description=key.text or None, json_schema_extra=more)
+            entry = _annotated(self._type(key.hint), about)
+            entries[name] = entry if key.default is MISSING else NotRequired[entry]
+        if tag:
+            entries[TAG] = Literal[tag] if needs_tag else NotRequired[Literal[tag]]
+        make_type: Any = TypedDict
+        data = make_type(tag or form.__name__, entries)
+        data.__doc__ = introduction(form.__doc__ or "")
+        data.__pydantic_config__ = _STRICT
+        defaults = {
+            name: key.default
+            for name, key in self.keys_of(form).items()
+            if form in self._keys and key.default is not MISSING
+        }
+
+        def make(given: dict[str, Any]) -> Any:
+            return form(**{**defaults, **{k: v for k, v in given.items() if k != TAG}})
+
+        return Annotated[data, pydantic.AfterValidator(make)]
+
+    def _choice(self, family: Family) -> Any:
+        """The type of the data of a family."""
+        members = [
+            Annotated[self._data(cls, tag, needs_tag=index > 0), pydantic.Tag(tag)]
+            for index, (tag, cls) in enumerate(family.members.items())
+        ]
+        if family.plain is not None:
+            members.append(_annotated(family.plain, pydantic.Tag("plain")))
+        return Annotated[Union[tuple(members)], pydantic.Discriminator(family.tag_of)]  # noqa: UP007
+
+    def _inside(self, hint: Any, part: str | int) -> Any:
+        """The annotation of a part of data: of a key, an entry of a list, a member by its tag."""
+        if (family := self._family(hint)) is not None:
+            return family.members.get(str(part))
+        hint = _only(hint)
+        if self._is_form(hint):
+            key = self.keys_of(hint).get(str(part))
+            return None if key is None else key.hint
+        return (get_args(hint) or [None])[-1]
+
+    def _problem(self, error: ErrorDetails, data: Any) -> tuple[str, str, str]:
+        """The dotted key of a problem, its text, and the key at whose place it is."""
+        loc, kind, value = error["loc"], error["type"], error["input"]
+        last = str(loc[-1]) if TAG in loc or kind in ("missing", "extra_forbidden") else ""
+        hint, keys, tag, tags = self._form, list[str](), "", ""
+        for part in loc[: loc.index(TAG)] if TAG in loc else loc[:-1] if last else loc:
+            family, hint = self._family(hint), self._inside(hint, part)
+            if family is None:
+                keys, data, tag, tags = [*keys, str(part)], data[part], "", ""
+            else:
+                tag, tags = f"{part} ", ", ".join(family.members)
+        at, form = ".".join(keys), _only(hint)
+        names = list(self.keys_of(form)) if self._is_form(form) else []
+        listed = f"keys: {', '.join(names) or 'none'}"
+        if tag and isinstance(data, dict) and TAG not in data:
+            listed += f". No tag is given; there are {tags}"
+        place = at
+        if TAG in loc:
+            text = f"takes no tag, got {data[TAG]}"
+        elif kind == "missing":
+            text = f"{tag}needs the key '{last}'; {listed}"
+        elif kind == "extra_forbidden":
+            near = get_close_matches(last, names, n=1)
+            listed = f"did you mean '{near[0]}'?" if near else listed
+            text, place = f"{tag}has no key '{last}'; {listed}", ".".join([*keys, last])
+        elif kind == "value_error":
+            text = str(error["ctx"]["error"])
+        elif (family := self._family(hint)) is not None:
+            also = {str: "text, or ", float: "a number, or "}.get(family.plain or list, "")
+            text = f"expected {also}one of {', '.join(family.members)}, got {shown(value)}"
+        else:
+            expected = _WORDS.get(kind, error["msg"].removeprefix("Input should be "))
+            expected = listed if kind == "dict_type" and names else expected
+            text = f"expected {expected}, got {shown(value)}"
+            if kind == "string_type" and isinstance(value, (bool, int, float)):
+                text += "; text that reads as something else goes in quotes"
+        return at or "scenario", text, place
+
+
+def _annotated(hint: Any, *more: Any) -> Any:
+    for part in more:
+        hint = Annotated[hint, part]
+    return hint
 
 
 def _members(hint: Any) -> set[Any]:
@@ -160,44 +365,78 @@ def _members(hint: Any) -> set[Any]:
     return set(get_args(hint)) if get_origin(hint) in (Union, UnionType) else {hint}
 
 
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """Annotates a Union of dataclasses: a tag chooses one, by default the first.
+def _only(hint: Any) -> Any:
+    """An annotation without None and without what is said about it."""
+    while get_origin(hint) is Annotated or len(_members(hint) - {NoneType}) < len(_members(hint)):
+        if get_origin(hint) is Annotated:
+            hint = get_args(hint)[0]
+        else:
+            (*rest,) = _members(hint) - {NoneType}
+            hint = rest[0] if len(rest) == 1 else None
+    return hint
 
-    The tag is "!" and the name of the class, without a "Form" at its end. A member annotated with a
-    `Form` has the tag and the defaults of that `Form`. Members `str` and `float` are plain text and
-    a number.
 
-    Attributes:
-        written: The types that stand for others in data, as in `Form`, for all members.
-    """
+def _name_length(data: Any, parts: Sequence[str]) -> int:
+    """The number of parts of a dotted key that form a name with dots."""
+    for count in range(len(parts), 0, -1) if isinstance(data, dict) else ():
+        name = ".".join(parts[:count])
+        if name in data and (count == len(parts) or isinstance(data[name], (dict, list))):
+            return count
+    return len(parts)
 
-    written: Mapping[Any, Any] = field(default_factory=dict)
 
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: pydantic.GetCoreSchemaHandler
-    ) -> CoreSchema:
-        forms: dict[type[Any], Form] = {}
-        members = get_args(source)
-        for member in (member for member in members if member not in PLAIN):
-            cls, form = get_args(member) or (member, Form())
-            tag = form.tag or f"!{cls.__name__.removesuffix('Form')}"
-            forms[cls] = replace(form, written=self.written, tag=tag, needs_tag=bool(forms))
-        first = next(iter(forms.values())).tag
+def _without_tags(schema: Any) -> Any:
+    """A JSON Schema of data in which any member of a family fits, whatever its tag."""
+    if isinstance(schema, list):
+        return [_without_tags(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    named = {"oneOf": "anyOf"}
+    cleaned = {
+        named.get(key, key): _without_tags(part)
+        for key, part in schema.items()
+        if key not in (TAG, "discriminator")
+    }
+    if "required" in cleaned:
+        cleaned["required"] = [name for name in cleaned["required"] if name != TAG]
+    return cleaned
 
-        def chosen(value: Any) -> str | None:
-            if isinstance(value, dict):
-                return str(value.get(TAG, first))
-            for plain, types in ((str, str), (float, (int, float))):
-                if plain in members and isinstance(value, types) and not isinstance(value, bool):
-                    return PLAIN[plain]
-            return forms[type(value)].tag if type(value) in forms else None
 
-        choices = {
-            form.tag: handler.generate_schema(Annotated[cls, form]) for cls, form in forms.items()
-        }
-        if str in members:
-            choices[PLAIN[str]] = core_schema.str_schema(strict=True)
-        if float in members:
-            choices[PLAIN[float]] = core_schema.float_schema(strict=True, allow_inf_nan=False)
-        return core_schema.tagged_union_schema(choices, chosen)
+@cache
+def keys_of(form: type) -> Mapping[str, Key]:
+    """The keys of a dataclass: the fields that its constructor takes."""
+    hints, texts = get_type_hints(form, include_extras=True), attribute_texts(form)
+    return {
+        item.name: Key(
+            hints[item.name],
+            item.default if item.default_factory is MISSING else item.default_factory(),
+            texts.get(item.name, ""),
+        )
+        for item in fields(form)
+        if item.init
+    }
+
+
+@cache
+def introduction(docstring: str) -> str:
+    """A docstring up to its first section, such as "Attributes:"."""
+    text = inspect.cleandoc(docstring)
+    return re.split(r"^\w+:$", text, maxsplit=1, flags=re.MULTILINE)[0].strip()
+
+
+def attribute_texts(source: type) -> dict[str, str]:
+    """Name of an attribute -> its text in the docstring of the class or of one of its bases."""
+    return {
+        name: text
+        for cls in reversed(source.__mro__)
+        for names, text in _attributes(inspect.cleandoc(cls.__doc__ or ""))
+        for name in names.split(", ")
+    }
+
+
+def _attributes(doc: str) -> Iterator[tuple[str, str]]:
+    _, _, rest = doc.partition("\nAttributes:\n")
+    section = re.split(r"^\S", rest, maxsplit=1, flags=re.MULTILINE)[0]
+    for entry in re.split(r"^    (?=\w)", section, flags=re.MULTILINE)[1:]:
+        names, _, text = entry.partition(":")
+        yield names, " ".join(text.split())

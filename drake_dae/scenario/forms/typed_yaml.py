@@ -1,7 +1,7 @@
 """YAML as plain data and back, where a tag `!Sphere` is an entry "_tag" as Drake has it."""
 
 import re
-from collections.abc import Container
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import yaml  # type: ignore[import-untyped]
@@ -125,10 +125,21 @@ def load_yaml(text: str, name: str) -> Any:
         ScenarioError: The YAML is broken, or a key is not text or occurs twice; the message has the
             line.
     """
+    return load_lines(text, name)[0]
+
+
+def load_lines(text: str, name: str) -> tuple[Any, Callable[[str], int | None]]:
+    """What `load_yaml` returns, and the function from a dotted key to its line.
+
+    The line is that of the deepest key in the text, and None for a key that the text has not.
+    """
     if len(text) > MOST_TEXT:
         raise ScenarioError((name, f"more than {MOST_TEXT} characters, got {len(text)}"))
+    loader = None
     try:
-        return yaml.load(text, Loader=_Loader)
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        data = None if node is None else loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
         what = ", ".join(part for part in (error.context, error.problem) if part)
@@ -140,6 +151,29 @@ def load_yaml(text: str, name: str) -> Any:
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
         # Of PyYAML, where a tag such as !!int or !!timestamp has a value that is none.
         raise ScenarioError((name, "a tag of YAML (!!...) does not fit its value")) from None
+    finally:
+        if loader is not None:
+            loader.dispose()
+    return data, lambda key: None if node is None else _line_of(node, key)
+
+
+def _line_of(node: yaml.Node, key: str) -> int | None:
+    """The line of a dotted key below a node; names may have dots themselves."""
+    line = node.start_mark.line + 1
+    while key:
+        if isinstance(node, yaml.SequenceNode):
+            entries = {str(index): (part, part) for index, part in enumerate(node.value)}
+        elif isinstance(node, yaml.MappingNode):
+            entries = {name.value: (name, part) for name, part in node.value}
+        else:
+            return None
+        found = [name for name in entries if f"{key}.".startswith(f"{name}.")]
+        if not found:
+            return None
+        name = max(found, key=len)
+        start, node = entries[name]
+        line, key = start.start_mark.line + 1, key[len(name) + 1 :]
+    return int(line)
 
 
 def dump_yaml(data: Any, on_one_line: bool = False) -> str:
@@ -148,68 +182,3 @@ def dump_yaml(data: Any, on_one_line: bool = False) -> str:
     return str(
         yaml.dump(data, Dumper=_Dumper, allow_unicode=True, default_flow_style=flow, width=width)
     )
-
-
-def set_entry(data: Any, setting: str, names: Container[str] = ()) -> None:
-    """Sets an entry of plain data by a text "a.b.0.c=value".
-
-    Args:
-        data: Lists and dictionaries; changed in place.
-        setting: A dotted key, "=", and a value in YAML.
-        names: Dotted keys of dictionaries whose names may have dots themselves; "*" is any entry
-            of a list.
-
-    Raises:
-        ScenarioError: There is no such entry, or the YAML is broken.
-    """
-    key, separator, text = setting.partition("=")
-    if not separator or not all(key.split(".")):
-        raise ScenarioError((f"--set {setting}", "expected key=value, for example duration=5"))
-    put_entry(data, key, load_yaml(text, key), names)
-
-
-def put_entry(data: Any, key: str, value: Any, names: Container[str] = ()) -> None:
-    """Sets an entry of plain data at a dotted key, "a.b.0.c".
-
-    Args:
-        data: Lists and dictionaries; changed in place.
-        key: The key.
-        value: Plain data.
-        names: As for `set_entry`.
-
-    Raises:
-        ScenarioError: There is no such entry.
-    """
-    parts = key.split(".")
-    if not all(parts):
-        raise ScenarioError((brief(key), "expected a dotted key, for example start.errors.tool.z"))
-    path = form = ""
-    while True:
-        count = _name_length(data, parts) if form in names else 1
-        part, rest = ".".join(parts[:count]), parts[count:]
-        slot: str | int = part
-        if isinstance(data, list):
-            if not (part.isascii() and part.isdecimal() and int(part) < len(data)):
-                indices = ", ".join(map(str, range(len(data)))) or "none"
-                raise ScenarioError((path, f"no entry '{part}'; entries: {indices}"))
-            slot = int(part)
-        elif not isinstance(data, dict):
-            raise ScenarioError((path, f"{brief(data)} has no entry '{part}'"))
-        if not rest:
-            data[slot] = value
-            return
-        path = f"{path}.{part}" if path else part
-        kind = part if isinstance(data, dict) else "*"
-        form = f"{form}.{kind}" if form else kind
-        if isinstance(data, dict):
-            data.setdefault(slot, {})
-        data, parts = data[slot], rest
-
-
-def _name_length(data: Any, parts: list[str]) -> int:
-    """The number of parts of a dotted key that form a name with dots."""
-    for count in range(len(parts), 0, -1) if isinstance(data, dict) else ():
-        name = ".".join(parts[:count])
-        if name in data and (count == len(parts) or isinstance(data[name], (dict, list))):
-            return count
-    return len(parts)

@@ -1,81 +1,92 @@
-"""Values in plain data without a dataclass: numbers, file names, vectors."""
+"""Values in plain data without a dataclass: numbers, vectors, file names."""
 
 from pathlib import Path
 from sys import float_info
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import pydantic
 
-from drake_dae.arrays import brief
-from drake_dae.scenario.forms.typed_yaml import TAG
-
-
-def shown(data: Any) -> str:
-    """A value as the user wrote it, but short."""
-    if data is None:
-        return "nothing"
-    if isinstance(data, dict) and TAG in data:
-        return str(data[TAG])
-    text = brief(data)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _numbers(value: Any) -> Any:
-    """A number, a list of numbers or a list of rows; a list of one number is that number."""
-    rows = value if isinstance(value, list) else [value]
-    is_matrix = bool(rows) and all(isinstance(row, list) for row in rows)
-    entries = [entry for row in rows for entry in row] if is_matrix else rows
-    for entry in entries:
-        if type(entry) not in (int, float) or not abs(entry) <= float_info.max:
-            wanted = "a number, a list of numbers, or a matrix as a list of rows"
-            raise ValueError(f"expected {wanted}, got {shown(entry)}")
-    if is_matrix and len({len(row) for row in rows}) > 1:
-        raise ValueError(f"the rows of {shown(value)} have different lengths")
-    if not entries:
-        raise ValueError("empty; give one number, or one for each")
-    numbers = np.array(value, dtype=float)
-    return numbers.tolist() if numbers.size > 1 else numbers.item()
-
+from drake_dae.scenario.forms.forms import Value
 
 _NUMBER = {"type": "number"}
 _LIST = {"type": "array", "items": _NUMBER}
 
-Numbers = Annotated[
-    Any,
-    pydantic.PlainValidator(_numbers),
-    pydantic.PlainSerializer(lambda value: np.asarray(value, dtype=float).tolist()),
-    pydantic.WithJsonSchema({"anyOf": [_NUMBER, _LIST, {"type": "array", "items": _LIST}]}),
-]
-"""A number, a list of numbers, or a matrix row by row."""
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= float_info.max
 
 
-def _file(value: Any, info: pydantic.ValidationInfo) -> Path:
-    """A file; relative paths are in the reader's folder."""
-    if not isinstance(value, (str, Path)) or not str(value):
-        raise ValueError(f"expected the name of a file, got {shown(value)}")
+def _vector(value: Any, size: int) -> Any:
+    right = isinstance(value, (list, tuple)) and all(map(_is_number, value))
+    return tuple(map(float, value)) if right and len(value) == (size or len(value)) else None
+
+
+def _numbers(value: Any) -> Any:
+    rows = value if isinstance(value, list) else [value]
+    is_matrix = bool(rows) and all(isinstance(row, list) for row in rows)
+    entries = [entry for row in rows for entry in row] if is_matrix else rows
+    if not entries or not all(map(_is_number, entries)):
+        return None
+    if is_matrix and len({len(row) for row in rows}) > 1:
+        return None
+    numbers = np.array(value, dtype=float)
+    return numbers.tolist() if numbers.size > 1 else numbers.item()
+
+
+def _number_or_list(value: Any) -> Any:
+    entries = value if isinstance(value, list) else [value]
+    return value if all(map(_is_number, entries)) else None
+
+
+def _interval(value: Any) -> Any:
+    is_pair = isinstance(value, (list, tuple)) and len(value) == 2
+    return tuple(value) if is_pair and all(_number_or_list(v) is not None for v in value) else None
+
+
+def in_folder(value: Any, folder: Path) -> str | None:
+    """The path of a file, relative to a folder; None if it is no name of a file."""
+    if not isinstance(value, (str, Path)) or not str(value) or "\0" in str(value):
+        return None
     try:
-        return (info.context or Path()) / value
-    except ValueError:  # A null byte.
-        raise ValueError(f"expected the name of a file, got {shown(value)}") from None
+        return str((folder / value).resolve())
+    except (OSError, RuntimeError):  # A link that leads to itself; no working directory.
+        return None
 
 
-FileName = Annotated[
-    Any,
-    pydantic.PlainValidator(_file),
-    pydantic.PlainSerializer(str),
-    pydantic.WithJsonSchema({"type": "string"}),
-]
-"""The name of a file."""
+NUMBERS = Value(
+    "a number, a list of numbers, or a matrix as a list of rows of one length",
+    {"anyOf": [_NUMBER, _LIST, {"type": "array", "items": _LIST}]},
+    lambda value, folder: _numbers(value),
+)
+ROW = Value("a list of numbers", _LIST, lambda value, folder: _vector(value, 0))
 
-Row = Annotated[tuple[float, ...], pydantic.Strict(False)]
-"""A list of numbers."""
 
-Pair = Annotated[Row, pydantic.Field(min_length=2, max_length=2)]
-"""Two numbers."""
+def _fixed(size: int) -> Value:
+    schema = {**_LIST, "minItems": size, "maxItems": size}
+    return Value(f"{size} numbers", schema, lambda value, folder: _vector(value, size))
 
-Triple = Annotated[Row, pydantic.Field(min_length=3, max_length=3)]
-"""Three numbers."""
 
-Interval = Annotated[tuple[float | list[float], float | list[float]], pydantic.Strict(False)]
-"""A lowest and a highest value, each a number or a list of numbers."""
+PAIR, TRIPLE = _fixed(2), _fixed(3)
+NUMBER_OR_LIST = Value(
+    "a number or a list of numbers",
+    {"anyOf": [_NUMBER, _LIST]},
+    lambda value, folder: _number_or_list(value),
+)
+INTERVAL = Value(
+    "a lowest and a highest value, each a number or a list of numbers",
+    {"type": "array", "minItems": 2, "maxItems": 2, "items": {"anyOf": [_NUMBER, _LIST]}},
+    lambda value, folder: _interval(value),
+)
+FILE = Value("the name of a file", {"type": "string"}, in_folder)
+
+
+def _names(value: Any, folder: Path) -> Any:
+    names = value if isinstance(value, list) else [value]
+    return value if all(isinstance(name, str) for name in names) else None
+
+
+NAMES = Value(
+    "a name or a list of names",
+    {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]},
+    _names,
+)

@@ -17,8 +17,7 @@ from drake_dae.robots.links.links import Links
 from drake_dae.robots.outputs import PointCoordinates
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.robots.surfaces.surfaces import Plane
-from drake_dae.scenario.feasibility.feasibility import complete_and_examine
-from drake_dae.scenario.feasibility.report import Feasibility
+from drake_dae.scenario.judging import Feasibility, complete_and_examine
 from drake_dae.scenario.new.places import find_places
 from drake_dae.scenario.new.robot import NewRobot, new_robot
 from drake_dae.scenario.new.task import NewTask, SurfaceKind, circle

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pydrake.multibody.parsing import GetScopedFrameByName, PackageMap
+from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     Joint,
@@ -21,25 +21,21 @@ from pydrake.multibody.tree import (
 
 from drake_dae.analysis.tables import count_of
 from drake_dae.arrays import unknown_name
-from drake_dae.errors import ModelError, RobotFileWarning
+from drake_dae.errors import ModelError, RobotFileWarning, ScenarioError
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.new.far_end import far_end
 from drake_dae.scenario.new.tree import Tree
 from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.loops import actuators_of, closing_joints
-from drake_dae.scenario.robot_file.packages import find_packages
-from drake_dae.scenario.robot_file.reading import read_robot
-from drake_dae.scenario.robot_file.robot import LeftOut, Robot, RobotPlacement
+from drake_dae.scenario.robot_file.reading import parts_to_leave_out, read_robot, unknown_packages
+from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 
 _NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
 """Names of grippers and wheels: such joints are locked, if others are left."""
 
 # A hand may be the link that the last joint of an arm turns, a finger not.
 _FINGER = re.compile(r"finger|thumb|jaw|knuckle|inner|outer", re.IGNORECASE)
-
-_LEFT_OUT: tuple[LeftOut, ...] = ("joint_friction", "inertia", "empty_limits")
-"""Parts that must be left out of a file are found by trying."""
 
 _TOOLS = [
     re.compile(word, re.IGNORECASE)
@@ -111,31 +107,15 @@ def new_robot(file: str, tip: str = "", point: Vector = (0.0, 0.0, 0.0)) -> NewR
 
 def _read(file: str) -> tuple[Tree, Robot]:
     """The robot with what must be left out of its file, and its bodies and joints."""
-    everything = Robot(file, _folders_above(file), actuators="all", leave_out=list(_LEFT_OUT))
-
-    def left_out(*kinds: LeftOut) -> Robot:
-        return replace(everything, leave_out=list(kinds))
-
+    robot = Robot(file, _folders_above(file), actuators="all")
     with warnings.catch_warnings():  # The scenario's own robot reports it.
         warnings.simplefilter("ignore", RobotFileWarning)
-        try:
-            tree = Tree(_finished(left_out()))
-            if tree.works or not tree.empty:
-                return tree, left_out()
-            return Tree(_finished(left_out("empty_limits"))), left_out("empty_limits")
-        except ModelError as error:
-            problem = error
-        try:
-            _finished(everything)
-        except ModelError:
-            raise problem from None
-        needed: list[LeftOut] = []
-        for kind in _LEFT_OUT:
-            try:
-                _finished(left_out(*(other for other in _LEFT_OUT if other != kind)))
-            except ModelError:
-                needed.append(kind)
-        return Tree(_finished(left_out(*needed))), left_out(*needed)
+        robot = replace(robot, leave_out=parts_to_leave_out(robot))
+        tree = Tree(_finished(robot))
+        if tree.works or not tree.empty:
+            return tree, robot
+        robot = replace(robot, leave_out=[*robot.leave_out, "empty_limits"])
+        return Tree(_finished(robot)), robot
 
 
 def _finished(robot: Robot) -> MultibodyPlant:
@@ -159,9 +139,11 @@ def _finished(robot: Robot) -> MultibodyPlant:
 def _folders_above(file: str) -> dict[str, str]:
     """Unknown packages -> folders of that name above the file or beside it."""
     folders: dict[str, str] = {}
-    with suppress(RuntimeError, ValueError, OSError):  # The reader of the file reports it.
+    with suppress(
+        ModelError, ScenarioError, OSError, RuntimeError
+    ):  # The reader of the file reports it.
         above = list(Path(file).resolve().parents)
-        for name in find_packages(file, PackageMap())[1]:
+        for name in unknown_packages(Robot(file)):
             beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
             candidates = [*(folder for folder in above if folder.name == name), *beside]
             folders.update({name: str(candidates[0])} if candidates else {})

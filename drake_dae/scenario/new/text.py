@@ -22,20 +22,6 @@ _PATH = (TAG, "center", "radius", "period", "offset", "amplitudes", "frequencies
 
 _WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 
-_KEYS = (
-    "description",
-    "robot",
-    "constraints",
-    "outputs",
-    "tool_axis",
-    "law",
-    "references",
-    "start",
-    "duration",
-    "integrator",
-)
-"""The keys of the text."""
-
 _WIDTH = 100
 
 _WHOLE: Any = {"break_long_words": False, "break_on_hyphens": False}
@@ -59,7 +45,7 @@ def scenario_text(
         task: Its task.
         folder: The folder in which it will be saved, if it is known.
     """
-    data = scenario_data(scenario, _KEYS)
+    data = {"duration": scenario.duration, **scenario_data(scenario)}
     if folder is not None:
         file, saved = Path(data["robot"]["file"]), os.path.realpath(folder)
         if file.is_relative_to(saved):
@@ -75,8 +61,7 @@ def _lines(data: Mapping[str, Any], robot: NewRobot, task: NewTask) -> Iterator[
     yield "robot:"
     yield f"  file: {_flow(data['robot']['file'])}"
     for key in ("packages", "base", "locked", "actuators", "leave_out"):
-        value = data["robot"][key]
-        if value:
+        if value := data["robot"].get(key):
             yield from _with_reason(f"  {key}: {_flow(_short(value))}", robot.remarks[key])
     yield "constraints:"
     yield f"- name: {_flow(task.name)}"
@@ -93,7 +78,7 @@ def _lines(data: Mapping[str, Any], robot: NewRobot, task: NewTask) -> Iterator[
     yield from _with_reason("outputs:", singular) if singular else ["outputs:"]
     for output in data["outputs"]:
         yield from _with_reason(f"- {_flow(_short(output))}", _WHY[output[TAG]])
-    if data["tool_axis"] != "normal":
+    if "tool_axis" in data:
         fixed = "to keep it normal to a surface that bends would hinder the way along"
         yield from _with_reason(f"tool_axis: {data['tool_axis']}", fixed)
     (pole,) = data["law"]["gains"]["all"]

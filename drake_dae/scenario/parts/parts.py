@@ -1,8 +1,7 @@
 """Parts of a scenario without a class in the library: sensors, estimator, law, start."""
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,8 +10,6 @@ from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots.constraints.friction import FrictionCone
-from drake_dae.scenario.forms.forms import Choice, Form
-from drake_dae.scenario.forms.values import Numbers
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor
@@ -36,9 +33,9 @@ class MeasuredForce:
 
     time_constant: float = 0.0
     sample_period: float = 0.0
-    bias: Numbers = 0.0
-    noise_deviation: Numbers = 0.0
-    drift: Numbers = 0.0
+    bias: ArrayLike = 0.0
+    noise_deviation: ArrayLike = 0.0
+    drift: ArrayLike = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -60,8 +57,8 @@ class Sensors:
         force: The measurement of the constraint force, in place of that of the law's model.
     """
 
-    encoders: Annotated[Encoders, Form({ArrayLike: Numbers})] | None = None
-    force: Annotated[MeasuredForce, Form()] | None = None
+    encoders: Encoders | None = None
+    force: MeasuredForce | None = None
 
     @property
     def force_noise(self) -> FloatArray:
@@ -108,6 +105,14 @@ class Estimator(Observing):
             super().__post_init__()
 
 
+class Gains(ABC):
+    """Gains of the tracking law, as they are written."""
+
+    @abstractmethod
+    def design(self) -> GainDesign:
+        """The design of the gains."""
+
+
 @dataclass(frozen=True)
 class PerOutput:
     """Numbers for all outputs, or for each output.
@@ -126,7 +131,7 @@ class PerOutput:
 
 
 @dataclass(frozen=True)
-class Poles(PerOutput):
+class Poles(PerOutput, Gains):
     """Real poles of the errors, one number or mu_i numbers per output; see also Coefficients.
 
     Attributes:
@@ -135,12 +140,11 @@ class Poles(PerOutput):
     """
 
     def design(self) -> GainDesign:
-        """The design of the gains."""
         return poles(self.all or self.outputs)
 
 
 @dataclass(frozen=True)
-class Coefficients(PerOutput):
+class Coefficients(PerOutput, Gains):
     """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first; in 1/s^mu_i, ..., 1/s.
 
     Attributes:
@@ -150,12 +154,11 @@ class Coefficients(PerOutput):
     """
 
     def design(self) -> GainDesign:
-        """The design of the gains."""
         return gain_coefficients(self.all or self.outputs)
 
 
 @dataclass(frozen=True)
-class Matrices:
+class Matrices(Gains):
     """Gains that couple outputs of equal degree; see `gain_matrices`.
 
     Attributes:
@@ -171,11 +174,7 @@ class Matrices:
                 raise GainError(f"groups: the rows of {matrix} have different lengths")
 
     def design(self) -> GainDesign:
-        """The design of the gains."""
         return gain_matrices(*self.groups)
-
-
-Gains = Annotated[Poles | Coefficients | Matrices, Choice()]
 
 
 @dataclass(frozen=True)
@@ -211,10 +210,10 @@ class Law:
     integral: list[str] | None = None
     constraint_damping: Gains | None = None
     contact_stiffness: float | None = None
-    force_gain: Numbers = 0.0
+    force_gain: ArrayLike = 0.0
     control_weights: list[float] = field(default_factory=list)
     largest_roughness: float | None = None
-    largest_errors: Annotated[LargestErrors, Form()] | None = None
+    largest_errors: LargestErrors | None = None
 
 
 @dataclass(frozen=True)
@@ -231,9 +230,7 @@ class Judgement:
     """
 
     tolerances: dict[str, float] = field(default_factory=dict)
-    friction_cones: list[Annotated[FrictionCone, Form({Sequence[str]: list[str]})]] = field(
-        default_factory=list
-    )
+    friction_cones: list[FrictionCone] = field(default_factory=list)
     may_diverge: bool = False
 
 

@@ -1,9 +1,8 @@
 """Forms whose data in a scenario differ from the fields of the library's classes."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -14,31 +13,11 @@ from drake_dae.robots import constraints as contact
 from drake_dae.robots import outputs
 from drake_dae.scenario.robot_file.robot import Pose
 
-T = TypeVar("T")
-
-
-class WrittenForm(ABC, Generic[T]):
-    """A form that makes an object of another class of the library."""
-
-    @abstractmethod
-    def make(self, constraints: Sequence[contact.Constraint]) -> T:
-        """Makes the library's object.
-
-        Args:
-            constraints: The constraints of the scenario to which the form may refer.
-
-        Raises:
-            ModelError: Something does not fit.
-        """
-
-
-def make(form: T | WrittenForm[T], constraints: Sequence[contact.Constraint]) -> T:
-    """Makes the library's object of a form; an object of the library is returned as it is."""
-    return form.make(constraints) if isinstance(form, WrittenForm) else form
+T = TypeVar("T", contact.Constraint, outputs.PositionOutput)
 
 
 @dataclass(frozen=True)
-class WeldedFramesForm(WrittenForm[contact.Constraint]):
+class WeldedFramesForm:
     """Frame B has a fixed pose in frame A, given by angles.
 
     Attributes:
@@ -54,13 +33,14 @@ class WeldedFramesForm(WrittenForm[contact.Constraint]):
     name: str = "weld"
 
     def make(self, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+        """The constraint."""
         rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
         pose = RigidTransform(rotation, self.pose.translation)
         return contact.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
 
 
 @dataclass(frozen=True)
-class SurfaceCoordinatesForm(WrittenForm[outputs.PositionOutput]):
+class SurfaceCoordinatesForm:
     """The coordinates along a constraint.
 
     Attributes:
@@ -70,11 +50,12 @@ class SurfaceCoordinatesForm(WrittenForm[outputs.PositionOutput]):
     constraint: str
 
     def make(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+        """The output."""
         return outputs.SurfaceCoordinates(_named(self.constraint, constraints))
 
 
 @dataclass(frozen=True)
-class TiltFromNormalForm(WrittenForm[outputs.PositionOutput]):
+class TiltFromNormalForm:
     """The tilt of a tool's axis from the surface normal at its contact.
 
     Attributes:
@@ -88,8 +69,25 @@ class TiltFromNormalForm(WrittenForm[outputs.PositionOutput]):
     components: str = ""
 
     def make(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+        """The output."""
         contact = _named(self.constraint, constraints)
         return outputs.TiltFromNormal(contact, self.axis, self.components)
+
+
+WrittenConstraint = contact.Constraint | WeldedFramesForm
+WrittenOutput = outputs.PositionOutput | SurfaceCoordinatesForm | TiltFromNormalForm
+
+
+def make(
+    form: T | WeldedFramesForm | SurfaceCoordinatesForm | TiltFromNormalForm,
+    constraints: Sequence[contact.Constraint],
+) -> T:
+    """The library's object of a form that may name constraints; such an object as it is.
+
+    Raises:
+        ModelError: Something does not fit.
+    """
+    return cast(T, form.make(constraints) if hasattr(form, "make") else form)
 
 
 def _named(name: str, constraints: Sequence[contact.Constraint]) -> contact.Constraint:

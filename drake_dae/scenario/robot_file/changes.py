@@ -1,8 +1,7 @@
 """The changes that a scenario makes to its robot: base, locked joints, actuators, payloads."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -15,46 +14,55 @@ from pydrake.multibody.tree import (
     PrismaticJoint,
     RevoluteJoint,
     RpyFloatingJoint,
+    SpatialInertia,
+    UnitInertia,
     WeldJoint,
 )
 
 from drake_dae.arrays import unknown_name
-from drake_dae.errors import DrakeDaeError, ModelError
-from drake_dae.robots.constraints.plant_constraints import Coupling, couplings_of
-from drake_dae.robots.links.frames import joint_names, unique_names
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.plant_constraints import Coupling
+from drake_dae.robots.links.frames import frame_named, joint_names, unique_names
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.robot_file.efforts import Efforts, limits_of
 from drake_dae.scenario.robot_file.loops import actuators_of, joints_of
-from drake_dae.scenario.robot_file.payloads import add_payloads
-from drake_dae.scenario.robot_file.reading import read_robot
-from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
+from drake_dae.scenario.robot_file.mending import Mender
+from drake_dae.scenario.robot_file.mjcf import ARMATURE
+from drake_dae.scenario.robot_file.reading import drake_errors
+from drake_dae.scenario.robot_file.robot import Payload, Robot, RobotPlacement
+
+T = TypeVar("T")
 
 
-def change_robot(robot: Robot, plant: MultibodyPlant, efforts: Efforts) -> None:
+def change_robot(robot: Robot, plant: MultibodyPlant, mender: Mender) -> None:
     """Applies the changes that a scenario makes to the robot of its file.
 
     Args:
         robot: The key `robot` of the scenario.
         plant: The robot of that file, not finalized.
-        efforts: The effort limits of the file, for new actuators.
+        mender: What the file says besides, for new actuators and locked joints.
 
     Raises:
         ScenarioError: A change does not fit the robot; the message names its key.
     """
-    couplings: Sequence[Coupling] = ()
-    if plant.num_constraints() > 0 and (robot.locked or robot.actuators == "all"):
-        second, _ = read_robot(robot)  # Only a finalized plant has its couplings.
-        finalize(second)
-        couplings = couplings_of(second)
-    with _drake_errors():
+    couplings = _couplings(plant, mender)
+    with drake_errors():
         if robot.base is not None:
-            weld_base(robot.base, plant)
+            _weld_base(robot.base, plant)
         if robot.locked:
-            lock_joints(robot.locked, plant, couplings)
-        add_free_joints(robot.free, plant)
+            _lock_joints(robot.locked, plant, couplings)
+        _add_free_joints(robot.free, plant)
         if robot.actuators is not None:
-            drive_joints(robot.actuators, plant, couplings, limits_of(plant, efforts))
+            _drive_joints(robot.actuators, plant, couplings, mender)
         add_payloads("robot.payloads", robot.payloads, plant)
+    driven = {actuator.joint().index() for actuator in actuators_of(plant)}
+    is_left_out = ARMATURE in robot.leave_out
+    for name, armature in _of_joints(plant, mender.armatures).items():
+        if not is_left_out and joint_names(plant)[name].index() not in driven:
+            raise ModelError(
+                f"joint '{name}' has an armature of {armature:g} and no motor, and Drake gives "
+                "only motors one; name it under robot.actuators, or write leave_out: "
+                "[joint/armature] under robot"
+            )
 
 
 def finalize(plant: MultibodyPlant) -> None:
@@ -63,52 +71,58 @@ def finalize(plant: MultibodyPlant) -> None:
     Raises:
         ModelError: Drake cannot finalize it.
     """
-    with _drake_errors():
+    with drake_errors():
         plant.Finalize()
 
 
-@contextmanager
-def _drake_errors() -> Iterator[None]:
-    """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
-    try:
-        yield
-    except DrakeDaeError:
-        raise
-    except (RuntimeError, ValueError, SystemExit) as error:
-        raise ModelError(str(error)) from None
+def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -> None:
+    """Adds the payloads of a key of the scenario to a plant that is not finalized.
+
+    Raises:
+        ScenarioError: There is no such frame of the robot, or another body has the name.
+    """
+    for index, payload in enumerate(payloads):
+        with at(f"{key}.{index}"):
+            frame = frame_named(plant, payload.frame)
+            if frame.body() == plant.world_body():
+                raise ModelError(
+                    f"'{payload.frame}' is a frame of the world, and a payload there moves "
+                    "nothing; name a frame of the robot"
+                )
+            if plant.HasBodyNamed(payload.name):
+                raise ModelError(
+                    f"a payload needs a name of its own; a body '{payload.name}' is there"
+                )
+            inertia = SpatialInertia(payload.mass, [0.0, 0.0, 0.0], UnitInertia(0.0, 0.0, 0.0))
+            body = plant.AddRigidBody(payload.name, frame.model_instance(), inertia)
+            plant.WeldFrames(frame, body.body_frame(), RigidTransform(list(payload.point)))
 
 
 @at("robot.base.weld")
-def weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
-    """Welds a frame of a body without a joint to the world.
-
-    Raises:
-        ScenarioError: There is no such frame, or its body has a joint.
-    """
+def _weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
+    """Welds a frame of a body without a joint to the world."""
+    attached = _joints_to_parents(plant)
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    free = unique_names(plant, [body for body in bodies if body.index() not in attached])
     try:
         frame = GetScopedFrameByName(plant, base.weld)
     except RuntimeError:
-        free = _free_bodies(plant)
         raise ModelError(unknown_name("free body or frame on it", base.weld, free)) from None
     body = frame.body()
     if body.index() == plant.world_body().index():
         raise ModelError("the world needs no base; name a frame of the robot")
-    if joint := _joints_to_parents(plant).get(body.index()):
+    if joint := attached.get(body.index()):
         raise ModelError(
             f"body '{body.name()}' is attached already, by joint '{joint.name()}'; unattached "
-            f"bodies: {', '.join(_free_bodies(plant)) or 'none'}"
+            f"bodies: {', '.join(free) or 'none'}"
         )
     rotation = RollPitchYaw(np.deg2rad(base.pose.rpy_deg))
     plant.WeldFrames(plant.world_frame(), frame, RigidTransform(rotation, base.pose.translation))
 
 
 @at("robot.free")
-def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
-    """Adds floating joints in roll, pitch and yaw to bodies without a joint.
-
-    Raises:
-        ScenarioError: There is no such body, or it has a joint.
-    """
+def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
+    """Adds floating joints in roll, pitch and yaw to bodies without a joint."""
     for name in bodies:
         try:
             body = GetScopedFrameByName(plant, name).body()
@@ -120,29 +134,17 @@ def add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
 
 
 @at("robot.locked")
-def lock_joints(
+def _lock_joints(
     locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[Coupling]
 ) -> None:
-    """Replaces joints by welds at given positions.
+    """Replaces joints, and those that are coupled to them, by welds at given positions.
 
     Drake supports locked joints only in discrete time. The weld has the constant pose X_FM(q) of
     the joint, from its frame on the parent to its frame on the child. The actuator, the damping and
     the rotor of the joint are removed.
-
-    Joints that are coupled to a locked one by q_f = ratio q_l + offset are locked as well.
-
-    Args:
-        locked: Name -> position, in rad or m.
-        plant: The robot, not finalized; changed.
-        couplings: The couplings of the plant.
-
-    Raises:
-        ScenarioError: There is no such joint, its position is outside of its limits or
-            contradicts a coupling, or the file has constraints other than couplings.
     """
     joints = _movable(plant)
-    positions = dict(locked)
-    _lock_coupled(positions, couplings)
+    positions = _with_coupled(locked, couplings)
     for name, value in positions.items():
         joint = _named(name, joints)
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
@@ -153,28 +155,30 @@ def lock_joints(
             raise ModelError(
                 f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
             )
-    with _without_constraints(plant, couplings):
-        for name, value in positions.items():
-            _weld_joint(joints[name], value, plant)
-
-
-@contextmanager
-def _without_constraints(plant: MultibodyPlant, couplings: Sequence[Coupling]) -> Iterator[None]:
-    """Removes the constraints of a plant, and restores those between remaining joints.
-
-    Drake removes joints only from plants without constraints.
-
-    Raises:
-        ModelError: The plant has constraints other than these couplings.
-    """
     if plant.num_constraints() > len(couplings):
         raise ModelError(
             "the file has constraints other than mimic joints, which Drake loses when a joint is "
-            "locked; take them out of it, and write them under constraints"
+            "locked; name them under robot.leave_out, and write them under constraints"
         )
+    # Drake removes joints only from plants without constraints.
     for key in plant.GetConstraintIds():
         plant.RemoveConstraint(key)
-    yield
+    for name, value in positions.items():
+        joint = joints[name]
+        inboard, outboard = joint.frame_on_parent(), joint.frame_on_child()
+        if isinstance(joint, PrismaticJoint):
+            pose = RigidTransform(value * joint.translation_axis())
+        else:
+            pose = RigidTransform(AngleAxis(value, joint.revolute_axis()), np.zeros(3))
+        for actuator in actuators_of(plant):
+            if actuator.joint() is joint:
+                plant.RemoveJointActuator(actuator)
+        own_name = joint.name()
+        try:
+            plant.RemoveJoint(joint)
+        except RuntimeError as error:
+            raise ModelError(f"'{name}' cannot be locked: {error}") from None
+        plant.AddJoint(WeldJoint(own_name, inboard, outboard, pose))
     joints = _movable(plant)
     for coupling in couplings:
         if coupling.follower in joints:
@@ -182,8 +186,9 @@ def _without_constraints(plant: MultibodyPlant, couplings: Sequence[Coupling]) -
             plant.AddCouplerConstraint(*pair, coupling.ratio, coupling.offset)
 
 
-def _lock_coupled(positions: dict[str, float], couplings: Sequence[Coupling]) -> None:
-    """Adds the positions of joints that are coupled to locked ones."""
+def _with_coupled(locked: Mapping[str, float], couplings: Sequence[Coupling]) -> dict[str, float]:
+    """The positions of locked joints, and of those that are coupled to them."""
+    positions = dict(locked)
     for _ in couplings:  # As often as the longest chain needs.
         for coupling in couplings:
             leader, follower = coupling.leader, coupling.follower
@@ -197,31 +202,15 @@ def _lock_coupled(positions: dict[str, float], couplings: Sequence[Coupling]) ->
                     )
             elif follower in positions and coupling.ratio != 0.0:
                 positions[leader] = (positions[follower] - coupling.offset) / coupling.ratio
-
-
-def _weld_joint(joint: Joint, position: float, plant: MultibodyPlant) -> None:
-    """Replaces a joint with one position by a weld."""
-    name, inboard, outboard = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
-    if isinstance(joint, PrismaticJoint):
-        pose = RigidTransform(position * joint.translation_axis())
-    else:
-        pose = RigidTransform(AngleAxis(position, joint.revolute_axis()), np.zeros(3))
-    for actuator in actuators_of(plant):
-        if actuator.joint() is joint:
-            plant.RemoveJointActuator(actuator)
-    try:
-        plant.RemoveJoint(joint)
-    except RuntimeError as error:
-        raise ModelError(f"'{name}' cannot be locked: {error}") from None
-    plant.AddJoint(WeldJoint(name, inboard, outboard, pose))
+    return positions
 
 
 @at("robot.actuators")
-def drive_joints(
-    driven: Literal["all"] | Sequence[str] | Mapping[str, float | None],
+def _drive_joints(
+    driven: str | Sequence[str] | Mapping[str, float | None],
     plant: MultibodyPlant,
     couplings: Sequence[Coupling],
-    efforts: Mapping[str, float],
+    mender: Mender,
 ) -> None:
     """Adds actuators to the joints that a scenario names, and removes those of all other joints.
 
@@ -232,31 +221,30 @@ def drive_joints(
             prismatic joints that mimic no other.
         plant: The robot, not finalized; changed.
         couplings: The couplings of the plant.
-        efforts: Name -> effort limit of the file, for new actuators without a limit.
-
-    Raises:
-        ScenarioError: There is no such joint, or it has several positions.
+        mender: It has the limits and rotors of the file.
     """
     joints = _movable(plant)
     if driven == "all":
         followers = {coupling.follower for coupling in couplings}
         driven = [name for name in joints if name not in followers]
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
+    efforts = _of_joints(plant, mender.efforts)
+    armatures = _of_joints(plant, mender.armatures)
     names = {_named(name, joints).index(): name for name in limits}
     with_actuator = set()
     for actuator in actuators_of(plant):
-        driven_joint = names.get(actuator.joint().index())
-        if driven_joint is None:
+        name = names.get(actuator.joint().index())
+        if name is None:
             plant.RemoveJointActuator(actuator)
             continue
-        with_actuator.add(driven_joint)
-        if (limit := limits[driven_joint]) is not None:
+        with_actuator.add(name)
+        if (limit := limits[name]) is not None:
             actuator.set_effort_limit(limit)
     for name, limit in limits.items():
         if name not in with_actuator:
-            joint = joints[name]
             effort = efforts.get(name, np.inf) if limit is None else limit
-            plant.AddJointActuator(joint.name(), joint, effort)
+            actuator = plant.AddJointActuator(joints[name].name(), joints[name], effort)
+            actuator.set_default_rotor_inertia(armatures.get(name, 0.0))
 
 
 def _named(name: str, joints: Mapping[str, Joint]) -> Joint:
@@ -267,20 +255,33 @@ def _named(name: str, joints: Mapping[str, Joint]) -> Joint:
 
 def _movable(plant: MultibodyPlant) -> dict[str, Joint]:
     """Name -> joint, for revolute and prismatic joints."""
-    return {
-        name: joint
-        for name, joint in joint_names(plant).items()
-        if isinstance(joint, RevoluteJoint | PrismaticJoint)
-    }
+    kinds = RevoluteJoint | PrismaticJoint
+    return {name: joint for name, joint in joint_names(plant).items() if isinstance(joint, kinds)}
+
+
+def _of_joints(plant: MultibodyPlant, values: Mapping[tuple[str, str], T]) -> dict[str, T]:
+    """What is known of joints by (model, joint), by their names in a scenario."""
+    found = {}
+    for name, joint in joint_names(plant).items():
+        for model in ("", plant.GetModelInstanceName(joint.model_instance())):
+            if (model, joint.name()) in values:
+                found[name] = values[model, joint.name()]
+    return found
+
+
+def _couplings(plant: MultibodyPlant, mender: Mender) -> list[Coupling]:
+    """The couplings of joints of a plant, by names."""
+    if plant.num_constraints() == 0:
+        return []
+    joints = joint_names(plant)
+    names = {(int(j.model_instance()), j.name()): name for name, j in joints.items()}
+    couplings = []
+    for name, (leader, ratio, offset) in _of_joints(plant, mender.followers).items():
+        leading = names.get((int(joints[name].model_instance()), leader))
+        couplings += [Coupling(name, leading, ratio, offset)] if leading else []
+    return couplings
 
 
 def _joints_to_parents(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
     """Index of a body -> the joint by which it is attached."""
     return {joint.child_body().index(): joint for joint in reversed(joints_of(plant))}
-
-
-def _free_bodies(plant: MultibodyPlant) -> list[str]:
-    """The names of the bodies without a joint, except the world."""
-    attached = _joints_to_parents(plant)
-    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-    return unique_names(plant, [body for body in bodies if body.index() not in attached])

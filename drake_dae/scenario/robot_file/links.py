@@ -13,11 +13,10 @@ from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.links.frames import joint_names
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.robot_file.changes import change_robot, finalize
+from drake_dae.scenario.robot_file.changes import add_payloads, change_robot, finalize
 from drake_dae.scenario.robot_file.loops import cut_loops, joints_of, loop_constraints
-from drake_dae.scenario.robot_file.payloads import Payload, add_payloads
 from drake_dae.scenario.robot_file.reading import read_into, read_robot
-from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.robot_file.robot import Payload, Robot
 
 RobotLinks = tuple[MultibodyExpressions, list[Constraint]]
 """The links of a robot, and its loop-closing joints as constraints."""
@@ -45,9 +44,10 @@ def add_robot(
         ScenarioError: Drake cannot read the file, or ignores parts of it; or a change of the
             scenario does not fit it.
     """
-    change_robot(robot, plant, read_into(plant, robot, scene_graph))
+    mender = read_into(plant, robot, scene_graph)
+    change_robot(robot, plant, mender)
     add_payloads("plant.payloads", payloads, plant)
-    cut_loops(plant)
+    cut_loops(plant, mender.parent_frames)
 
 
 @at("robot.file")
@@ -68,10 +68,10 @@ def robot_links(
     Raises:
         ScenarioError: The file cannot be read or a change does not fit; the message names the key.
     """
-    plant, efforts = read_robot(robot, scene_graph, drawn)
-    change_robot(robot, plant, efforts)
+    plant, mender = read_robot(robot, scene_graph, drawn)
+    change_robot(robot, plant, mender)
     add_payloads("plant.payloads", payloads, plant)
-    cuts = cut_loops(plant)
+    cuts = cut_loops(plant, mender.parent_frames)
     finalize(plant)
     for joint in joints_of(plant):
         if isinstance(joint, QuaternionFloatingJoint):
@@ -87,7 +87,8 @@ def robot_links(
         plant_constraints(links)
     except ModelError as error:
         raise ModelError(
-            f"{error}. With leave_out: [constraints] under robot the file stays as it is"
+            f"{error}; leave_out: [equality/connect] under robot leaves the file as it is, or "
+            "[robot/drake:ball_constraint], as the file has it"
         ) from None
     return links, loop_constraints(cuts, plant)
 

@@ -1,9 +1,8 @@
 """Joints of a robot's file that close loops: they are replaced by constraints."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -17,12 +16,10 @@ from drake_dae.robots.links.frames import frame_name, joint_names
 from drake_dae.robots.surfaces.surface import axes_along, triple
 
 
-@dataclass(frozen=True)
-class CutJoint:
+class CutJoint(NamedTuple):
     """A joint that closes a loop and was removed from the plant.
 
     Attributes:
-        name: Its name.
         slides: Whether it is prismatic; else it is revolute.
         bodies: The indices of parent and child.
         poses: The poses of its frames on parent and child.
@@ -30,54 +27,11 @@ class CutJoint:
         options: Its name, damping, limits and motor, as arguments of the constraint.
     """
 
-    name: str
     slides: bool
     bodies: tuple[Any, Any]
     poses: tuple[RigidTransform, RigidTransform]
     axis: FloatArray
     options: dict[str, Any]
-
-
-def cut_loops(plant: MultibodyPlant) -> list[CutJoint]:
-    """Removes joints until the others form a tree; driven joints only if necessary.
-
-    Args:
-        plant: Not finalized; changed.
-
-    Raises:
-        ModelError: A loop has no joint that can be cut, or Drake cannot remove it.
-    """
-    driven = {actuator.joint().index(): actuator for actuator in actuators_of(plant)}
-    names = {joint.index(): name for name, joint in joint_names(plant).items()}
-    return [
-        _cut(joint, names.get(joint.index(), joint.name()), driven.get(joint.index()), plant)
-        for joint in closing_joints(plant)
-    ]
-
-
-def closing_joints(plant: MultibodyPlant) -> list[Joint]:
-    """The joints that close loops, so that the others form a tree; if possible without motors."""
-    driven = {actuator.joint().index() for actuator in actuators_of(plant)}
-    joints = sorted(
-        joints_of(plant),
-        key=lambda joint: (not _has_one_position(joint), joint.index() in driven),
-        reverse=True,
-    )
-    groups = {index: index for index in range(plant.num_bodies())}
-
-    def group(body: int) -> int:
-        while groups[body] != body:
-            body = groups[body]
-        return body
-
-    closing = []
-    for joint in joints:
-        first = group(int(joint.parent_body().index()))
-        second = group(int(joint.child_body().index()))
-        groups[first] = second
-        if first == second:
-            closing.append(joint)
-    return closing
 
 
 def joints_of(plant: MultibodyPlant) -> list[Joint]:
@@ -90,8 +44,73 @@ def actuators_of(plant: MultibodyPlant) -> list[JointActuator]:
     return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
 
 
+def closing_joints(plant: MultibodyPlant) -> list[Joint]:
+    """The joints that close loops, so that the others form a tree; if possible without motors."""
+    driven = {actuator.joint().index() for actuator in actuators_of(plant)}
+    groups = list(range(plant.num_bodies()))
+    closing = []
+    for joint in sorted(
+        joints_of(plant),
+        key=lambda joint: (not _has_one_position(joint), joint.index() in driven),
+        reverse=True,
+    ):
+        first, second = (
+            groups[int(body.index())] for body in (joint.parent_body(), joint.child_body())
+        )
+        if first == second:
+            closing.append(joint)
+        groups = [second if group == first else group for group in groups]
+    return closing
+
+
 def _has_one_position(joint: Joint) -> bool:
     return isinstance(joint, RevoluteJoint | PrismaticJoint)
+
+
+def cut_loops(
+    plant: MultibodyPlant, parent_frames: Mapping[tuple[str, str], str]
+) -> list[CutJoint]:
+    """Removes joints until the others form a tree; driven joints only if necessary.
+
+    Args:
+        plant: Not finalized; changed.
+        parent_frames: (model, joint) -> the parent that an SDFormat file names.
+
+    Raises:
+        ModelError: A loop has no joint that can be cut, or is open, or Drake cannot remove it.
+    """
+    driven = {actuator.joint().index(): actuator for actuator in actuators_of(plant)}
+    names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    cuts = []
+    for joint in closing_joints(plant):
+        name = names.get(joint.index(), joint.name())
+        _check_ends(joint, name, plant, parent_frames)
+        cuts.append(_cut(joint, name, driven.get(joint.index()), plant))
+    return cuts
+
+
+def _check_ends(
+    joint: Joint, name: str, plant: MultibodyPlant, parents: Mapping[tuple[str, str], str]
+) -> None:
+    """Refuses a loop that is open where its file means it to be closed.
+
+    A joint of SDFormat is at its child; of a frame that is its parent, only the body counts.
+    """
+    model = plant.GetModelInstanceName(joint.model_instance())
+    named = parents.get(("", joint.name()), parents.get((model, joint.name()), ""))
+    if not named or not plant.HasFrameNamed(named, joint.model_instance()):
+        return
+    frame = plant.GetFrameByName(named, joint.model_instance())
+    places = [
+        one.GetFixedPoseInBodyFrame().translation() for one in (frame, joint.frame_on_parent())
+    ]
+    gap = float(np.linalg.norm(places[0] - places[1]))
+    if frame.name() != frame.body().name() and gap > 1e-6:
+        raise ModelError(
+            f"joint '{name}' closes a loop at its child, {gap:.3g} m from the frame '{named}' that "
+            f"it names as its parent: of that only the body '{frame.body().name()}' counts. Let "
+            "<pose> place the joint at the frame"
+        )
 
 
 def _cut(
@@ -102,13 +121,12 @@ def _cut(
             f"joint '{name}' closes a loop, and neither turns nor slides; take it out of the file, "
             "and write it under constraints, as a !WeldedFrames or !CoincidentPoints"
         )
-    slides = isinstance(joint, PrismaticJoint)
-    options: dict[str, Any] = {"damping": joint.default_damping(), "name": name}
     limits = {
         "lower": joint.position_lower_limits()[0],
         "upper": joint.position_upper_limits()[0],
         "velocity_limit": joint.velocity_upper_limits()[0],
     }
+    options: dict[str, Any] = {"damping": joint.default_damping(), "name": name}
     if actuator is not None:
         if actuator.default_rotor_inertia() != 0.0:
             raise ModelError(
@@ -120,8 +138,8 @@ def _cut(
         plant.RemoveJointActuator(actuator)
     options |= {key: float(value) for key, value in limits.items() if isfinite(value)}
     parent, child = joint.frame_on_parent(), joint.frame_on_child()
+    slides = isinstance(joint, PrismaticJoint)
     cut = CutJoint(
-        name,
         slides,
         (parent.body().index(), child.body().index()),
         (parent.GetFixedPoseInBodyFrame(), child.GetFixedPoseInBodyFrame()),
@@ -150,8 +168,7 @@ def loop_constraints(cuts: Sequence[CutJoint], plant: MultibodyPlant) -> list[Co
 
 def _constraint(cut: CutJoint, plant: MultibodyPlant) -> Constraint:
     bodies = [plant.get_body(index) for index in cut.bodies]
-    context = plant.CreateDefaultContext()
-    pose = plant.EvalBodyPoseInWorld(context, bodies[0]) @ cut.poses[0]
+    pose = plant.EvalBodyPoseInWorld(plant.CreateDefaultContext(), bodies[0]) @ cut.poses[0]
     normal = _normal(cut, pose.rotation() @ cut.axis, plant)
     axes = axes_along(cut.axis)
     if cut.slides and normal is not None:
@@ -169,7 +186,7 @@ def _constraint(cut: CutJoint, plant: MultibodyPlant) -> Constraint:
 
 
 def _normal(cut: CutJoint, axis: FloatArray, plant: MultibodyPlant) -> FloatArray | None:
-    """The normal of the plane in which all joints of a loop move; None if there is none.
+    """The normal of the plane in which all joints of a loop move, in the world; None without one.
 
     Args:
         cut: The joint that closes the loop.
@@ -207,5 +224,4 @@ def _path(cut: CutJoint, plant: MultibodyPlant) -> Iterator[tuple[bool, FloatArr
             continue
         slides = isinstance(joint, PrismaticJoint)
         axis = joint.translation_axis() if slides else joint.revolute_axis()
-        frame = joint.frame_on_parent().CalcPoseInWorld(context)
-        yield slides, frame.rotation() @ axis
+        yield slides, joint.frame_on_parent().CalcPoseInWorld(context).rotation() @ axis

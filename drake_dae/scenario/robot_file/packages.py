@@ -1,138 +1,180 @@
-"""Finds the packages that a robot's files name, "package://<name>/...", as ROS finds them."""
+"""Finds the files that a robot's files name, in packages as ROS finds them."""
 
 import os
-import re
-from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
+from urllib.parse import unquote
 
+from pydrake.common import GetDrakePath
 from pydrake.multibody.parsing import PackageMap
 
+from drake_dae.arrays import brief
 from drake_dae.errors import ModelError
-from drake_dae.files import read_bytes
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.robot_file.readable.markup import without_comments
+from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.robot_file.xml_tree import read_xml
 from drake_dae.scenario.shipped import FOLDER
 
-_URL = re.compile(r"\b(?:package|model)://([^/\s\"'<>]+)[^\s\"'<>,}\]]*")
-_MODEL = (".urdf", ".sdf", ".xml", ".yaml", ".yml")
-"""The suffixes of files that may contain names of packages."""
 
+class RobotFiles:
+    """The file of a robot, and those that it names.
 
-def add_packages(packages: Mapping[str, str], package_map: PackageMap) -> None:
-    """Adds the shipped package and those of `robot.packages`.
+    A package is a folder above the file that names it, or a folder of its name in one of these,
+    if it has a package.xml with the name; or it is in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH.
 
-    Raises:
-        ScenarioError: A folder does not exist, or the name is one of Drake's.
-    """
-    package_map.AddPackageXml(str(FOLDER / "models" / "package.xml"))
-    for name, folder in packages.items():
-        with at(f"robot.packages.{name}"):
-            try:
-                package_map.Add(name, folder)
-            except RuntimeError as error:
-                raise ModelError(f"no package in '{folder}': {error}") from None
-
-
-def find_packages(
-    file: str, package_map: PackageMap, places: Sequence[Path] = ()
-) -> tuple[list[Path], dict[str, str]]:
-    """Adds the packages that a file names, and those that its included files name.
-
-    A package is searched near the file that names it: a folder above the file, or a subfolder of
-    the package's name in such a folder, that has a package.xml with the name. Then it is searched
-    in ROS_PACKAGE_PATH by the name in its package.xml, and last as a subfolder of its name in the
-    folders of ROS_PACKAGE_PATH and in `places`.
+    Attributes:
+        main: The file.
+        packages: The packages of Drake's parser.
+        folders: The folders from which geometry is read: those of the model and its packages.
+        missing: Package that is not found -> a file that names it.
 
     Args:
-        file: A path, or a URL of a package.
-        package_map: The known packages; the packages that are found are added.
-        places: Folders with packages as subfolders of their names.
+        robot: The key `robot` of the scenario.
+        packages: The packages of Drake's parser; those that are found are added.
 
-    Returns:
-        The folders of the added packages; and the packages that are not found: name -> a file that
-        names it, or "" for `file` itself.
+    Raises:
+        ScenarioError, ModelError: There is no such file, robot or folder.
     """
-    folders: list[Path] = []
-    missing: dict[str, str] = {}
-    ros: PackageMap | None = None
-    waiting, searched = [(file, Path())], set()
-    while waiting:
-        url, origin = waiting.pop()
-        for name in _URL.findall(url):
-            if not package_map.Contains(name) and name not in missing:
-                ros = ros or _ros_packages()
-                folder = _beside(name, origin) if origin.name else None
-                if folder is None and ros.Contains(name):
-                    folder = Path(ros.GetPath(name))
-                if folder is None:
-                    inside = (place / name for place in (*_ros_folders(), *places))
-                    folder = next((path for path in inside if path.is_dir()), None)
-                if folder is None:
-                    missing[name] = str(origin) if origin.name else ""
-                    continue
-                package_map.Add(name, str(folder))
-                folders.append(folder)
-        path = _path(url, package_map)
-        if path is None or path in searched or path.suffix not in _MODEL or not path.is_file():
-            continue
-        searched.add(path)
-        text = without_comments(path.read_text("utf-8", errors="replace"))
-        waiting.extend((match[0], path) for match in _URL.finditer(text))
-    return folders, missing
+
+    def __init__(self, robot: Robot, packages: PackageMap) -> None:
+        self.missing: dict[str, Path] = {}
+        self.packages = packages
+        self._places = [
+            *(Path(part) for part in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)),
+            *(Path(p, "share") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)),
+        ]
+        packages.AddPackageXml(str(FOLDER / "models" / "package.xml"))
+        for name, folder in robot.packages.items():
+            with at(f"robot.packages.{name}"):
+                try:
+                    packages.Add(name, folder)
+                except RuntimeError as error:
+                    raise ModelError(f"no package in '{folder}': {error}") from None
+        self.folders = [FOLDER / "models", *map(Path, robot.packages.values()), *_drake_folders()]
+        main: Path | None = Path(robot.file)
+        if robot.description:
+            with at("robot.description"):
+                main, described = described_robot(robot.description)
+                self.folders += described[:2]
+                self._places += described
+        elif "://" in robot.file:
+            main = self.find(robot.file, Path())
+        if main is None:
+            raise ModelError(self.unknown_packages())
+        try:
+            is_there = main.is_file()
+        except (OSError, ValueError):  # A null byte.
+            is_there = False
+        if not is_there:
+            raise ModelError(
+                f"no file '{main}'; a relative path starts in the scenario's folder, that of a "
+                "shipped scenario in the working directory"
+            )
+        own = main.resolve().parent
+        inside = (path for path in (own, *own.parents) if (path / "package.xml").is_file())
+        self.folders.append(next(inside, own))
+        self.main = main
+
+    def find(self, name: str, file: Path) -> Path | None:
+        """The path of a URL or a name in a file; None if its package is unknown."""
+        scheme, _, rest = name.rpartition("://")
+        rest = rest.lstrip("/") if scheme in ("package", "model") else rest
+        package = rest.split("/")[0]
+        if not scheme:
+            return file.resolve().parent / name
+        if scheme == "file":
+            return Path(unquote(rest))
+        if scheme not in ("package", "model"):
+            return None
+        if not self.packages.Contains(package):
+            folder = self._folder_of(package, file)
+            if folder is None:
+                self.missing.setdefault(package, file)
+                return None
+            self.packages.Add(package, str(folder))
+            self.folders.append(folder)
+        try:
+            return Path(self.packages.ResolveUrl(f"package://{rest}"))
+        except RuntimeError:
+            return None
+
+    def _folder_of(self, package: str, file: Path) -> Path | None:
+        for above in file.resolve().parents if file.name else ():
+            for folder in (above, above / package):
+                if _package_name(folder) == package:
+                    return folder
+        ros = PackageMap.MakeEmpty()
+        if os.environ.get("ROS_PACKAGE_PATH"):
+            ros.PopulateFromRosPackagePath()
+        if ros.Contains(package):
+            return Path(ros.GetPath(package))
+        inside = (place / package for place in self._places if str(place) != ".")
+        return next((folder for folder in inside if folder.is_dir()), None)
+
+    def unknown_packages(self) -> str:
+        """The message for packages that are not found."""
+        name, file = next(iter(self.missing.items()))
+        others = f" (nor are {', '.join(list(self.missing)[1:])})" if len(self.missing) > 1 else ""
+        return (
+            f"unknown package '{name}': it is neither beside '{file.name or name}', as a folder "
+            f"with a package.xml, nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH{others}; name its "
+            f"folder under robot.packages, as packages: {{{name}: <folder>}}, so that "
+            f"package://{name}/a is <folder>/a"
+        )
 
 
-def explained(missing: Mapping[str, str]) -> str:
-    """The error message for packages that are not found."""
-    name, origin = next(iter(missing.items()))
-    where = (
-        f", which '{Path(origin).name}' names, is neither beside it" if origin else " is neither"
-    )
-    others = f" (nor are {', '.join(list(missing)[1:])})" if len(missing) > 1 else ""
-    key = "{" + f"{name}: <folder>" + "}"
-    return (
-        f"unknown package '{name}'{where}, as a folder with a package.xml, nor in "
-        f"ROS_PACKAGE_PATH{others}; name its folder under robot.packages, as packages: {key}, "
-        f"so that package://{name}/a is <folder>/a"
-    )
-
-
-def _path(url: str, package_map: PackageMap) -> Path | None:
-    """The file of a path or a URL; None if the package is unknown."""
-    if "://" not in url:
-        return Path(url)
-    try:
-        return Path(package_map.ResolveUrl(url))
-    except RuntimeError:
-        return None
-
-
-def _beside(name: str, file: Path) -> Path | None:
-    """The folder of a package above a file, or beside a folder above it; None if there is none."""
-    for above in file.resolve().parents:
-        for folder in (above, above / name):
-            if _package_name(folder / "package.xml") == name:
-                return folder
-    return None
-
-
-def _package_name(file: Path) -> str:
-    """The name in a package.xml; empty if there is none."""
-    try:
-        text = without_comments(read_bytes(file).decode("utf-8", errors="replace"))
-    except (OSError, ValueError):
+def _package_name(folder: Path) -> str:
+    """The name in a folder's package.xml; empty if there is none."""
+    if not (folder / "package.xml").is_file():
         return ""
-    match = re.search(r"<name>\s*([^<]*?)\s*</name>", text)
-    return match[1] if match else ""
+    try:
+        return (read_xml(folder / "package.xml").findtext("name") or "").strip()
+    except ModelError:
+        return ""
 
 
-def _ros_folders() -> list[Path]:
-    """The folders in ROS_PACKAGE_PATH."""
-    return [Path(part) for part in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if part]
+def _drake_folders() -> list[Path]:
+    """The folders of Drake's packages, installed and downloaded."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return [Path(GetDrakePath()), Path(cache) / "drake" / "package_map"]
 
 
-def _ros_packages() -> PackageMap:
-    """The packages in ROS_PACKAGE_PATH."""
-    packages = PackageMap.MakeEmpty()
-    if os.environ.get("ROS_PACKAGE_PATH"):
-        packages.PopulateFromRosPackagePath()
-    return packages
+def described_robot(name: str) -> tuple[Path, list[Path]]:
+    """The file of a robot of the package robot_descriptions, and folders that have its packages.
+
+    Raises:
+        ModelError: There is no such robot, it cannot be cloned, or robot_descriptions is not
+            installed.
+    """
+    try:
+        names = import_module("robot_descriptions").DESCRIPTIONS
+    except ImportError:
+        raise ModelError(
+            "this takes the package robot_descriptions; pip install 'drake_dae[descriptions]', or "
+            "name a file of your own as robot.file"
+        ) from None
+    if name not in names:
+        near = get_close_matches(name, names, n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise ModelError(
+            f"robot_descriptions has no '{name}'; {hint}python -m robot_descriptions list names all"
+        )
+    try:
+        module = import_module(f"robot_descriptions.{name}")
+    except Exception as error:  # Of git, of the network, of the disk.
+        raise ModelError(
+            f"'{name}' cannot be fetched: {brief(str(error))}. Without a network clone it "
+            "elsewhere, and let ROBOT_DESCRIPTIONS_CACHE name the folder, or name the robot's own "
+            "file as robot.file"
+        ) from None
+    file = getattr(module, "URDF_PATH", None) or getattr(module, "MJCF_PATH", None)
+    if file is None:
+        raise ModelError(
+            f"'{name}' comes as neither URDF nor MJCF; make a URDF of it, as xacro does, and name "
+            "it as robot.file"
+        )
+    package, repository = (
+        Path(getattr(module, key, Path(file).parent)) for key in ("PACKAGE_PATH", "REPOSITORY_PATH")
+    )
+    return Path(file), [package, repository, package.parent, repository.parent, Path(file).parent]

@@ -1,23 +1,18 @@
 """The robot of a scenario: a file, and changes of it."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-import pydantic
-from numpy.typing import ArrayLike
 
-from drake_dae.arrays import brief
+from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
-from drake_dae.robots.joint_friction import JointFriction
-from drake_dae.robots.known_forces import KnownForce
+from drake_dae.robots.known_forces import Load
 from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.scenario.forms.forms import Choice, Form
+from drake_dae.scenario.forms.forms import Value
 from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.forms.values import Numbers, Triple
-from drake_dae.scenario.robot_file.payloads import Payload
+from drake_dae.scenario.forms.values import FILE, in_folder
 
 
 @dataclass(frozen=True)
@@ -29,8 +24,8 @@ class Pose:
         rpy_deg: Roll, pitch and yaw, in degrees.
     """
 
-    translation: Triple = (0.0, 0.0, 0.0)
-    rpy_deg: Triple = (0.0, 0.0, 0.0)
+    translation: Vector = (0.0, 0.0, 0.0)
+    rpy_deg: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -47,55 +42,67 @@ class RobotPlacement:
     pose: Pose = Pose()
 
 
-def _actuators(value: Any) -> Any:
-    """Checks the value of `actuators`."""
-    if value is None or value == "all":
+@dataclass(frozen=True)
+class Payload:
+    """A point mass attached to a robot.
+
+    Attributes:
+        frame: Name of the frame to which it is attached.
+        mass: Its mass, in kg; the parameter "<name>.mass".
+        point: Its position in the frame, m.
+        name: The name of its body.
+    """
+
+    frame: str
+    mass: float
+    point: Vector = (0.0, 0.0, 0.0)
+    name: str = "payload"
+
+    def __post_init__(self) -> None:
+        positive("the mass of a payload", self.mass)
+
+
+def _actuators(value: Any, folder: Path) -> Any:
+    if value == "all" or (isinstance(value, list) and all(isinstance(v, str) for v in value)):
         return value
-    if isinstance(value, list) and all(isinstance(name, str) for name in value):
-        return value
-    if isinstance(value, dict) and TAG not in value:
-        for name, limit in value.items():
-            if limit is not None and not (type(limit) in (int, float) and 0 < limit < np.inf):
-                raise ValueError(
-                    f"the effort limit of {name} must be a positive number of N m or N, or nothing "
-                    f"for that of the file, got {brief(limit)}"
-                )
-        return value
-    raise ValueError(
-        f"expected all, a list of joints, or joints with effort limits, got {brief(value)}"
-    )
+    if not isinstance(value, dict) or TAG in value:
+        return None
+    limits = [limit for limit in value.values() if limit is not None]
+    return value if all(type(x) in (int, float) and 0 < x < np.inf for x in limits) else None
 
 
-Actuators = Annotated[
-    Any,
-    pydantic.PlainValidator(_actuators),
-    pydantic.PlainSerializer(lambda value: value),
-    pydantic.WithJsonSchema(
-        {
-            "anyOf": [
-                {"const": "all"},
-                {"type": "array", "items": {"type": "string"}},
-                {
-                    "type": "object",
-                    "additionalProperties": {"anyOf": [{"type": "number"}, {"type": "null"}]},
-                },
-                {"type": "null"},
-            ]
-        }
-    ),
-]
-"""The driven joints: "all", a list of names, or name -> effort limit."""
+ACTUATORS = Value(
+    "all, a list of joints, or joints with effort limits in N m or N, positive, or nothing for "
+    "that of the file",
+    {
+        "anyOf": [
+            {"const": "all"},
+            {"type": "array", "items": {"type": "string"}},
+            {"type": "object", "additionalProperties": {"type": ["number", "null"]}},
+        ]
+    },
+    _actuators,
+)
 
 
-LeftOut = Literal["joint_friction", "inertia", "empty_limits", "constraints"]
-"""The parts of a robot's file that a scenario can leave out."""
+def _robot_file(value: Any, folder: Path) -> Any:
+    is_package = isinstance(value, str) and value.startswith("package://")
+    return value if is_package else in_folder(value, folder)
 
 
-KnownLoad = Annotated[
-    KnownForce | JointFriction,
-    Choice({Vector: Triple, ArrayLike: Numbers, Sequence[str]: list[str]}),
-]
-"""Known forces on a robot."""
+ROBOT_FILE = Value("the name of a file", {"type": "string"}, _robot_file)
+
+
+def _part(value: Any, folder: Path) -> Any:
+    is_part = isinstance(value, str) and 0 < value.find("/") < len(value) - 1
+    return value if is_part or value in ("inertia", "empty_limits") else None
+
+
+LEFT_OUT = Value(
+    '"<parent>/<name>" of an element or attribute, inertia, or empty_limits',
+    {"type": "string"},
+    _part,
+)
 
 
 @dataclass(frozen=True)
@@ -130,26 +137,26 @@ class Robot:
             name -> effort limit in N m or N, or "all" revolute and prismatic joints that mimic no
             other. Without a number the limit is that of the file. Controls have this order, after
             those of the file's own actuators.
-        leave_out: Parts of the file that are left out, and are errors otherwise. joint_friction:
-            Coulomb friction of joints. inertia: impossible inertias, which are replaced by the
-            nearest possible ones. empty_limits: position limits that are empty intervals, such as 0
-            to 0. constraints: all constraints of the file except joints, such as <equality> of
-            MJCF; write them under `constraints` instead.
+        leave_out: What is left out of the file: elements and attributes by "<parent>/<name>", as
+            "joint/stiffness" or "equality/weld". Drake reads not all that a file says; what of it
+            changes the equations is an error until it is named here. Besides, inertia: impossible
+            moments of inertia, which the nearest possible ones replace; empty_limits: position
+            limits that are empty intervals, such as 0 to 0.
         payloads: Masses attached to the robot, known to plant and law.
         known_forces: Known forces on frames; "<name>.force" is zero unless it is in `exogenous` or
             `plant.parameters`. And friction of joints.
     """
 
-    file: str = ""
-    packages: dict[str, str] = field(default_factory=dict)
+    file: Annotated[str, ROBOT_FILE] = ""
+    packages: dict[str, Annotated[str, FILE]] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
-    base: Annotated[RobotPlacement, Form()] | None = None
+    base: RobotPlacement | None = None
     locked: dict[str, float] = field(default_factory=dict)
-    actuators: Actuators = None
-    leave_out: list[LeftOut] = field(default_factory=list)
+    actuators: Annotated[Any, ACTUATORS] | None = None
+    leave_out: list[Annotated[str, LEFT_OUT]] = field(default_factory=list)
     description: str = ""
-    payloads: list[Annotated[Payload, Form()]] = field(default_factory=list)
-    known_forces: list[KnownLoad] = field(default_factory=list)
+    payloads: list[Payload] = field(default_factory=list)
+    known_forces: list[Load] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if bool(self.file) == bool(self.description):

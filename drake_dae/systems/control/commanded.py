@@ -1,18 +1,21 @@
 """References that a person changes while they run, as a LeafSystem.                   (28)"""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import casadi as ca
-import numpy as np
-from pydrake.systems.framework import BasicVector, Context, ContinuousState, DependencyTicket
 
 from drake_dae.arguments import checked
-from drake_dae.blocks.computations import DERIVATIVE, PARAMETERS, STATE, TIME, Block, Computation
+from drake_dae.blocks.block import stacked
+from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import Reference
-from drake_dae.systems.control.references import ReferenceGenerator, traced_references
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.systems.control.references import (
+    ReferenceGenerator,
+    common_parameters,
+    reference_block,
+)
 
 RATES = {"N": 40.0, "N m": 40.0}
 """Unit -> the rate w of the lags, in 1/s; `RATE` for others."""
@@ -40,8 +43,6 @@ class CommandedReferences(ReferenceGenerator):
     Output port:
         reference: R of (28) for references + changes, shape (sum (mu_i + 1),).
 
-    The block does not convert to AutoDiffXd, since the lags have kinks.
-
     Args:
         references: The references, in the order of the outputs.
         degrees: The degrees mu_1, ..., mu_p.
@@ -56,7 +57,7 @@ class CommandedReferences(ReferenceGenerator):
         ReferenceSignalError: As of `ReferenceGenerator`; or a reference has parameters.
     """
 
-    no_gradient = "commands pass lags with kinks"
+    __slots__ = TracedSystem.__slots__
 
     def __init__(
         self,
@@ -66,7 +67,8 @@ class CommandedReferences(ReferenceGenerator):
         *,
         depth: int = 0,
     ) -> None:
-        super().__init__(references, degrees)
+        self.references, self.degrees = tuple(references), tuple(degrees)
+        self.reference_parameters = common_parameters(self.references)
         if self.reference_parameters:
             raise ReferenceSignalError(
                 "references with parameters cannot be commanded: write the numbers of "
@@ -87,41 +89,14 @@ class CommandedReferences(ReferenceGenerator):
                 rows.append(change)
                 if order < degree:
                     change = ca.jtimes(change, y, rate)
-        state = ca.vertcat(ca.SX(0, 1), *states)
-        inputs = {"state": state, "commands": command}
-        self._rate = TracedFunction(
-            "command rate", inputs, {"rate": ca.vertcat(ca.SX(0, 1), *rates)}
+        self._base = base = reference_block(self.references, self.degrees, {})
+        block = replace(
+            base,
+            outputs={"reference": base.outputs["reference"] + stacked(rows)},
+            state=stacked(states),
+            derivative=stacked(rates),
+            parameters=command,
+            start={},
+            signals={"commands": self.commands},
         )
-        base = ca.SX.sym("base", len(rows))
-        self._sum = TracedFunction(
-            "commanded references",
-            {**inputs, "base": base},
-            {"R": base + ca.vertcat(ca.SX(0, 1), *rows)},
-        )
-        self.DeclareNumericParameter(BasicVector(np.zeros(len(self.commands))))
-        self.DeclareContinuousState(BasicVector(np.zeros(state.numel())))
-
-    def _declare_reference(self, sources: set[DependencyTicket]) -> None:
-        super()._declare_reference({self.all_sources_ticket()})
-
-    def _calc_reference(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(
-            self._sum(*self._values(context), self.function(context.get_time()))[0]
-        )
-
-    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        derivatives.get_mutable_vector().SetFromVector(self._rate(*self._values(context))[0])
-
-    def _values(self, context: Context) -> tuple[np.ndarray, np.ndarray]:
-        state = context.get_continuous_state_vector().CopyToVector()
-        return state, context.get_numeric_parameter(0).value()
-
-    def traced(self) -> Block:
-        time = ca.SX.sym("t")
-        base = ca.Function("base", [time], [traced_references(self.references, self.degrees, time)])
-        computations = (
-            Computation(base, (TIME,), ("base",)),
-            Computation.of(self._sum, (STATE, PARAMETERS, "base"), ("reference",)),
-            Computation.of(self._rate, (STATE, PARAMETERS), (DERIVATIVE,)),
-        )
-        return Block(self, computations, signals={"commands": self.commands})
+        TracedSystem.__init__(self, block, sees_steps=False)

@@ -1,37 +1,44 @@
-"""Drake's trajectories and systems as references."""
+"""Drake's trajectories as references."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from math import factorial
 
+import casadi as ca
 import numpy as np
-from pydrake.systems.framework import System
-from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from numpy.polynomial import Polynomial
+from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import Reference
+from drake_dae.references.polynomials import PiecewisePolynomials
 
 
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class TrajectoryReference(Reference):
-    """A reference that is a Drake Trajectory, with the derivatives that it provides itself.
+    """A reference that is a Drake PiecewisePolynomial or BsplineTrajectory, with its derivatives.
+
+    During a run a time outside its range is a SimulationError; Drake would clip it in silence.
 
     Attributes:
-        trajectory: Any column-valued Trajectory, shape (k, 1).
+        trajectory: The trajectory, a column of shape (k, 1).
 
     Raises:
-        ReferenceSignalError: The Trajectory is not a column; when `derivatives` is called, it has
-            no derivatives, or is a PiecewisePolynomial of which a derivative below the highest one
-            jumps at a break; or, during a run, the time is outside its range, which Drake would
-            silently clip.
+        ReferenceSignalError: The Trajectory is another one, or no column; or, where the reference
+            is used, a derivative below the highest one jumps at a break.
     """
 
     trajectory: Trajectory
 
     def __post_init__(self) -> None:
+        if not isinstance(self.trajectory, PiecewisePolynomial | BsplineTrajectory):
+            raise ReferenceSignalError(
+                "a reference Trajectory must be a PiecewisePolynomial or a BsplineTrajectory, got "
+                f"a {type(self.trajectory).__name__}; sample it into one of these"
+            )
         if self.trajectory.cols() != 1:
             raise ReferenceSignalError(
                 "a reference Trajectory must be a column, this one is "
@@ -42,120 +49,62 @@ class TrajectoryReference(Reference):
     def size(self) -> int:
         return int(self.trajectory.rows())
 
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        highest = max(degrees)
-        path = self.trajectory
-        if highest and not path.has_derivative():
-            raise ReferenceSignalError(
-                f"{type(path).__name__} has no derivatives, the law needs {highest}"
-            )
-        if isinstance(path, PiecewisePolynomial):
-            self._check_breaks(path, degrees)
-        first, last = path.start_time(), path.end_time()
-        slack = 1e-9 * max(1.0, abs(last))
-
-        def evaluate(time: float) -> FloatArray:
-            if not first - slack <= time <= last + slack:
-                raise ReferenceSignalError(
-                    f"the reference Trajectory covers {first:g} to {last:g} s and was asked for "
-                    f"t = {time:g} s; extend it over the whole simulation"
-                )
-            table = [path.value(time)] + [
-                path.EvalDerivative(time, k) for k in range(1, highest + 1)
-            ]
-            return np.array(
-                [table[k][i, 0] for i, degree in enumerate(degrees) for k in range(degree + 1)]
-            )
-
-        return evaluate
-
-    @staticmethod
-    def _check_breaks(path: PiecewisePolynomial, degrees: Sequence[int]) -> None:
-        breaks = path.get_segment_times()[1:-1]
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        pieces = self._pieces
+        table = [pieces.expression(time)]
         for order in range(max(degrees)):
-            derivative = path.derivative(order) if order else path
-            for index, time in enumerate(breaks):
-                left = derivative.getPolynomialMatrix(index)
-                right = derivative.getPolynomialMatrix(index + 1)
-                width = time - path.get_segment_times()[index]
-                for i, degree in enumerate(degrees):
-                    before, after = (
-                        left[i, 0].EvaluateUnivariate(width),
-                        right[i, 0].EvaluateUnivariate(0.0),
-                    )
-                    if order < degree and abs(before - after) > 1e-6 * (1.0 + abs(before)):
-                        raise ReferenceSignalError(
-                            f"derivative {order} of row {i} of the reference Trajectory jumps by "
-                            f"{after - before:.3g} at t = {time:g} s, but the law needs a "
-                            f"reference with {degree} derivatives; use a smoother trajectory"
-                        )
+            self._check_breaks(pieces, order, degrees)
+            pieces = _derivative(pieces)
+            table.append(pieces.expression(time))
+        rows = [table[k][i] for i, degree in enumerate(degrees) for k in range(degree + 1)]
+        return ca.vertcat(*rows) + ca.if_else(self.margin(time) >= 0.0, 0.0, np.nan)
 
-
-@checked(ReferenceSignalError)
-@dataclass(frozen=True, eq=False)
-class SystemReference(Reference):
-    """A reference that a Drake System computes from the time alone, with its derivatives.
-
-    The system has one output port: r_1, r_1', ..., r_1^(nu_1), r_2, ..., output-major. A LeafSystem
-    may compute any function; it must ensure that each value is the derivative of the one before it.
-
-    Attributes:
-        system: The system; it has no inputs and no state.
-        degrees: The number of derivatives nu_1, ..., nu_k of each output.
-
-    Raises:
-        ReferenceSignalError: The system has inputs, a state or another output; or, when
-            `derivatives` is called, too few derivatives.
-    """
-
-    system: System
-    degrees: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "degrees", tuple(self.degrees))
-        system, size = self.system, DerivativeLayout(self.degrees).reference_size
-        if not self.degrees or min(self.degrees) < 0:
-            raise ReferenceSignalError(
-                f"degrees must be one whole number from 0 for each output, got {self.degrees}"
-            )
-        name = system.get_name() or type(system).__name__
-        context = system.CreateDefaultContext()
-        if system.num_input_ports() or not context.is_stateless():
-            raise ReferenceSignalError(
-                f"'{name}' has inputs or a state, so that its output does not follow from the time "
-                "alone. Wire it yourself: make a RobotPlant and a TrackingController(law), and "
-                f"builder.Connect its output, of size {size}, to "
-                'controller.GetInputPort("reference")'
-            )
-        ports = [system.get_output_port(index) for index in range(system.num_output_ports())]
-        if [port.size() for port in ports] != [size]:
-            outputs = ", ".join(f"{port.get_name()} ({port.size()})" for port in ports) or "none"
-            raise ReferenceSignalError(
-                f"'{name}' must have one output port, of size {size}: each output with its "
-                f"{', '.join(map(str, self.degrees))} derivatives, as r_1, r_1', ..., r_2, ...; it "
-                f"has {outputs}"
-            )
+    def margin(self, time: ca.SX) -> ca.SX:
+        """The distance of a time from the ends of the trajectory, in s; negative outside."""
+        first, last = self.trajectory.start_time(), self.trajectory.end_time()
+        return ca.fmin(time - first, last - time) + 1e-9 * max(1.0, abs(last))
 
     @property
-    def size(self) -> int:
-        return len(self.degrees)
+    def _pieces(self) -> PiecewisePolynomials:
+        """The polynomials of its segments, from their derivatives in the middle of each."""
+        path, rows = self.trajectory, range(self.size)
+        if isinstance(path, PiecewisePolynomial):
+            breaks = np.array(path.get_segment_times())
+            segments = range(path.get_number_of_segments())
+            degree = max(path.getSegmentPolynomialDegree(i, row) for i in segments for row in rows)
+        else:
+            breaks, degree = np.unique(path.basis().knots()), path.basis().order() - 1
+            breaks = breaks[(breaks >= path.start_time()) & (breaks <= path.end_time())]
+        factors = np.zeros((breaks.size - 1, self.size, degree + 1))
+        for i, (begin, end) in enumerate(pairwise(breaks)):
+            middle, width = 0.5 * (begin + end), end - begin
+            taylor = [path.value(middle)[:, 0]]
+            taylor += [path.EvalDerivative(middle, k)[:, 0] for k in range(1, degree + 1)]
+            shares = Polynomial([-0.5 * width, width])  # The time from the middle.
+            for k, values in enumerate(taylor):
+                power = np.asarray((shares**k).coef, float) / factorial(k)
+                factors[i, :, : power.size] += np.outer(values, power)
+        return PiecewisePolynomials(breaks, factors)
 
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        for row, (needed, available) in enumerate(zip(degrees, self.degrees, strict=True)):
-            if needed > available:
+    def _check_breaks(
+        self, pieces: PiecewisePolynomials, order: int, degrees: Sequence[int]
+    ) -> None:
+        before = pieces.factors[:-1].sum(axis=2)
+        jumps = pieces.factors[1:, :, 0] - before
+        for row, degree in enumerate(degrees):
+            bad = np.abs(jumps[:, row]) > 1e-6 * (1.0 + np.abs(before[:, row]))
+            if order < degree and bad.any():
+                i = int(np.argmax(bad))
                 raise ReferenceSignalError(
-                    f"the law needs {needed} derivatives of row {row}, its system gives {available}"
+                    f"derivative {order} of row {row} of the reference Trajectory jumps by "
+                    f"{jumps[i, row]:.3g} at t = {pieces.breaks[i + 1]:g} s, but the law needs a "
+                    f"reference with {degree} derivatives; use a smoother trajectory"
                 )
-        context, port = self.system.CreateDefaultContext(), self.system.get_output_port()
-        table = DerivativeLayout(self.degrees)
-        places = [
-            first + k
-            for first, degree in zip(table.lowest, degrees, strict=True)
-            for k in range(degree + 1)
-        ]
 
-        def evaluate(time: float) -> FloatArray:
-            context.SetTime(time)
-            return np.asarray(port.Eval(context))[places]
 
-        return evaluate
+def _derivative(pieces: PiecewisePolynomials) -> PiecewisePolynomials:
+    powers = np.arange(pieces.factors.shape[2])
+    factors = (pieces.factors * powers)[:, :, 1:] / np.diff(pieces.breaks)[:, None, None]
+    if not factors.shape[2]:
+        factors = np.zeros((*factors.shape[:2], 1))
+    return PiecewisePolynomials(pieces.breaks, factors)

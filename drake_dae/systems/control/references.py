@@ -1,30 +1,30 @@
 """References as a LeafSystem.                                                         (28)"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, DependencyTicket
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, all_finite, numbers, unknown_name, vector
-from drake_dae.blocks.computations import PARAMETERS, TIME, Block, Computation
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.dae.system.layout import DerivativeLayout
+from drake_dae.blocks.block import TIME, Block, BlockFunction, Requirement, stacked
+from drake_dae.blocks.failures import simulation_error
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, ReferenceSignalError
-from drake_dae.references import Reference, ReferenceRows, stack_references
-from drake_dae.references.reference import not_finite, with_degrees
-from drake_dae.systems.blocks.along import signal_along
-from drake_dae.systems.blocks.block import DifferentiableSystem
-from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.errors import DrakeDaeError, ReferenceSignalError
+from drake_dae.references import Reference, ReferenceRows
+from drake_dae.references.reference import with_degrees
+from drake_dae.systems.control.drake_references import TrajectoryReference
+from drake_dae.trace.functions import FailureKind
 
 
 @checked(ReferenceSignalError)
-class ReferenceGenerator(DifferentiableSystem):
+class ReferenceGenerator(TracedSystem):
     """References of all outputs, stacked, with their derivatives.
 
     Output port:
@@ -39,11 +39,8 @@ class ReferenceGenerator(DifferentiableSystem):
         references, degrees: The arguments.
         reference_parameters: Name -> default of each parameter of its references, shape (k,),
             stacked in numeric parameter 0. References may share a parameter by its name.
-        function: R(t) with these defaults as a function of the time in s; the next call overwrites
-            its array.
 
-    The block converts to AutoDiffXd. If the time has a gradient, each reference needs one more
-    derivative.
+    The block converts to AutoDiffXd and to symbolic expressions.
 
     Raises:
         ReferenceSignalError: The references cover too few or too many outputs, or are not smooth
@@ -54,30 +51,11 @@ class ReferenceGenerator(DifferentiableSystem):
     __slots__ = SHARED_DICTIONARY
 
     def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
-        super().__init__()
-        self.set_name("reference")
-        covered = sum(reference.size for reference in references)
-        if covered != len(degrees):
-            raise ReferenceSignalError(
-                f"the references cover {covered} outputs, the law has {len(degrees)}"
-            )
         self.references, self.degrees = tuple(references), tuple(degrees)
-        self.function = stack_references(references, degrees)
-        self.reference_parameters = _common_parameters(self.references)
-        if self.reference_parameters:
-            values = np.concatenate([*self.reference_parameters.values()])
-            self.DeclareNumericParameter(BasicVector(values))
-        self._declare_reference({self.time_ticket(), self.all_parameters_ticket()})
-
-    def _declare_reference(self, sources: set[DependencyTicket]) -> None:
-        """Declares the port of R.
-
-        Args:
-            sources: The dependencies of R.
-        """
-        size = sum(degree + 1 for degree in self.degrees)
-        calculate = weakly(self._calc_reference)
-        self.DeclareVectorOutputPort("reference", size, calculate, sources)
+        self.reference_parameters = common_parameters(self.references)
+        block = reference_block(self.references, self.degrees, self.reference_parameters)
+        self._base = block  # Without commands.
+        super().__init__(block, sees_steps=False)
 
     @property
     def further_signals(self) -> dict[str, tuple[Signal, ...]]:
@@ -91,7 +69,7 @@ class ReferenceGenerator(DifferentiableSystem):
 
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s by the defaults of its parameters, shape (sum (mu_i + 1),)."""
-        return self.function(time).copy()
+        return self._at(time, self._base.default("parameters")).copy()
 
     def along(self, times: ArrayLike, context: Context | None = None) -> FloatArray:
         """R(t) at many times in s, one row for each; nan without a value.
@@ -101,8 +79,26 @@ class ReferenceGenerator(DifferentiableSystem):
             context: The block's context with the values of parameters; the defaults if None.
         """
         moments = vector("times", times, None, ReferenceSignalError)
-        function = self.function if context is None else self._in(context)
-        return signal_along(function, self.get_output_port().size(), moments)
+        values = self._base.default("parameters")
+        if context is not None and values.size:
+            values = context.get_numeric_parameter(0).CopyToVector()
+        rows = np.full((moments.size, self.get_output_port().size()), np.nan)
+        for row, time in zip(rows, moments.tolist(), strict=True):
+            with suppress(DrakeDaeError):
+                row[:] = self._at(time, values)
+        return rows
+
+    def _at(self, time: float, parameters: FloatArray) -> FloatArray:
+        given = {"time": np.array([time]), "parameters": parameters}
+        (values,) = self._function.evaluate(*(given[source] for source in self._function.sources))
+        if not self._function.is_valid:
+            failure, moment = self._function.failure(), np.zeros(0)
+            raise simulation_error(failure, time, moment, {})
+        return values
+
+    @cached_property
+    def _function(self) -> BlockFunction:
+        return BlockFunction(self._base, "", {"R": self._base.outputs["reference"]})
 
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of its references in a context.
@@ -140,47 +136,35 @@ class ReferenceGenerator(DifferentiableSystem):
             unknown_name("parameter of references", name, self.reference_parameters)
         )
 
-    def _in(self, context: Context) -> Callable[[float], FloatArray]:
-        """R(t) by the parameters of a context."""
-        if not self.reference_parameters:
-            return self.function
-        values = context.get_numeric_parameter(0).value()
 
-        def evaluate(time: float) -> FloatArray:
-            (reference,) = self._traced.evaluate(np.array([time]), values)
-            if not self._traced.is_valid:
-                raise not_finite(time, reference)
-            return reference
+def reference_block(
+    references: Sequence[Reference],
+    degrees: Sequence[int],
+    parameters: Mapping[str, FloatArray],
+) -> Block:
+    """R(t) with its derivatives, as a block; see `ReferenceGenerator`.
 
-        return evaluate
-
-    def _calc_reference(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._in(context)(context.get_time()))
-
-    @cached_property
-    def _traced(self) -> TracedFunction:
-        """R as a function of the time and, if there are any, the parameters."""
-        inputs = {"time": ca.SX.sym("t")}
-        symbols = {
-            name: ca.SX.sym(name, value.size) for name, value in self.reference_parameters.items()
-        }
-        references = [reference.with_parameters(symbols) for reference in self.references]
-        rows = traced_references(references, self.degrees, inputs["time"])
-        if symbols:
-            inputs["parameters"] = ca.vertcat(*symbols.values())
-        return TracedFunction("reference", inputs, {"R": rows})
-
-    def traced(self) -> Block:
-        sources = (TIME, PARAMETERS) if self.reference_parameters else (TIME,)
-        return Block(self, (Computation.of(self._traced, sources, ("reference",)),))
-
-    def _formulas(self) -> dict[str, Formula]:
-        if self.reference_parameters:
-            return {"reference": TracedFormula(self._traced, "R")}
-        return {"reference": _ReferenceFormula(self.references, self.degrees)}
+    Raises:
+        ReferenceSignalError: The references do not cover the outputs, or are not smooth enough.
+    """
+    covered = sum(reference.size for reference in references)
+    if covered != len(degrees):
+        raise ReferenceSignalError(
+            f"the references cover {covered} outputs, the law has {len(degrees)}"
+        )
+    symbols = {name: ca.SX.sym(name, value.size) for name, value in parameters.items()}
+    moved = [reference.with_parameters(symbols) for reference in references]
+    ranges = [r for each in references if (r := time_range(each)) is not None]
+    return Block(
+        "reference",
+        outputs={"reference": traced_references(moved, degrees, TIME)},
+        parameters=stacked(list(symbols.values())),
+        start={"parameters": np.concatenate([*parameters.values()])} if parameters else {},
+        requirements=tuple(ranges),
+    )
 
 
-def _common_parameters(references: Sequence[Reference]) -> dict[str, FloatArray]:
+def common_parameters(references: Sequence[Reference]) -> dict[str, FloatArray]:
     """The parameters of all references.
 
     Raises:
@@ -203,38 +187,30 @@ def traced_references(
     """R(t) of references at a symbolic time, shape (sum (mu_i + 1), 1).
 
     Raises:
-        ModelError: One is no expression of time.
+        ReferenceSignalError: One is no expression of time, or not smooth enough.
     """
     rows = [ca.SX(0, 1)]
     for reference, its_degrees in with_degrees(references, degrees):
         row = reference.expression(its_degrees, time)
         if row is None:
             whole = reference.reference if isinstance(reference, ReferenceRows) else reference
-            raise ModelError(
-                f"a {type(whole).__name__} is no expression of time, and rollouts, exports and "
-                "pages need one: take an ExpressionReference, PointToPointReference or "
-                "SinusoidReference, or run the loop by simulate"
+            raise ReferenceSignalError(
+                f"a {type(whole).__name__} is no expression of time: define its `expression`, or "
+                "take an ExpressionReference, or wire a system of your own to the controller's "
+                "port 'reference'"
             )
         rows.append(row)
     return ca.vertcat(*rows)
 
 
-class _ReferenceFormula:
-    """R(t); its derivative by the time needs one more derivative of each reference."""
-
-    sources = ("time",)
-
-    def __init__(self, references: Sequence[Reference], degrees: Sequence[int]) -> None:
-        self._evaluate = stack_references(references, degrees)
-        self._references, self._degrees = references, degrees
-
-    def value(self, time: float, *arguments: FloatArray) -> FloatArray:
-        return self._evaluate(time).copy()
-
-    @cached_property
-    def _higher(self) -> Callable[[float], FloatArray]:
-        return stack_references(self._references, [degree + 1 for degree in self._degrees])
-
-    def slope(self, moving: tuple[int, ...], time: float, *arguments: FloatArray) -> FloatArray:
-        higher = DerivativeLayout(tuple(degree + 1 for degree in self._degrees))
-        return np.delete(self._higher(time), higher.lowest)[:, None]
+def time_range(reference: Reference) -> Requirement | None:
+    """Within which times a Drake Trajectory has values; None for other references."""
+    whole = reference.reference if isinstance(reference, ReferenceRows) else reference
+    if not isinstance(whole, TrajectoryReference):
+        return None
+    first, last = whole.trajectory.start_time(), whole.trajectory.end_time()
+    reason = (
+        f"the reference Trajectory covers {first:g} to {last:g} s; extend it over the whole "
+        "simulation"
+    )
+    return Requirement(whole.margin(TIME), reason, FailureKind.OUTSIDE)

@@ -2,15 +2,17 @@
 
 from dataclasses import dataclass
 from math import ceil, floor, isfinite
+from typing import Any
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import EventStatus
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_whole_number
-from drake_dae.blocks.computations import HELD, Block, Computation, Update
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.blocks.block import Block, Held
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.errors import ModelError, NonFiniteError, WiringError
 
 _SAME = 1e-9
@@ -66,7 +68,7 @@ class Sampling:
 
 
 @checked(ModelError)
-class ControlHold(LeafSystem):
+class ControlHold(TracedSystem):
     """Makes any controller a sampled one: between samples the control is held,
 
         u(t) = control(t_k)    for    t_k + delay <= t < t_(k+1) + delay,    t_k = k period.
@@ -96,30 +98,13 @@ class ControlHold(LeafSystem):
     __slots__ = SHARED_DICTIONARY
 
     def __init__(self, size: int, sampling: Sampling) -> None:
-        super().__init__()
         check_whole_number("size", size, 1)
-        self.set_name("control_hold")
-        self.sampling = sampling
-        self.sample_period = sampling.period
-        self._port = self.DeclareVectorInputPort("control", size)
-        # The held control; then the waiting ones, the oldest first.
-        waiting = sampling.whole_periods + (sampling.rest > 0.0)
-        self._state = self.DeclareDiscreteState(np.full((1 + waiting) * size, np.nan))
-        self.DeclareInitializationUnrestrictedUpdateEvent(weakly(self._begin))
-        read = self._read if sampling.rest else self._read_and_act
-        self.DeclarePeriodicUnrestrictedUpdateEvent(sampling.period, 0.0, weakly(read))
-        if sampling.rest:
-            self.DeclarePeriodicUnrestrictedUpdateEvent(
-                sampling.period, sampling.rest, weakly(self._act)
-            )
-        self.DeclareVectorOutputPort("control", size, weakly(self._calc), {self.xd_ticket()})
+        self.sampling, self.sample_period = sampling, sampling.period
+        super().__init__(hold_block(size, sampling))
 
-    def _begin(self, context: Context, state: State) -> EventStatus:
-        rows = self._rows(context)
-        if not np.isnan(rows).any():
-            return EventStatus.DidNothing()  # A run that is continued.
+    def _begin(self, *arguments: Any) -> EventStatus:
         try:
-            rows[:] = self._port.Eval(context)
+            return super()._begin(*arguments)
         except NonFiniteError as error:
             raise WiringError(
                 "the first control cannot be found, as where a law reads the force that its own "
@@ -127,52 +112,16 @@ class ControlHold(LeafSystem):
                 "at the start, or set what control_hold holds before the first sample by "
                 "SetDiscreteState"
             ) from error
-        return self._set(state, rows)
 
-    def _read_and_act(self, context: Context, state: State) -> EventStatus:
-        return self._set(state, np.vstack([self._rows(context)[1:], self._port.Eval(context)]))
 
-    def _read(self, context: Context, state: State) -> EventStatus:
-        rows = self._rows(context)
-        return self._set(state, np.vstack([rows[:1], rows[2:], self._port.Eval(context)]))
-
-    def _act(self, context: Context, state: State) -> EventStatus:
-        rows = self._rows(context)
-        rows[0] = rows[1]
-        return self._set(state, rows)
-
-    def _rows(self, context: Context) -> np.ndarray:
-        vector = context.get_discrete_state(self._state).CopyToVector()
-        return vector.reshape(-1, self._port.size())
-
-    def _set(self, state: State, rows: np.ndarray) -> EventStatus:
-        state.get_mutable_discrete_state().set_value(self._state, rows.ravel())
-        return EventStatus.Succeeded()
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._rows(context)[0])
-
-    def traced(self) -> Block:
-        size = self._port.size()
-        waiting = self.sampling.whole_periods + (self.sampling.rest > 0.0)
-        rows, control = ca.SX.sym("held", (1 + waiting) * size), ca.SX.sym("control", size)
-
-        def computation(*parts: ca.SX) -> Computation:
-            function = ca.Function("held", [rows, control], [ca.vertcat(*parts)])
-            return Computation(function, (HELD, "control"), (HELD,))
-
-        now, later = rows[:size, 0], rows[size:, 0]
-        period, rest = self.sampling.period, self.sampling.rest
-        updates = [Update(computation(later, control), period, 0.0, True)]
-        if rest:
-            read = computation(now, later[size:, 0], control)
-            act = ca.Function("act", [rows], [ca.vertcat(later[:size, 0], later)])
-            updates = [
-                Update(read, period, 0.0, True),
-                Update(Computation(act, (HELD,), (HELD,)), period, rest, True),
-            ]
-        shown = Computation(ca.Function("shown", [rows], [now]), (HELD,), ("control",))
-        first = ca.Function("first", [control], [ca.repmat(control, 1 + waiting, 1)])
-        return Block(
-            self, (shown,), tuple(updates), initial=Computation(first, ("control",), (HELD,))
-        )
+def hold_block(size: int, sampling: Sampling) -> Block:
+    """The held control, and those on the way, the oldest first; see `ControlHold`."""
+    count, rate = sampling.whole_periods + (sampling.rest > 0.0), sampling.period
+    control, now = ca.SX.sym("control", size), ca.SX.sym("now", size)
+    later, unknown = ca.SX.sym("later", count * size), np.full(size, np.nan)
+    first, coming = ca.vertsplit(ca.vertcat(later, control), [0, size, (count + 1) * size])
+    held = {"now": Held(now, first, unknown, rate, sampling.rest, begin=control)}
+    if count:
+        begin = ca.repmat(control, count, 1)
+        held["later"] = Held(later, coming, np.tile(unknown, count), rate, begin=begin)
+    return Block("control_hold", {"control": control}, {"control": now}, held=held)

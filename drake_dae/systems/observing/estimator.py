@@ -1,24 +1,25 @@
 """An estimator of state, disturbance and friction from measured positions."""
 
-from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, EventStatus, State, ValueProducer
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.blocks.computations import HELD, PARAMETERS, TIME, Block, Computation
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.dae.system.signals import Signal
+from drake_dae.blocks.block import TIME, Held, where_finite
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
 from drake_dae.systems.observing.observer_rates import Observing
-from drake_dae.systems.observing.observing_system import ObservingSystem
+from drake_dae.systems.observing.observing_system import (
+    ObservingSystem,
+    check_timing,
+    columns,
+    observer_block,
+)
 
 
 @checked(ModelError)
@@ -94,9 +95,8 @@ class StateEstimator(ObservingSystem):
         position_deviation: ArrayLike = 0.0,
         velocity_deviation: ArrayLike = 0.0,
     ) -> None:
-        super().__init__(law, observing, sample_period, control_lag, control_delay)
-        self.set_name("state_estimator")
-        count = law.system.num_states // 2
+        period = check_timing(sample_period, control_lag, control_delay)
+        system, count = law.system, law.system.num_states // 2
         noise = [
             _each(name, given, count)
             for name, given in (
@@ -104,133 +104,43 @@ class StateEstimator(ObservingSystem):
                 ("velocity_deviation", velocity_deviation),
             )
         ]
-        filters = state_filters(observing, sample_period, *noise)
-        timing = sample_period, control_lag, control_delay, plant_step
-        self._functions = functions = EstimatorFunctions(law, observing, *timing, filters, noise[0])
-        start = np.zeros(functions.now.sizes[functions.now.input_names.index("held")])
-        start[0] = -1.0
-        self._declare(law, functions, "measured_state", start)
-        self._read = functions.reads
-        held = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}
-        names = "measured_state", *self._read
-        read = {self.input_port_ticket(self._ports[name].get_index()) for name in names}
-        entry = self.DeclareCacheEntry(
-            "estimate",
-            ValueProducer(
-                lambda: AbstractValue.Make(start[: functions.size].copy()), weakly(self._calc)
-            ),
-            held | read | {self.time_ticket()},
-        )
-        self._index = entry.cache_index()
-        force = entry.ticket()
-        if self._measures:
-            force = self.input_port_ticket(self._ports["measured_force"].get_index())
-        self._declare_hold(force)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
-        sources = {entry.ticket(), self.all_parameters_ticket()}
-        read = {force, self.input_port_ticket(self._ports["reference"].get_index())}
-        exogenous = port_value(self._exogenous_values)
-        state, disturbance, friction = (port_value(self._part, part) for part in self._parts[:3])
-        for name, size, value, tickets in (
-            ("estimated_state", law.system.num_states, state, sources),
-            ("exogenous", functions.exogenous.outputs[0].size, exogenous, sources | read),
-            ("disturbance", count, disturbance, sources),
-            ("friction", len(self.friction_signals), friction, sources),
-        ):
-            self.DeclareVectorOutputPort(name, size, value, tickets)
-        if not self._measures:
-            size = law.system.num_constraints
-            self.DeclareVectorOutputPort(_FORCE, size, port_value(self._force), {force})
-
-    @property
-    def _parts(self) -> tuple[slice, ...]:
-        """The parts of an estimate: state, disturbance, friction, force and slides."""
-        estimate = self._functions.estimate
-        columns = (
-            estimate.sample,
-            estimate.state,
-            estimate.disturbance,
-            estimate.friction,
-            estimate.force,
-            estimate.slides,
-        )
-        ends = np.cumsum([column.numel() for column in columns]).tolist()
-        return tuple(slice(*pair) for pair in pairwise(ends))
-
-    @property
-    def _measures(self) -> bool:
-        return self._functions.measures
-
-    @property
-    def further_signals(self) -> dict[str, Sequence[Signal]]:
-        """Name of an output port in a record -> names and units of its entries."""
-        signals = dict(super().further_signals)
-        if not self._measures:
-            signals[_FORCE] = self.dae.constraint_input_signals
-        return signals
-
-    def _force(self, context: Context) -> FloatArray:
-        if self._measures:
-            return super()._force(context)
-        return self._estimate(context)[self._parts[3]]
-
-    @property
-    def _mu(self) -> slice:
-        return self._parts[2]
-
-    def _calc(self, context: Context, value: AbstractValue) -> None:
-        (x,) = self._inputs(context, "measured_state")
-        held = context.get_discrete_state(self._held).value()
-        read = [*self._inputs(context, *self._read[:-1]), self._held_up(context)]
-        time = np.array([context.get_time()])
-        (estimate, *_) = self._checked(self._functions.now, context, x, held, *read, time)
-        value.set_value(estimate.copy())
-
-    def _estimate(self, context: Context) -> FloatArray:
-        estimate: FloatArray = self.get_cache_entry(self._index).Eval(context)
-        return estimate
-
-    def _part(self, part: slice, context: Context) -> FloatArray:
-        return self._estimate(context)[part]
-
-    def _sample(self, context: Context, state: State) -> EventStatus:
-        estimate = self._estimate(context)
-        (control,) = self._inputs(context, "control")
-        reference = self._reference(context, estimate[self._parts[0]])
-        held = [estimate, control, self._force(context), reference]
-        state.get_mutable_discrete_state().set_value(self._held, np.concatenate(held))
-        return EventStatus.Succeeded()
-
-    def _exogenous_values(self, context: Context) -> FloatArray:
-        estimate = self._estimate(context)
-        x = estimate[self._parts[0]]
-        inputs = estimate, self._force(context), self._reference(context, x)
-        return self._checked(self._functions.exogenous, context, x, *inputs)[0]
-
-    def traced(self) -> Block:
-        functions, estimate = self._functions, self._functions.estimate
-        sources = ("measured_state", HELD, *self._read, TIME, PARAMETERS)
-        now = Computation.of(functions.now, sources, (_NOW,))
-        force = "measured_force" if self._measures else _FORCE
-        state = ("estimated_state", _NOW, force, "reference", PARAMETERS)
-        parts = {
-            "estimated_state": estimate.state,
-            "disturbance": estimate.disturbance,
-            "friction": estimate.friction,
+        filters = state_filters(observing, period, *noise)
+        timing = period, control_lag, control_delay, plant_step
+        functions = EstimatorFunctions(law, observing, *timing, filters, noise[0])
+        sizes = dict(zip(functions.now.input_names, functions.now.sizes, strict=True))
+        memory, p = ca.SX.sym("held", sizes["held"]), system.parameter_symbol
+        inputs = columns(law, "measured_state", with_force=functions.measures)
+        read = [inputs[name] for name in functions.reads]
+        now, _, *checks = functions.now.function(inputs["measured_state"], memory, *read, TIME, p)
+        estimate = functions.estimate
+        names = ("sample", "state", "disturbance", "friction", "force", "slides")
+        ends = np.cumsum([0, *(getattr(estimate, name).numel() for name in names)]).tolist()
+        now = where_finite(now, checks[-1])
+        _, x, disturbance, friction, by_model, _ = ca.vertsplit(now, ends)
+        force = inputs["measured_force"] if functions.measures else by_model
+        reference = inputs["reference"]
+        signals, *valid = functions.exogenous.function(x, now, force, reference, p)
+        outputs = {
+            "estimated_state": x,
+            "exogenous": where_finite(signals, valid[-1]),
+            "disturbance": disturbance,
+            "friction": friction,
         }
-        parts |= {} if self._measures else {_FORCE: estimate.force}
-        column = estimate.column
-        shown = ca.Function("shown", [column], list(parts.values()))
-        sizes = self.dae.num_controls, self.dae.num_constraints, self._ports["reference"].size()
-        held = [column, *(ca.SX.sym("held", size) for size in sizes)]
-        after = ca.Function("after", held, [ca.vertcat(*held)])
-        computations = (
-            now,
-            Computation(shown, (_NOW,), tuple(parts)),
-            Computation.of(functions.exogenous, state, ("exogenous",)),
+        if not functions.measures:
+            outputs["estimated_force"] = by_model
+        start = np.zeros(sizes["held"])
+        start[0] = -1.0
+        after = ca.vertcat(now, inputs["control"], force, reference)
+        held, place = Held(memory, after, start, period), ends[3]
+        block = observer_block(
+            "state_estimator", law, functions, inputs, outputs, force, held, place
         )
-        sample = Computation(after, (_NOW, "control", force, "reference"), (HELD,))
-        return self._block(computations, sample, force)
+        moving = functions.observation.moving.function(x, p)[0]
+        block = replace(block, defaults={**block.defaults, "reference": moving})
+        if not functions.measures:
+            named = {**block.signals, "estimated_force": system.constraint_input_signals}
+            block = replace(block, signals=named)
+        super().__init__(law, observing, period, functions, block, place)
 
 
 def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
@@ -239,7 +149,3 @@ def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
     if deviations.shape not in ((), (count,)) or not np.all(deviations >= 0.0):
         raise ModelError(f"{name} must be 0 or more, a number or shape ({count},), got {given!r}")
     return np.broadcast_to(deviations, (count,))
-
-
-_NOW, _FORCE = "estimate", "estimated_force"
-"""The name of the estimate among the computations of the block, and the port of the force."""

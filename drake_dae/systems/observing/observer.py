@@ -1,27 +1,24 @@
 """An observer of model errors: a disturbance, and coefficients of friction."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-import casadi as ca
 import numpy as np
-from pydrake.systems.framework import Context, EventStatus, State
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import HELD, PARAMETERS, Block, Computation
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
+from drake_dae.blocks.block import Held, where_finite
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observer_functions import ObserverFunctions
 from drake_dae.systems.observing.observer_rates import Observing
-from drake_dae.systems.observing.observing_system import ObservingSystem
-from drake_dae.trace.functions import TracedFunction
-
-_ESTIMATES = ("identified", "identified_deviation")
-"""The ports of estimated parameters and of their standard deviations."""
-
-_READ = ("estimated_state", "measured_force", "reference")
+from drake_dae.systems.observing.observing_system import (
+    ObservingSystem,
+    check_timing,
+    columns,
+    observer_block,
+)
 
 
 @checked(ModelError)
@@ -99,88 +96,41 @@ class DisturbanceObserver(ObservingSystem):
         control_delay: float = 0.0,
         is_ideal: bool = False,
     ) -> None:
-        super().__init__(law, observing, sample_period, control_lag, control_delay)
-        self.set_name("disturbance_observer")
-        self._functions = functions = ObserverFunctions(
-            law, observing, sample_period, control_lag, control_delay, is_ideal
+        period = check_timing(sample_period, control_lag, control_delay)
+        functions = ObserverFunctions(law, observing, period, control_lag, control_delay, is_ideal)
+        memory, filtered = functions.memory, functions.filter
+        column, p = memory.column, law.system.parameter_symbol
+        inputs = columns(law, "estimated_state", with_force=True)
+        x, u, hold, reference, force = inputs.values()
+        after, _, *checks = functions.sample.function(x, column, u, force, hold, reference, p)
+        signals, *valid = functions.exogenous.function(x, column, force, reference, p)
+        start = np.zeros(column.numel())
+        start[start.size - filtered.start.size :] = filtered.start
+        outputs = {
+            "exogenous": where_finite(signals, valid[-1]),
+            "disturbance": memory.disturbance,
+            "friction": memory.friction,
+        }
+        place = memory.disturbance.numel()
+        held = Held(column, where_finite(after, checks[-1]), start, period)
+        block = observer_block(
+            "disturbance_observer", law, functions, inputs, outputs, force, held, place
         )
-        start = np.zeros(functions.memory.column.numel())
-        start[start.size - functions.filter.start.size :] = functions.filter.start
-        self._declare(law, functions, "estimated_state", start)
-        self._declare_hold(self.input_port_ticket(self._ports["measured_force"].get_index()))
-        # Unrestricted, as the step of a discrete MultibodyPlant: so all see one instant.
-        self.DeclarePeriodicUnrestrictedUpdateEvent(sample_period, 0.0, weakly(self._sample))
-        sources = {self.discrete_state_ticket(self._held), self.all_parameters_ticket()}
-        reads = {self.input_port_ticket(self._ports[port].get_index()) for port in _READ}
-        count = functions.exogenous.outputs[0].size
-        value = port_value(self._exogenous_values)
-        self.DeclareVectorOutputPort("exogenous", count, value, sources | reads)
-        for name, part in (("disturbance", slice(0, self._mu.start)), ("friction", self._mu)):
-            value = port_value(self._part, part)
-            self.DeclareVectorOutputPort(name, part.stop - part.start, value, sources)
-        identified = self.observation.identified.signals
-        self.identified_signals = (*identified, *self.friction_signals) if identified else ()
-        self._estimates = dict[str, ca.SX]()
-        if count := len(self.identified_signals):
-            memory, filtered = functions.memory, functions.filter
-            parts = filtered.values(memory.friction), filtered.deviations
-            self._estimates = dict(zip(_ESTIMATES, parts, strict=True))
-            held = {"held": memory.column}
-            self._estimated = TracedFunction("estimates", held, self._estimates, often=False)
-            for index, name in enumerate(_ESTIMATES):
-                value = port_value(self._estimate, index)
-                self.DeclareVectorOutputPort(name, count, value, sources)
+        identified = functions.observation.identified.signals
+        if identified:
+            names = (*identified, *block.signals["friction"])
+            estimates = {
+                "identified": filtered.values(memory.friction),
+                "identified_deviation": filtered.deviations,
+            }
+            block = replace(
+                block,
+                outputs={**block.outputs, **estimates},
+                signals={**block.signals, **dict.fromkeys(estimates, names)},
+            )
+        super().__init__(law, observing, period, functions, block, place)
 
     @property
-    def _mu(self) -> slice:
-        memory = self._functions.memory
-        first = memory.disturbance.numel()
-        return slice(first, first + memory.friction.numel())
-
-    @property
-    def further_signals(self) -> dict[str, Sequence[Signal]]:
-        signals = dict(super().further_signals)
-        if self.identified_signals:
-            signals |= dict.fromkeys(_ESTIMATES, self.identified_signals)
-        return signals
-
-    def _estimate(self, index: int, context: Context) -> FloatArray:
-        held = context.get_discrete_state(self._held).value()
-        values: FloatArray = self._estimated.evaluate(held)[index]
-        return values
-
-    def _sample(self, context: Context, state: State) -> EventStatus:
-        x, u, force = self._inputs(context, "estimated_state", "control", "measured_force")
-        inputs = (
-            context.get_discrete_state(self._held).value(),
-            u,
-            force,
-            self._held_up(context),
-            self._reference(context, x),
-        )
-        after = self._checked(self._functions.sample, context, x, *inputs)[0]
-        state.get_mutable_discrete_state().set_value(self._held, after)
-        return EventStatus.Succeeded()
-
-    def _exogenous_values(self, context: Context) -> FloatArray:
-        x, force = self._inputs(context, "estimated_state", "measured_force")
-        held = context.get_discrete_state(self._held).value()
-        inputs = x, held, force, self._reference(context, x)
-        return self._checked(self._functions.exogenous, context, *inputs)[0]
-
-    def _part(self, part: slice, context: Context) -> FloatArray:
-        return context.get_discrete_state(self._held).value()[part]
-
-    def traced(self) -> Block:
-        functions, memory = self._functions, self._functions.memory
-        read = ("estimated_state", HELD)
-        needed = (*read, "measured_force", "reference", PARAMETERS)
-        sampled = (*read, "control", "measured_force", "hold", "reference", PARAMETERS)
-        parts = {"disturbance": memory.disturbance, "friction": memory.friction}
-        parts |= self._estimates
-        shown = ca.Function("shown", [memory.column], list(parts.values()))
-        computations = (
-            Computation.of(functions.exogenous, needed, ("exogenous",)),
-            Computation(shown, (HELD,), tuple(parts)),
-        )
-        return self._block(computations, Computation.of(functions.sample, sampled, (HELD,)))
+    def identified_signals(self) -> Sequence[Signal]:
+        """Names and units of `identified`; empty without it."""
+        return self.block.signals.get("identified", ())

@@ -1,20 +1,21 @@
 """The base class of observers of model errors: their ports, and the hold of integrals."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import Context, DependencyTicket
+from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray, numbers, positive
-from drake_dae.blocks.computations import PARAMETERS, Block, Computation, Update, zero
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
+from drake_dae.arrays import numbers, positive
+from drake_dae.blocks.block import Block, Held
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.blocks.block import NO_TIME_DERIVATIVE, ParameterizedSystem
 from drake_dae.systems.observing.observed import Observed
 from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.parameterized import ParameterizedSystem
 
 
 class ObservingSystem(ParameterizedSystem):
@@ -24,97 +25,46 @@ class ObservingSystem(ParameterizedSystem):
         law: The law.
         observing: The rates, and the thresholds for friction.
         sample_period: T in s.
-        control_lag: The fraction of T for which the plant uses the previous control, from 0 to 1.
-        control_delay: tau in s, the mean time from a sample until its control acts.
+        functions: The functions of the observer.
+        block: Its block, with one group of held values.
+        place: The place of mu among these.
 
     Attributes:
         observing, sample_period: The arguments.
         observation: The observed functions.
         disturbance_signals, friction_signals: Names and units of the output ports.
-
-    Raises:
-        ModelError: A number is not valid.
     """
 
     __slots__ = SHARED_DICTIONARY
-    no_gradient = NO_TIME_DERIVATIVE
 
     def __init__(
         self,
         law: TrackingLaw,
         observing: Observing,
         sample_period: float,
-        control_lag: float,
-        control_delay: float,
+        functions: Observed,
+        block: Block,
+        place: int,
     ) -> None:
-        system = law.system
-        signals = {
-            "state": system.state_signals,
-            "control": system.control_signals,
-            "constraint_input": system.constraint_input_signals,
-        }
-        super().__init__(system, system.parameter_values, signals, sees_steps=False)
-        self.observing, self.sample_period = observing, positive("sample_period", sample_period)
-        if not 0.0 <= control_lag <= 1.0:
-            raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
-        if not control_delay >= 0.0:
-            raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
-
-    def _declare(
-        self, law: TrackingLaw, functions: Observed, state: str, start: FloatArray
-    ) -> None:
-        """Declares input ports and the discrete state.
-
-        Args:
-            law: The law.
-            functions: The functions of the observer.
-            state: The name of the port of the state.
-            start: The discrete state before the first sample, with zeros for friction at `_mu`.
-        """
-        system, self._observed = law.system, functions
-        self.observation = observation = functions.observation
-        names = list(observation.frictions)
-        self.disturbance_signals = tuple(
-            Signal(f"disturbance of {system.state_signals[i].name}") for i in observation.rows
-        )
-        self.friction_signals = tuple(Signal(name) for name in names)
-        sizes = {
-            state: system.num_states,
-            "control": system.num_controls,
-            "hold": 1,
-            "reference": law.layout.reference_size,
-        }
-        if self._measures:
-            sizes["measured_force"] = system.num_constraints
-        self._ports = {name: self.DeclareVectorInputPort(name, n) for name, n in sizes.items()}
-        for j, name in enumerate(names, self._mu.start):
-            start[j : j + 1] = system.parameter_values[system.parameter_slice(name)]
-        self._held = self.DeclareDiscreteState(start)
-
-    def _declare_hold(self, force: DependencyTicket) -> None:
-        """Declares the output port `hold`, which depends on the force."""
-        tickets = {force, self.input_port_ticket(self._ports["hold"].get_index())}
-        self.DeclareVectorOutputPort("hold", 1, port_value(self._hold_output), tickets)
+        self.observing, self.sample_period = observing, sample_period
+        self.observation = functions.observation
+        self._place = place
+        super().__init__(law.system, block, degrees=(), sees_steps=False)
 
     @property
-    def _measures(self) -> bool:
-        """Whether the constraint force comes from a sensor."""
-        return True
-
-    def _force(self, context: Context) -> FloatArray:
-        """The constraint force."""
-        return np.asarray(self._ports["measured_force"].Eval(context))
+    def disturbance_signals(self) -> Sequence[Signal]:
+        return self.block.signals["disturbance"]
 
     @property
-    def _mu(self) -> slice:
-        """The part of the discrete state that is mu."""
-        raise NotImplementedError
+    def friction_signals(self) -> Sequence[Signal]:
+        return self.block.signals["friction"]
 
     @property
     def further_signals(self) -> dict[str, Sequence[Signal]]:
         """Name of an output port in a record -> names and units of its entries."""
-        ports = {"disturbance": self.disturbance_signals, "friction": self.friction_signals}
-        return {name: signals for name, signals in ports.items() if signals}
+        named = {name: self.block.signals.get(name, ()) for name in self.block.outputs}
+        others = ("estimated_state", "exogenous", "hold")
+        return {name: signals for name, signals in named.items() if signals and name not in others}
 
     def set_friction(self, context: Context, friction: ArrayLike) -> None:
         """Sets the initial coefficients of friction, shape (c,), or a number for all.
@@ -130,51 +80,84 @@ class ObservingSystem(ParameterizedSystem):
                 f"friction must be from 0 to {most:g}, a number or shape ({count},), got "
                 f"{friction!r}"
             )
-        values = context.get_discrete_state(self._held).CopyToVector()
-        values[self._mu] = given
-        context.SetDiscreteState(self._held, values)
+        values = context.get_discrete_state(0).CopyToVector()
+        values[self._place : self._place + count] = given
+        context.SetDiscreteState(0, values)
 
-    def _inputs(self, context: Context, *names: str) -> list[FloatArray]:
-        """The values of input ports."""
-        return [self._ports[name].Eval(context) for name in names]
 
-    def _held_up(self, context: Context) -> FloatArray:
-        """The input port `hold`; 0 without a wire."""
-        port = self._ports["hold"]
-        return np.asarray(port.Eval(context)) if port.HasValue(context) else np.zeros(1)
+def check_timing(sample_period: float, control_lag: float, control_delay: float) -> float:
+    """Checks the numbers of an observer's samples, and returns T.
 
-    def _reference(self, context: Context, state: FloatArray) -> FloatArray:
-        """The input port `reference`; without a wire the current rates."""
-        port = self._ports["reference"]
-        if port.HasValue(context):
-            return np.asarray(port.Eval(context))
-        return self._checked(self.observation.moving, context, state)[0].copy()
+    Raises:
+        ModelError: One is not valid.
+    """
+    if not 0.0 <= control_lag <= 1.0:
+        raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
+    if not control_delay >= 0.0:
+        raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
+    return positive("sample_period", sample_period)
 
-    def _hold_output(self, context: Context) -> FloatArray:
-        return self._observed.hold.evaluate(self._force(context), self._held_up(context))[0]
 
-    def _block(
-        self,
-        computations: Sequence[Computation],
-        sample: Computation,
-        force: str = "measured_force",
-    ) -> Block:
-        """The observer with some computations, and the update of its state at samples.
+def observer_block(
+    name: str,
+    law: TrackingLaw,
+    functions: Observed,
+    inputs: Mapping[str, ca.SX],
+    outputs: Mapping[str, ca.SX],
+    force: ca.SX,
+    held: Held,
+    place: int,
+) -> Block:
+    """The block of an observer, with the ports that all have.
 
-        Args:
-            computations: All computations except that of the port `hold`.
-            sample: The computation of its state after a sample.
-            force: The source of the constraint force.
-        """
-        rates = self.observation.moving, ("estimated_state", PARAMETERS), ("reference",)
-        return Block(
-            self,
-            (*computations, Computation.of(self._observed.hold, (force, "hold"), ("hold",))),
-            (Update(sample, self.sample_period, is_unrestricted=True),),
-            unwired={
-                "hold": zero("hold"),
-                "reference": Computation.of(*rates),
-            },
-            signals=self._signals,
-            ports={"disturbance": self.disturbance_signals, "friction": self.friction_signals},
-        )
+    Args:
+        name: Its name.
+        law: The law.
+        functions: The functions of the observer.
+        inputs: Its input ports.
+        outputs: Its output ports without `hold`.
+        force: The constraint force.
+        held: Its memory, with zeros at the place of mu in the start.
+        place: The place of mu among the held values.
+    """
+    system, observation = law.system, functions.observation
+    names = list(observation.frictions)
+    for j, friction in enumerate(names, place):
+        held.start[j : j + 1] = system.parameter_values[system.parameter_slice(friction)]
+    state = next(symbol for port, symbol in inputs.items() if port.endswith("_state"))
+    rates = observation.moving.function(state, system.parameter_symbol)[0]
+    hold = functions.hold.function(force, inputs["hold"])[0]
+    rows = observation.rows
+    return Block(
+        name,
+        inputs,
+        {**outputs, "hold": hold},
+        parameters=system.parameter_symbol,
+        start={"parameters": system.parameter_values},
+        held={"memory": held},
+        defaults={"hold": ca.SX.zeros(1), "reference": rates},
+        signals={
+            "estimated_state": system.state_signals,
+            "measured_state": system.state_signals,
+            "control": system.control_signals,
+            "measured_force": system.constraint_input_signals,
+            "disturbance": tuple(
+                Signal(f"disturbance of {system.state_signals[i].name}") for i in rows
+            ),
+            "friction": tuple(Signal(friction) for friction in names),
+        },
+    )
+
+
+def columns(law: TrackingLaw, state: str, *, with_force: bool) -> dict[str, ca.SX]:
+    """The input ports of an observer, with new symbols."""
+    system = law.system
+    sizes = {
+        state: system.num_states,
+        "control": system.num_controls,
+        "hold": 1,
+        "reference": law.layout.reference_size,
+    }
+    if with_force:
+        sizes["measured_force"] = system.num_constraints
+    return {name: ca.SX.sym(name, size) for name, size in sizes.items()}

@@ -1,42 +1,30 @@
 """Any DaeSystem as a LeafSystem."""
 
 from collections.abc import Mapping
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    ContinuousState,
-    DependencyTicket,
-    EventStatus,
-    State,
-)
+from pydrake.systems.framework import Context, EventStatus
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.blocks.computations import Block
+from drake_dae.arrays import FloatArray
+from drake_dae.blocks.block import Block, Projection, Requirement
 from drake_dae.blocks.failures import (
     assembled_otherwise,
     jammed_contact,
-    off_manifold,
     off_start,
     singular_configuration,
 )
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.blocks.trials import state_tickets
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.structure.redundancy import manifold_of_left_out
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import InconsistentStateError, ModelError, SimulationError, SingularityError
-from drake_dae.systems.blocks.along import function_along
-from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.formulas import Formula, TracedFormula
+from drake_dae.errors import ModelError, SimulationError, SingularityError
+from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.plants.traced_plant import traced_plant
-from drake_dae.trace.functions import TracedFunction
-
-_CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
 
 
 @checked(ModelError)
@@ -89,8 +77,6 @@ class DaePlant(ParameterizedSystem, Plant):
     Attributes:
         structure: The structure.
         projects: Whether the state is projected onto N* after each step.
-        functions: Name of an output port -> its function of state, parameters and, for some, the
-            control.
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
@@ -112,51 +98,15 @@ class DaePlant(ParameterizedSystem, Plant):
         project: bool = True,
     ) -> None:
         structure = constraint_structure_of(type(self).__name__, system, structure)
-        signals = {"state": system.state_signals, "control": system.control_signals}
-        super().__init__(system, system.parameter_values, signals)
-        self.structure = structure
-        self.set_name(system.name)
-        elimination, derivatives = structure.elimination, structure.derivatives
-        constraint_input = derivatives.expand(derivatives.constraint_input)
-        output = system.outputs(constraint_input)
-        force = system.forces(constraint_input)
-        self._is_controlled = system.num_controls > 0
-        rate = derivatives.expand(derivatives.rate)
-        self.dynamics = structure.trace("dynamics", rate, self._is_controlled)
-        self._force = structure.trace("constraint force", force, elimination.beta.nnz() > 0)
-        needs_control = elimination.n_star.nnz() > 0
-        self._output = structure.trace("controlled output", output, needs_control)
-        self.functions: dict[str, TracedFunction] = {
-            "constraint_force": self._force,
-            "constraint_residual": structure.manifold.residual_function,
-            "controlled_output": self._output,
-        }
+        self._start(structure, dae_block(structure, project))
 
-        self.DeclareContinuousState(BasicVector(structure.manifold.project(system.nominal_state)))
-        self._control_port = self.DeclareVectorInputPort("control", system.num_controls)
-        residual = structure.manifold.residual_expression
-        self._left_out = manifold_of_left_out(system)
-        degrees = system.exogenous.degrees(rate, force, output, residual)
-        self._by_state = state_tickets(self) | self._declare_exogenous(degrees)
-        self._control_ticket = self.input_port_ticket(self._control_port.get_index())
-        self.DeclareVectorOutputPort(
-            "state", system.num_states, weakly(self._copy_state), state_tickets(self)
-        )
-        for name, function in self.functions.items():
-            calculate = port_value(self._evaluate, function)
-            if name == "constraint_residual":
-                calculate = port_value(self._residual)
-            size = function.outputs[0].size
-            self.DeclareVectorOutputPort(name, size, calculate, self._tickets(function))
+    def _start(self, structure: ConstraintStructure, block: Block) -> None:
+        """Makes the system of its block."""
+        system, values = structure.system, (*block.outputs.values(), block.derivative)
+        self.structure, self._left_out = structure, manifold_of_left_out(structure.system)
+        self.projects = block.projection is not None
+        super().__init__(system, block, system.exogenous.degrees(*values))
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
-        self.projects = bool(project and system.num_constraints)
-        if self.projects:
-            self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
-
-    def _tickets(self, function: TracedFunction) -> set[DependencyTicket]:
-        """The dependencies of the values of a function."""
-        takes_control = "control" in function.input_names
-        return self._by_state | ({self._control_ticket} if takes_control else set())
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
         """Sets the state on N* next to a guess, shape (n,), and returns it.
@@ -171,90 +121,31 @@ class DaePlant(ParameterizedSystem, Plant):
         self.set_state(context, state)
         return state
 
-    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        # Called most by an integrator, so without further calls for valid values.
-        if self._is_controlled and self._exogenous is None:
-            control = self._control_port.Eval(context)
-            state = context.get_continuous_state_vector().value()
-            parameters = context.get_numeric_parameter(0).value()
-            (rate,) = self.dynamics.evaluate(state, control, parameters)
-            if self.dynamics.is_valid:
-                derivatives.SetFromVector(rate)
-                return
-        derivatives.SetFromVector(self._evaluate(self.dynamics, context))
-
-    def _evaluate(self, function: TracedFunction, context: Context) -> FloatArray:
-        x = context.get_continuous_state_vector().value()  # The context's own numbers, no copy.
-        if "control" in function.input_names:
-            return self._checked(function, context, x, self._control_port.Eval(context))[0]
-        return self._checked(function, context, x)[0]
-
-    def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
-        """The values of a port of `functions` at given times, one row each; nan without a value.
-
-        Args:
-            port: The port's name.
-            given: "state", "parameters" and "control", one row for each time.
-
-        Raises:
-            ModelError: There is no such port, or values are missing or have a wrong size.
-        """
-        if port not in self.functions:
-            raise ModelError(f"{self.dae.name}: {unknown_name('port', port, self.functions)}")
-        function = self.functions[port]
-        sizes = {
-            "state": self.dae.num_states,
-            "control": self.dae.num_controls,
-            "parameters": self.dae.parameter_symbol.numel(),
-        }
-        for name in function.input_names:
-            if name not in given or np.shape(given[name])[1:] != (sizes[name],):
-                raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {sizes[name]})")
-        return function_along(function, given)
-
     def explained(
-        self,
-        error: SimulationError,
-        parameters: FloatArray,
-        *inputs: FloatArray,
+        self, error: SimulationError, values: Mapping[str, FloatArray]
     ) -> SimulationError:
         """Returns the error with dependent constraints, or in a Painleve paradox its outcome."""
         if not isinstance(error, SingularityError):
             return error
+        parameters = values.get("parameters", np.zeros(0))
+        if "input exogenous" in values:
+            parameters = parameters.copy()
+            parameters[self.exogenous_places] = values["input exogenous"]
         if not self.dae.frictional_contacts:
             names = self.structure.dependent_constraints(error.state, parameters)
             return singular_configuration(self.dae.name, error.time, error.state, names)
-        if not inputs and self._is_controlled:
-            return error
-        control = inputs[0] if self._is_controlled else np.zeros(0)
-        taken = (control,) if "control" in self._force.input_names else ()
-        force = self._force(error.state, *taken, parameters)[0]
-        return jammed_contact(self.structure, error, control, parameters, force) or error
+        control = values.get("input control", np.zeros(self.dae.num_controls))
+        force = self.structure.trace("force", self.dae.forces(self._constraint_input), True)
+        (lambdas,) = force(error.state, control, parameters)
+        return jammed_contact(self.structure, error, control, parameters, lambdas) or error
 
-    def _formulas(self) -> dict[str, Formula]:
-        state = self.dae.trace("state", {"value": self.dae.state})
-        functions = {"derivative": self.dynamics, "state": state, **self.functions}
-        return {
-            name: TracedFormula(function, function.output_names[0], signals=self._signals)
-            for name, function in functions.items()
-        }
+    @property
+    def _constraint_input(self) -> ca.SX:
+        derivatives = self.structure.derivatives
+        return derivatives.expand(derivatives.constraint_input)  # (25)
 
-    def traced(self) -> Block:
-        return traced_plant(
-            self,
-            self.structure,
-            self.projects,
-            self.check_start,
-            self.exogenous_places,
-            self._signals,
-        )
-
-    def _copy_state(self, context: Context, output: BasicVector) -> None:
-        output.SetFrom(context.get_continuous_state_vector())
-
-    def _residual(self, context: Context) -> FloatArray:
-        state = context.get_continuous_state_vector().CopyToVector()
-        return self.structure.manifold.residual(state, self._values(context))
+    def _shares(self) -> dict[str, Any]:
+        return {"model": self.dae, "check_start": self.check_start}
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
@@ -285,20 +176,52 @@ class DaePlant(ParameterizedSystem, Plant):
             self.dae.name, left_out, state, left_out.residual(state, parameters)
         )
 
-    def _project(self, context: Context, state: State) -> EventStatus:
-        x = context.get_continuous_state_vector().value()
-        if self._exogenous is None:
-            parameters = context.get_numeric_parameter(0).value()
-        else:
-            parameters = self._values(context)
-        manifold = self.structure.manifold
-        projected = manifold.first_steps(x, parameters)
-        if projected is None:
-            try:
-                projected = manifold.searched(x, parameters)
-            except InconsistentStateError as error:
-                raise off_manifold(context.get_time(), x.copy(), error) from error
-        if projected is x:
-            return _UNCHANGED
-        state.get_mutable_continuous_state().SetFromVector(projected)
-        return _CHANGED
+
+def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
+    """The motion on N* and the constraint force, (25), as a block; see `DaePlant`."""
+    system, derivatives = structure.system, structure.derivatives
+    manifold, control = structure.manifold, derivatives.control
+    regular = Requirement.regular(structure.elimination.pivot, "A(x) of Assumption (2)")
+    force = derivatives.expand(derivatives.constraint_input)
+    output, none = system.outputs(force), ca.SX.zeros(control.numel())
+    if not structure.elimination.n_star.nnz():  # m beta u cancels.
+        output = ca.substitute(output, control, none)
+    if not structure.elimination.beta.nnz():
+        force = ca.substitute(force, control, none)
+    projection = None
+    if project and system.num_constraints:
+        projection = Projection(newton_of(manifold), manifold.projected)
+    return Block(
+        system.name,
+        inputs={"control": control},
+        outputs={
+            "state": system.state,
+            "constraint_force": regular.of(system.forces(force)),
+            "constraint_residual": manifold.residual_expression,
+            "controlled_output": regular.of(output),
+        },
+        state=system.state,
+        derivative=regular.of(derivatives.expand(derivatives.rate)),
+        parameters=system.parameter_symbol,
+        start={
+            "state": manifold.project(system.nominal_state),
+            "parameters": system.parameter_values,
+        },
+        projection=projection,
+        scale=system.scale,
+        requirements=(regular,),
+        signals={
+            "state": system.state_signals,
+            "control": system.control_signals,
+            "constraint_force": system.force_signals,
+            "constraint_residual": manifold.residual_signals,
+            "controlled_output": system.output_signals,
+        },
+    )
+
+
+def newton_of(manifold: Manifold) -> ca.Function:
+    """A Newton step to a manifold, as a `Projection` has it."""
+    step = manifold.newton_step
+    inputs = [ca.SX.sym(*item) for item in zip(step.input_names, step.sizes, strict=True)]
+    return ca.Function("newton", inputs, step.function.call(inputs)[:1])

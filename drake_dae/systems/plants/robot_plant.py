@@ -6,16 +6,14 @@ from dataclasses import replace
 import casadi as ca
 
 from drake_dae.arguments import checked
-from drake_dae.blocks.computations import PARAMETERS, STATE, Block, Computation
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.blocks.block import Block
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.plants.dae_plant import DaePlant
-from drake_dae.systems.plants.robot_ports import RobotPorts
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.systems.plants.dae_plant import DaePlant, dae_block
 
 
 @checked(ModelError)
@@ -48,7 +46,6 @@ class RobotPlant(DaePlant):
 
     Attributes:
         model: The robot.
-        wrench_signals: Names and units of `constraint_wrenches`.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -60,49 +57,57 @@ class RobotPlant(DaePlant):
         structure: ConstraintStructure | None = None,
         project: bool = True,
     ) -> None:
-        super().__init__(model.dae, structure=structure, project=project)
+        structure = constraint_structure_of(type(self).__name__, model.dae, structure)
         self.model: RobotModel = model
-        values, force = weakly(self._values), weakly(self._evaluate, self._force)
-        by_force = self._tickets(self._force)
-        self._ports = RobotPorts(self, model, values, force, self._by_state, by_force)
-        self.wrench_signals = self._ports.wrench_signals
-        if "loop_state" in self._ports.joints:
-            self.functions["loop_state"] = self._ports.joints["loop_state"]
+        self._start(structure, robot_block(model, structure, project))
+
+    @property
+    def wrench_signals(self) -> Sequence[Signal]:
+        """Names and units of `constraint_wrenches`."""
+        return self.block.signals["constraint_wrenches"]
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
-        return self._ports.loop_signals
+        return loop_signals(self.model)
 
-    def _formulas(self) -> dict[str, Formula]:
-        state = self.dae.state
-        formulas = super()._formulas()
-        ports = self._ports
-        derivatives = self.structure.derivatives
-        constraint_input = derivatives.expand(derivatives.constraint_input)
-        wrenches = ca.substitute(ports.wrenches, ports.force, self.dae.forces(constraint_input))
-        takes_control = "control" in self._force.input_names
-        formulas["constraint_wrenches"] = TracedFormula(
-            self.structure.trace("constraint wrenches", wrenches, takes_control),
-            signals=self._signals,
-        )
-        for name, part in ports.parts.items():
-            function = TracedFunction(name, {"state": state}, {"value": state[part]})
-            formulas[name] = TracedFormula(function)
-        formulas |= {name: TracedFormula(function) for name, function in ports.joints.items()}
-        return formulas
 
-    def traced(self) -> Block:
-        block, ports, state = super().traced(), self._ports, self.dae.state
-        computations = [
-            Computation(ca.Function("part", [state], [state[part]]), (STATE,), (name,))
-            for name, part in ports.parts.items()
-        ]
-        sources = (STATE, "constraint_force", PARAMETERS)
-        computations.append(
-            Computation.of(ports.wrench_function, sources, ("constraint_wrenches",))
-        )
-        computations += [
-            Computation.of(function, (STATE, PARAMETERS), (name,))
-            for name, function in ports.joints.items()
-        ]
-        return replace(block, computations=(*block.computations, *computations))
+def robot_block(model: RobotModel, structure: ConstraintStructure, project: bool = True) -> Block:
+    """The block of a constrained robot; see `RobotPlant`."""
+    block, bound = dae_block(structure, project), ConstraintSet(model.constraints)
+    force = ca.SX.sym("force", bound.size)
+    wrenches, signals = bound.wrenches(model.links.kinematics(), force)
+    lambdas = block.outputs["constraint_force"]
+    outputs = {
+        **block.outputs,
+        **joint_outputs(model),
+        "constraint_wrenches": ca.substitute(wrenches, force, lambdas),
+    }
+    named = {**block.signals, **loop_signals(model), "constraint_wrenches": signals}
+    return replace(block, outputs=outputs, signals=named)
+
+
+def joint_outputs(model: RobotModel) -> dict[str, ca.SX]:
+    """The output ports of a robot's plant that are functions of its state and parameters."""
+    size = model.links.q.numel() + model.links.v.numel()
+    parts = {"link_state": slice(0, size), **stage_ports(model, size)}
+    outputs = {name: model.dae.state[part, 0] for name, part in parts.items()}
+    if model.loop_joints.signals:
+        outputs["loop_state"] = model.loop_joints.state
+    if model.joint_force is not None:
+        outputs["joint_torque"] = model.joint_force
+    return outputs
+
+
+def loop_signals(model: RobotModel) -> dict[str, Sequence[Signal]]:
+    """Names and units of `loop_state` under that name; empty without it."""
+    return {"loop_state": model.loop_joints.signals} if model.loop_joints.signals else {}
+
+
+def stage_ports(model: RobotModel, start: int = 0) -> dict[str, slice]:
+    """Name of a port of a robot's stages -> its part of (..., s), where s begins at `start`."""
+    parts = {}
+    for stage in model.stages:
+        for name, part in stage.ports.items():
+            parts[name] = slice(start + part.start, start + part.stop)
+        start += stage.state.numel()
+    return parts

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, check_whole_number, numbers, positive
-from drake_dae.blocks.computations import HELD, TIME, Block, Computation, Update
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.blocks.block import TIME, Block, Held
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.errors import ModelError
 
 _SAME = 1e-9
@@ -117,7 +117,7 @@ class Encoders:
 
 
 @checked(ModelError)
-class StateSensor(LeafSystem):
+class StateSensor(TracedSystem):
     """The state x = (q, v, ...) of a robot, measured by `Encoders`, for a law.
 
     The measurement of t_k = k period is held until the next sample; entries of x after q and v are
@@ -158,104 +158,51 @@ class StateSensor(LeafSystem):
         encoders: Encoders,
         period: float,
     ) -> None:
-        super().__init__()
-        self.set_name("state_sensor")
         check_whole_number("num_positions", num_positions, 1)
         check_whole_number("size", size, 2 * num_positions)
         self.encoders, self.period = encoders, positive("period", period)
         self.sample_period = self.period
-        self._resolution, self._bias, self._position_noise, self._velocity_noise = (
-            _each(name, getattr(encoders, name), num_positions)
-            for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
-        )
-        self._count, self._rounds = num_positions, bool(self._resolution.any())
-        self._port = self.DeclareVectorInputPort("state", size)
-        self._noise = None
-        if encoders.has_noise:
-            self._noise = self.DeclareVectorInputPort("noise", 2 * num_positions)
-        # The index of the held sample, and its measurement.
-        held = np.full(1 + 2 * num_positions, np.nan)
-        self._held = self.DeclareDiscreteState(held)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(self.period, 0.0, weakly(self._sample))
-        self.DeclareVectorOutputPort("estimated_state", size, weakly(self._calc))
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        state = np.array(self._port.Eval(context))
-        state[: 2 * self._count] = self._measured(context, state)[1:]
-        output.SetFromVector(state)
-
-    def _sample(self, context: Context, state: State) -> EventStatus:
-        sample = self._measured(context, self._port.Eval(context))
-        state.get_mutable_discrete_state().set_value(self._held, sample)
-        return EventStatus.Succeeded()
-
-    def _measured(self, context: Context, state: FloatArray) -> FloatArray:
-        """The index of the current sample, and its measurement."""
-        held = context.get_discrete_state(self._held).CopyToVector()
-        sample = np.floor(context.get_time() / self.period + _SAME)
-        if held[0] == sample:
-            return held
-        count = self._count
-        q, v = state[:count] + self._bias, state[count : 2 * count]
-        if self._noise is not None:
-            noise = self._noise.Eval(context)
-            q += self._position_noise * noise[:count]
-            v = v + self._velocity_noise * noise[count:]
-        if self._rounds:
-            rounded = self._resolution > 0.0
-            steps = self._resolution[rounded]
-            q[rounded] = steps * np.round(q[rounded] / steps)
-        if self.encoders.velocity_bandwidth is not None and np.isfinite(held[0]):
-            a = np.exp(-self.encoders.velocity_bandwidth * self.period)
-            before = held[1 + count : 1 + 2 * count]
-            v = a * before + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
-        return np.concatenate([[sample], q, v])
-
-    def traced(self) -> Block:
-        count, size = self._count, self._port.size()
-        time, held = ca.SX.sym("time"), ca.SX.sym("held", 1 + 2 * count)
-        state, noise = ca.SX.sym("state", size), ca.SX.sym("noise", 2 * count)
-        sample = ca.floor(time / self.period + _SAME)
-        q, v = state[:count] + self._bias, state[count : 2 * count]
-        sources, inputs = [TIME, HELD, "state"], [time, held, state]
-        if self._noise is not None:
-            sources, inputs = [*sources, "noise"], [*inputs, noise]
-            q = q + self._position_noise * noise[:count]
-            v = v + self._velocity_noise * noise[count:]
-        q = ca.SX(q)
-        if self._rounds:
-            for i in np.flatnonzero(self._resolution > 0.0).tolist():
-                step = self._resolution[i]
-                q[i] = step * _rounded(q[i] / step)
-        has_sample = ca.fabs(held[0]) < np.inf
-        if self.encoders.velocity_bandwidth is not None:
-            a = np.exp(-self.encoders.velocity_bandwidth * self.period)
-            before = held[1 + count : 1 + 2 * count]
-            filtered = a * before + (1.0 - a) * (q - held[1 : 1 + count]) / self.period
-            v = ca.if_else(has_sample, filtered, v)
-        fresh = ca.vertcat(sample, q, v)
-        current = ca.if_else(ca.eq(held[0], sample), held, fresh)
-        shown = ca.vertcat(current[1:], state[2 * count :])
-        first = ca.substitute(fresh, held, ca.SX.nan(held.numel(), 1))
-        first_sources = [source for source in sources if source != HELD]
-        first_inputs = [symbol for symbol in inputs if symbol is not held]
-        return Block(
-            self,
-            (Computation(_function(inputs, shown), tuple(sources), ("estimated_state",)),),
-            (
-                Update(
-                    Computation(_function(inputs, current), tuple(sources), (HELD,)),
-                    self.period,
-                    0.0,
-                    True,
-                ),
-            ),
-            initial=Computation(_function(first_inputs, first), tuple(first_sources), (HELD,)),
-        )
+        super().__init__(encoder_block(size, num_positions, encoders, period))
 
 
-def _function(inputs: list[ca.SX], value: ca.SX) -> ca.Function:
-    return ca.Function("encoders", inputs, [ca.densify(value)])
+def encoder_block(size: int, count: int, encoders: Encoders, period: float) -> Block:
+    """The measured state, and the last sample with its index; see `StateSensor`."""
+    resolution, bias, position_noise, velocity_noise = (
+        _each(name, getattr(encoders, name), count)
+        for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
+    )
+    state, held = ca.SX.sym("state", size), ca.SX.sym("held", 1 + 2 * count)
+    q, v = state[:count] + bias, state[count : 2 * count]
+    inputs = {"state": state}
+    if encoders.has_noise:
+        inputs["noise"] = noise = ca.SX.sym("noise", 2 * count)
+        q, v = q + position_noise * noise[:count], v + velocity_noise * noise[count:]
+    for i in np.flatnonzero(resolution).tolist():
+        q[i] = resolution[i] * _rounded(q[i] / resolution[i])
+    sample, first = ca.floor(TIME / period + _SAME), ca.vertcat(q, v)
+    later = first
+    if encoders.velocity_bandwidth is not None:
+        a = np.exp(-encoders.velocity_bandwidth * period)
+        before, q_before = held[1 + count :], held[1 : 1 + count]
+        later = ca.vertcat(q, a * before + (1.0 - a) * (q - q_before) / period)
+    fresh = ca.if_else(
+        ca.fabs(held[0]) < np.inf, later, first
+    )  # Before the first sample it is nan.
+    current = ca.if_else(ca.eq(held[0], sample), held, ca.vertcat(sample, fresh))
+    return Block(
+        "state_sensor",
+        inputs,
+        {"estimated_state": ca.vertcat(current[1:], state[2 * count :])},
+        held={
+            "sample": Held(
+                held,
+                current,
+                np.full(1 + 2 * count, np.nan),
+                period,
+                begin=ca.vertcat(sample, first),
+            )
+        },
+    )
 
 
 def _rounded(number: ca.SX) -> ca.SX:

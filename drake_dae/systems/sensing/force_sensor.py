@@ -1,32 +1,22 @@
 """Sensors of constraint forces, for laws with measured force.              (59), (71), (81)"""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import BasicVector, Context, ContinuousState
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, vector
-from drake_dae.blocks.computations import (
-    DERIVATIVE,
-    HELD,
-    PARAMETERS,
-    STATE,
-    TIME,
-    Block,
-    Computation,
-    Update,
-)
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.blocks.trials import StepWatch, state_tickets
-from drake_dae.errors import ModelError, NonFiniteError
-from drake_dae.systems.blocks.block import DifferentiableSystem
-from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.arrays import vector
+from drake_dae.blocks.block import TIME, Block, Held
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.blocks.traced_system import TracedSystem
+from drake_dae.errors import ModelError
 
 
 @checked(ModelError)
-class ForceSensor(DifferentiableSystem):
+class ForceSensor(TracedSystem):
     """A force sensor with state, so that it can close a loop around a rigid robot:
 
         time_constant * y' = force - y,
@@ -75,8 +65,6 @@ class ForceSensor(DifferentiableSystem):
         noise_deviation: ArrayLike = 0.0,
         drift: ArrayLike = 0.0,
     ) -> None:
-        super().__init__()
-        self.set_name("force_sensor")
         self.time_constant = float(time_constant)
         self.sample_period = float(sample_period)
         try:
@@ -102,24 +90,34 @@ class ForceSensor(DifferentiableSystem):
                 "a ForceSensor needs a time_constant or a sample_period: without state it would "
                 "close an algebraic loop"
             )
-        errors = [self.bias, self.noise_deviation, self.drift]
-        self.DeclareNumericParameter(BasicVector(np.concatenate(errors)))
-        self._force_port = self.DeclareVectorInputPort("force", size)
-        self._noise_port = None
+        super().__init__(self._make_block(size))
+
+    def _make_block(self, size: int) -> Block:
+        force, y, sampled, noise = (
+            ca.SX.sym(name, size) for name in ("force", "y", "sampled", "noise")
+        )
+        parts = self.bias, self.noise_deviation, self.drift
+        bias, deviation, drift = (ca.SX.sym(name, size) for name in ("bias", "deviation", "drift"))
+        inputs = {"force": force}
+        measured = (y if self.time_constant else force) + bias + drift * TIME
         if self.noise_deviation.any():
-            self._noise_port = self.DeclareVectorInputPort("noise", size)
+            inputs["noise"] = noise
+            measured = measured + deviation * noise
+        block = Block(
+            "force_sensor",
+            inputs,
+            {"measured_force": sampled if self.sample_period else measured},
+            parameters=ca.vertcat(bias, deviation, drift),
+            start={"parameters": np.concatenate(parts)},
+        )
         if self.time_constant:
-            self.DeclareContinuousState(size)
-            self._steps = StepWatch(self)
+            rate = (force - y) / self.time_constant
+            block = replace(block, state=y, derivative=rate)
         if self.sample_period:
-            self._held = self.DeclareDiscreteState(size)
-            self.DeclarePeriodicDiscreteUpdateEvent(self.sample_period, 0.0, weakly(self._sample))
-            sources = {self.xd_ticket()}
-        else:
-            sources = state_tickets(self) | {self.all_parameters_ticket(), self.time_ticket()}
-            if self._noise_port is not None:
-                sources.add(self.input_port_ticket(self._noise_port.get_index()))
-        self.DeclareVectorOutputPort("measured_force", size, port_value(self._output), sources)
+            start, period = np.zeros(size), self.sample_period
+            held = Held(sampled, measured, start, period, is_unrestricted=False)
+            block = replace(block, held={"measured_force": held})
+        return block
 
     def set_errors(
         self,
@@ -134,10 +132,10 @@ class ForceSensor(DifferentiableSystem):
             ModelError: They do not fit, or there is noise and the sensor was made without.
         """
         self.check_context(context)
-        size = self._force_port.size()
+        size = self.block.inputs["force"].numel()
         lags = self.time_constant, self.sample_period
         other = ForceSensor(size, *lags, bias, noise_deviation, drift)
-        if other.noise_deviation.any() and self._noise_port is None:
+        if other.noise_deviation.any() and "noise" not in self.block.inputs:
             raise ModelError("a ForceSensor that was made without noise has no port for it")
         errors = np.concatenate([other.bias, other.noise_deviation, other.drift])
         context.get_mutable_numeric_parameter(0).SetFromVector(errors)
@@ -145,12 +143,12 @@ class ForceSensor(DifferentiableSystem):
     def set_force(self, context: Context, force: ArrayLike) -> None:
         """Sets the state of the sensor for a constant force, shape (m,), without noise and lag."""
         self.check_context(context)
-        value = vector("force", force, self._force_port.size())
+        value = vector("force", force, self.block.inputs["force"].numel())
         if self.time_constant:
             context.SetContinuousState(value)
         if self.sample_period:
             bias, _, drift = np.split(context.get_numeric_parameter(0).value(), 3)
-            context.SetDiscreteState(self._held, value + bias + drift * context.get_time())
+            context.SetDiscreteState(0, value + bias + drift * context.get_time())
 
     def largest_stable_gain(self) -> float:
         """The largest gain Gbar of (59) for which a rigid robot's force error decays.
@@ -162,85 +160,3 @@ class ForceSensor(DifferentiableSystem):
             return np.inf
         a = np.exp(-self.sample_period / self.time_constant) if self.time_constant else 0.0
         return float((1.0 + a) / (1.0 - a))
-
-    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        if self.time_constant:
-            y = context.get_continuous_state_vector().CopyToVector()
-            force = self._force_port.Eval(context)
-            with np.errstate(over="ignore"):
-                rate = (force - y) / self.time_constant
-            if not np.isfinite(rate).all():
-                time = context.get_time()
-                error = NonFiniteError(
-                    f"{self.get_name()}: the rate of the measured force is not finite at "
-                    f"t = {time:.6g} s; its time_constant is {self.time_constant:g} s",
-                    time,
-                    y,
-                )
-                self._steps.tolerate(context, error)
-            derivatives.get_mutable_vector().SetFromVector(rate)
-
-    def _measured(self, context: Context) -> FloatArray:
-        if self.time_constant:
-            value = context.get_continuous_state_vector().CopyToVector()
-        else:
-            value = self._force_port.Eval(context)
-        bias, deviation, drift = np.split(context.get_numeric_parameter(0).value(), 3)
-        if self._noise_port is not None:
-            value = value + deviation * self._noise_port.Eval(context)
-        return value + bias + drift * context.get_time()
-
-    def _sample(self, context: Context, state: object) -> None:
-        state.set_value(self._held, self._measured(context))  # type: ignore[attr-defined]
-
-    def _output(self, context: Context) -> FloatArray:
-        if self.sample_period:
-            return context.get_discrete_state(self._held).value()
-        return self._measured(context)
-
-    def traced(self) -> Block:
-        size = self._force_port.size()
-        force, y, noise = (ca.SX.sym(name, size) for name in ("force", "y", "noise"))
-        errors, time = ca.SX.sym("errors", 3 * size), ca.SX.sym("time")
-        sources = [STATE if self.time_constant else "force", PARAMETERS, TIME]
-        inputs, measured = [force, errors, time], force
-        if self._noise_port is not None:
-            sources, inputs = [*sources, "noise"], [*inputs, noise]
-            measured = measured + errors[size : 2 * size] * noise
-        measured = measured + errors[:size] + errors[2 * size :] * time
-        measurement = ca.Function("measured_force", inputs, [measured])
-        computations, updates = [], []
-        if self.time_constant:
-            rate = ca.Function("rate", [force, y], [(force - y) / self.time_constant])
-            computations.append(Computation(rate, ("force", STATE), (DERIVATIVE,)))
-        if self.sample_period:
-            held = ca.Function("held", [y], [y])
-            computations.append(Computation(held, (HELD,), ("measured_force",)))
-            sampled = Computation(measurement, tuple(sources), (HELD,))
-            updates.append(Update(sampled, self.sample_period))
-        else:
-            computations.append(Computation(measurement, tuple(sources), ("measured_force",)))
-        return Block(self, tuple(computations), tuple(updates))
-
-    def _formulas(self) -> dict[str, Formula]:
-        if self.sample_period:
-            raise ModelError(
-                f"{self.get_name()} does not convert to AutoDiffXd: it samples, and a sample has "
-                "no derivative by the time. Give it a time_constant alone"
-            )
-        size = self._force_port.size()
-        force, y, noise = (ca.SX.sym(name, size) for name in ("force", "state", "noise"))
-        errors, time = ca.SX.sym("errors", 3 * size), ca.SX.sym("time")
-        rate = TracedFunction(
-            "force sensor",
-            {"force": force, "state": y},
-            {"value": (force - y) / self.time_constant},
-        )
-        inputs, measured = {"state": y}, y
-        if self._noise_port is not None:
-            inputs["noise"] = noise
-            measured = measured + errors[size : 2 * size] * noise
-        inputs |= {"parameters": errors, "time": time}
-        measured = measured + errors[:size] + errors[2 * size :] * time
-        output = TracedFunction("measured force", inputs, {"value": measured})
-        return {"derivative": TracedFormula(rate), "measured_force": TracedFormula(output)}

@@ -16,11 +16,11 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.blocks.along import function_along
 from drake_dae.systems.control.contract import Compared, Controller, Derived, check_same_sizes
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.control.switch import LawSwitch
+from drake_dae.systems.parameterized import function_along
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.task.contacts.open_contact import CONTACT, FREE, LAWS, contact_laws
 from drake_dae.systems.task.contacts.outputs import TaskOutputs

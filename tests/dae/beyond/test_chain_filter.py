@@ -5,7 +5,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
-from drake_dae.errors import ModelError
 
 T = 1e-4
 
@@ -19,15 +18,6 @@ def test_poles_are_those_of_the_docstring(fast, slow):
     roots = np.roots([1.0, 0.0, 0.0, 0.0, fast**4, 0.0, -(fast**4) * slow**2])
     wanted = np.sort_complex(roots[roots.real < 0.0])
     assert_allclose(poles, wanted, rtol=20.0 * fast * T)
-
-
-def test_a_slow_disturbance_leaves_a_pair_with_the_damping_ratio_of_butterworth():
-    found = ChainFilter.of(100.0, 1.0, T)
-    closed = (np.eye(3) - found.gain @ np.eye(3)[:1]) @ transition(T)
-    poles = np.log(np.linalg.eigvals(closed)) / T
-    slow, pair = poles[np.argmin(np.abs(poles))], poles[np.abs(poles) > 50.0]
-    assert slow == pytest.approx(-1.0, rel=1e-2)
-    assert_allclose(-pair.real / np.abs(pair), 0.5**0.5, rtol=1e-2)
 
 
 @pytest.mark.slow
@@ -46,10 +36,3 @@ def test_gain_and_covariance_are_where_riccatis_recursion_ends(ratio):
         spread = (np.eye(3) - gain @ shown) @ before
     assert_allclose(found.gain, gain, rtol=1e-6)
     assert_allclose(found.covariance, spread, rtol=1e-6)
-
-
-def test_what_makes_no_filter_is_refused():
-    with pytest.raises(ModelError, match="1000"):
-        ChainFilter.of(2000.0, 10.0, 1e-3)
-    with pytest.raises(ModelError, match="disturbance_rate"):
-        ChainFilter.of(20.0, 0.0, 1e-3)

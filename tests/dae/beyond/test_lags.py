@@ -34,22 +34,3 @@ def test_constant_is_found_as_the_filter_says(degree):
     for j in range(1, degree + 1):
         assert_allclose(found[j], RATE**j * density(x) * np.exp(-x), atol=1e-9)
         density = density.deriv() - density
-
-
-def test_ramp_is_followed_late_with_its_slope():
-    """(n + 1) / k, and half a sample, by which a signal that is held is late.
-
-    The saw of what is held leaves up to k^2 T / 8 of the slope in r''.
-    """
-    found = run(Lags.of(RATE, PERIOD, 2), 3.0 * (TIMES - PERIOD))
-    late = 3.0 / RATE + PERIOD / 2.0
-    assert_allclose(found[0][-1], 3.0 * (TIMES[-1] - late), rtol=1e-3)
-    assert_allclose(found[1:, -1], [3.0, 0.0], atol=3.0 * RATE**2 * PERIOD / 8.0)
-    assert found[1, -1] == pytest.approx(3.0, rel=1e-4)
-
-
-def test_derivatives_stay_where_all_lags_change_alike():
-    lags = Lags.of(RATE, PERIOD, 2)
-    state = ca.DM([[1.0, 2.0, 4.0]])
-    assert_allclose(lags.derivatives(state), lags.derivatives(state - 0.7), atol=1e-12)
-    assert_allclose(lags.derivatives(state)[0], RATE * (state[1] - state[2]))

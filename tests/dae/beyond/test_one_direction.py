@@ -108,13 +108,3 @@ def test_motion_within_a_sample_is_that_of_the_contact():
     start = np.zeros(len(loop.step))
     start[:2] = 1.0, 3.0 * T  # In units of the period.
     assert_allclose(loop.step[:2] @ start, run.y[:, -1] * [1.0, T], rtol=1e-10)
-
-
-def test_differences_lag_as_their_filter_does():
-    """Without noise and with a bandwidth far above the loop's, poles are those of velocities."""
-    slow = DirectionGains((1.0, 2.0, 2.0), 0.0, 2.0)
-    lagging = SensorNoise(velocity_bandwidth=5000.0)
-    radii = [sampled_loop(Direction(T, 0), slow, each).radius for each in (SensorNoise(), lagging)]
-    assert np.log(radii[1]) == pytest.approx(np.log(radii[0]), rel=5e-3)
-    late = sampled_loop(Direction(T, 0), FREE, SensorNoise(velocity_bandwidth=20.0))
-    assert late.radius > sampled_loop(Direction(T, 0), FREE, SensorNoise()).radius

@@ -15,7 +15,6 @@ from drake_dae import (
     Sampling,
     SinusoidReference,
     TrackingLaw,
-    linearize_loop,
     make_closed_loop,
     poles,
     sampled_poles,
@@ -51,13 +50,6 @@ def test_poles_of_a_mass_are_those_of_the_map_by_hand(delay):
     expected = np.linalg.eigvals(matrix)
     # A double pole moves by the root of round-off.
     assert_allclose(np.poly(found), np.poly(expected), atol=1e-12)
-
-
-def test_short_periods_have_the_poles_of_theory():
-    found = sampled_poles(
-        TrackingLaw(mass_on_a_spring(7.0), poles([-3.0, -8.0])), np.zeros(3), 1e-5
-    )
-    assert_allclose(np.log(found[:2]).real / 1e-5, [-3.0, -8.0], rtol=1e-4)
 
 
 def pressing(sampling, duration, gains=-4.0, errors=0.0):
@@ -148,19 +140,3 @@ def test_laws_with_a_state_of_their_own_are_refused():
         rows = np.zeros((sizes[0], 2)), np.zeros((3, sizes[1]))
         with pytest.raises(ModelError, match=r"\(3, .\)"):
             sampling_error(plain, [0, 1, 2], *rows, T)
-
-
-def test_poles_are_those_about_a_rest_that_few_periods_reach():
-    plain = TrackingLaw(mass_on_a_spring(0.0), poles(-4.0))
-    with pytest.raises(ModelError, match=r"x0|x1"):
-        sampled_poles(plain, [0.1, 0.0, 0.0], T)
-    with pytest.raises(ModelError, match="10000000"):
-        sampled_poles(plain, np.zeros(3), 1e-6, 10.0)
-
-
-def test_it_needs_no_drake_and_no_sampling():
-    """Where G is what feedback adds: A + G of the loop itself as the period tends to zero."""
-    chosen = TrackingLaw(mass_on_a_spring(7.0), poles(-3.0))
-    matrix = linearize_loop(chosen, np.zeros(3)).minimal.A
-    found = sampled_poles(chosen, np.zeros(3), 1e-4)
-    assert_allclose(np.sum(np.log(found[:2])).real / 1e-4, np.trace(matrix), rtol=1e-2)

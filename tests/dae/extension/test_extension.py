@@ -4,17 +4,13 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems import (
-    PROBLEMS,
     changed,
-    double_integrator,
     early_control,
     hidden_normal_form,
 )
 from problems.extensions import (
-    CRANE,
     GRAVITY,
     REGULAR,
-    crane,
     evaluated,
     extension_of,
     unicycle,
@@ -25,8 +21,6 @@ from runs import some
 from drake_dae.dae.extension.dynamic_extension import dynamic_extension
 from drake_dae.dae.extension.extension import extend
 from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 
 
@@ -39,63 +33,6 @@ def test_an_integrator_is_a_state_and_its_rate_the_control():
     f, h = evaluated(system, [1.0, 2.0, 0.3, 0.9], f=system.f, h=system.h)
     np.testing.assert_allclose(f[:, 0], [0.9 * np.cos(0.3), 0.9 * np.sin(0.3), 0, 0], rtol=1e-15)
     np.testing.assert_array_equal(h, [[0, 0], [0, 0], [0, 1], [1, 0]])
-
-
-def test_several_integrators_before_several_controls():
-    """(x, u1, u2, u2', u2''): rounds of integrators, one before each control that still needs one.
-
-    The units are those of derivatives of the control.
-    """
-    system = changed(unicycle(), control_signals=("drive", Signal("steer", "rad")))
-    extended = extend(system, {"steer": 3, "drive": 1})
-    names = ["x", "y", "heading", "drive", "steer", "steer'", "steer''"]
-    assert [s.name for s in extended.state_signals] == names
-    assert extended.state_signals[6].unit == "rad/s^2"
-    assert extended.control_signals == (Signal("drive'", "1/s"), Signal("steer'''", "rad/s^3"))
-    f, h = evaluated(extended, [0, 0, 0, 2, 3, 4, 5], f=extended.f, h=extended.h)
-    np.testing.assert_array_equal(f[:, 0], [2, 0, 3, 0, 4, 5, 0])
-    np.testing.assert_array_equal(np.argwhere(h), [[3, 0], [6, 1]])
-    assert find_structure(extend(double_integrator(), {"u0": 2})).output_degrees == (4,)
-
-
-def test_all_else_stays():
-    """Constraints, outputs, parameters, and mass matrix: B(x) with them and without."""
-    plain = crane(nominal_state=[0.0, 1.0, 0.6, -0.8, 0.0, 0.0, 0.0, 0.0])
-    mass = ca.diag(ca.SX([1, 1, 1, 1, *CRANE, CRANE[2]]))
-    heavy = changed(
-        plain,
-        **{key: ca.mtimes(mass, getattr(plain, key)) for key in "fgh"},
-        mass_matrix=mass,
-    )
-    one, two = (
-        changed(e, l=e.state[[1, 0]], output_signals=("l", "s"))
-        for e in (
-            extend(system, ["trolley", "winch"], {"trolley": 2.0}) for system in (plain, heavy)
-        )
-    )
-    first, second = find_structure(one), find_structure(two)
-    assert first.output_degrees == second.output_degrees == (3, 3)
-    assert one.parameters == plain.parameters
-    assert one.constraint_output_signals == plain.constraint_output_signals
-    for state in first.states:
-        # Twenty operations on numbers of order 10.
-        np.testing.assert_allclose(
-            evaluated(one, state, b=first.control_matrix)[0],
-            evaluated(two, state, b=second.control_matrix)[0],
-            rtol=1e-12,
-            atol=1e-12,
-        )
-
-
-@pytest.mark.parametrize("wrong", ["u0", 3, None])
-def test_integrators_are_named_in_a_list(wrong):
-    with pytest.raises(ModelError, match="integrators"):
-        extend(double_integrator(), wrong)
-
-
-def test_no_integrators_change_nothing():
-    system = crane()
-    assert extend(system, []) is system
 
 
 @pytest.mark.parametrize(
@@ -151,13 +88,6 @@ def test_the_extension_moves_the_original_states_as_the_original_does(name):
         np.testing.assert_array_equal(ge[n:], 0.0)
 
 
-def test_recovered_controls_are_integrals():
-    """u of the aircraft is its state thrust and the torque, whatever the thrust's derivatives."""
-    extension = extension_of("vtol")
-    state = np.array([0, 0, 0.1, 0, 0, 0, 9.0, -2.0])
-    np.testing.assert_array_equal(extension.original_control(state, [5.0, 0.3]), [9.0, 0.3])
-
-
 def test_mixed_controls_by_hand():
     """left* = left + right is 4 v: both wheels share its integral, and left = left* - right."""
     extension = extension_of("wheels")
@@ -168,37 +98,6 @@ def test_mixed_controls_by_hand():
         u = extension.original_control([1.0, 2.0, heading, 3.0], [7.0, 0.5])
         np.testing.assert_allclose(u, [2.5, 0.5], rtol=1e-15)
     assert extension.system.nominal_state[3] == pytest.approx(3.0, rel=1e-15)
-
-
-def test_the_control_matrix_of_the_aircraft_by_hand():
-    """x'' = -sin(roll) T and y'' = cos(roll) T - g differentiated twice, w the rate of the roll:
-
-    x^(4) = -s T'' - c T u2 + s w^2 T - 2 c w T',   y^(4) = c T'' - s T u2 - c w^2 T - 2 s w T'.
-    """
-    extension, random = extension_of("vtol"), np.random.default_rng(1)
-    for _ in range(5):
-        state = extension.system.nominal_state + 0.5 * random.standard_normal(8)
-        s, c, w, (thrust, rate) = np.sin(state[2]), np.cos(state[2]), state[5], state[6:]
-        structure = extension.structure
-        b, a = evaluated(extension.system, state, b=structure.control_matrix, a=structure.drift)
-        drift = [s * w**2 * thrust - 2 * c * w * rate, -c * w**2 * thrust - 2 * s * w * rate]
-        # Ten operations on numbers of order 10.
-        np.testing.assert_allclose(b, [[-s, -c * thrust], [c, -s * thrust]], rtol=0, atol=1e-13)
-        np.testing.assert_allclose(a[:, 0], drift, rtol=0, atol=1e-13)
-
-
-def test_found_and_asked_for_are_the_same():
-    extension = extension_of("vtol")
-    asked = extend(vtol(), {"thrust": 2}, {"thrust": GRAVITY})
-    assert asked.state_signals == extension.system.state_signals
-    assert asked.control_signals == extension.system.control_signals
-    np.testing.assert_array_equal(asked.nominal_state, extension.system.nominal_state)
-    one, two = (
-        evaluated(system, np.arange(8.0), f=system.f, h=system.h, l=system.l)
-        for system in (asked, extension.system)
-    )
-    for left, right in zip(one, two, strict=True):
-        np.testing.assert_array_equal(left, right)
 
 
 # Turned at random, they have sums that cancel to nothing much above round-off.
@@ -226,25 +125,6 @@ def test_hidden_integrators_are_found(seed):
     assert extension.structure.output_degrees == tuple(d + 1 for d in hidden.output_degrees)
     assert sum(extension.integrators.values()) == p - count
     assert extension.structure.zero_dynamics_dimension == hidden.zero_dynamics
-
-
-def test_a_regular_system_needs_none():
-    system = PROBLEMS["two_link_arm"]().system
-    extension = dynamic_extension(system)
-    assert extension.system is system
-    assert extension.integrators == {}
-    np.testing.assert_array_equal(extension.original_control(np.ones(4), [3.0, 5.0]), [3.0, 5.0])
-
-
-def test_round_off_is_no_control():
-    """Entries of 1e-17, as a change of basis leaves behind, do not make B(x) regular."""
-    system = unicycle(
-        h=lambda x: [[ca.cos(x[2]), 1e-17], [ca.sin(x[2]), 2e-17], [0, 1]],
-        nominal_state=[0.0, 0.0, 0.4],
-    )
-    extension = dynamic_extension(system, nominal_control={"v": 1.0})
-    assert extension.integrators == {"v": 1}
-    assert extension.structure.output_degrees == (2, 2)
 
 
 def test_units_do_not_matter():
@@ -284,19 +164,3 @@ def test_a_constraint_that_a_control_meets_too_early_gets_integrators():
         # x1 + u = 0 binds u: N* is {x0 = 0, x1 = -u}.
         for state in structure.states:
             np.testing.assert_allclose([state[0], state[1] + state[3]], 0.0, atol=1e-15)
-
-
-def test_controls_that_act_together_with_the_force_need_none():
-    """Beside that constraint x2'' = v1 + u1, where u1 acts as early as Assumption (3) allows."""
-    system = DaeSystem.from_functions(
-        5,
-        f=lambda x: [x[1], 0, x[3], 0, 0],
-        g=lambda x: [[0, 0], [1, 0], [0, 0], [0, 1], [0, 0]],
-        h=lambda x: [[1, 0], [0, 0], [0, 0], [0, 1], [1, 0]],
-        k=lambda x: [x[0], x[2]],
-        l=lambda x: [x[4], 0],
-        m=lambda x: [[0, 0], [0, 1]],
-    )
-    extension = dynamic_extension(system)
-    assert extension.integrators == {"u0": 1}
-    assert extension.structure.output_degrees == (2, 0)

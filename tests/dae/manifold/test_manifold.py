@@ -10,7 +10,7 @@ from drake_dae import build_scenario
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import newton, shortest_steps
 from drake_dae.trace.round_off import are_dependent
 
@@ -100,54 +100,11 @@ def test_projection_reaches_the_manifold_to_round_off(problem):
         assert np.linalg.norm(state - start) < 3 * size * np.sqrt(start.size)
 
 
-@pytest.mark.slow
-def test_projection_leaves_consistent_states_alone(problem):
-    manifold = problem.structure.manifold
-    state = manifold.project(problem.consistent(np.random.default_rng(2)))
-    again = manifold.project(state)
-    np.testing.assert_allclose(again, state, rtol=0, atol=1e-15)
-
-
-def test_small_projections_are_orthogonal():
-    # To first order the nearest point: the change is along the gradient, so along the radius.
-    manifold = circle(radius=2.0)
-    point = np.array([1.2, 1.6])
-    for offset in (1e-3, -1e-3):
-        np.testing.assert_allclose(manifold.project((1 + offset) * point), point, atol=1e-15)
-
-
 def test_projection_follows_the_parameters():
     manifold = circle(radius=2.0)
     assert np.hypot(*manifold.project([1.0, 1.0])) == pytest.approx(2.0, abs=1e-15)
     assert np.hypot(*manifold.project([1.0, 1.0], [3.0])) == pytest.approx(3.0, abs=1e-15)
     assert manifold.residual([1.0, 1.0], [3.0]) == pytest.approx([-7.0])
-
-
-def test_projection_takes_anything_like_a_state_and_changes_nothing():
-    manifold, start = circle(radius=2.0), np.array([1.5, 0.5])
-    expected = manifold.project(start)
-    np.testing.assert_array_equal(start, [1.5, 0.5])
-    for state in ([1.5, 0.5], (1.5, 0.5), start[:, None], start[None]):
-        np.testing.assert_array_equal(manifold.project(state), expected)
-    kept = expected.copy()
-    manifold.project([-1.0, 0.1])
-    np.testing.assert_array_equal(expected, kept)
-
-
-def test_wrong_sizes_are_refused():
-    manifold = circle(radius=2.0)
-    with pytest.raises(ModelError, match=r"\(2,\).*\(3,\)"):
-        manifold.project([1.0, 2.0, 3.0])
-    with pytest.raises(ModelError, match="parameters"):
-        manifold.project([1.0, 2.0], [1.0, 2.0])
-    with pytest.raises(ModelError, match=r"'state'.*1"):
-        manifold.residual([1.0])
-
-
-def test_far_starts_are_damped():
-    # exp(x0) = 2: the full Newton step from -5 goes to 290, where exp is 1e126.
-    manifold = manifold_of(lambda x: ca.exp(x[0]) - 2)
-    assert manifold.project([-5.0, 1.0]) == pytest.approx([np.log(2), 1.0], abs=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -186,27 +143,6 @@ def test_failures_say_what_is_left_and_why():
     # The gradient vanishes at the centre of the circle.
     with pytest.raises(InconsistentStateError, match="y0 = -4"):
         circle(radius=2.0).project([0.0, 0.0])
-
-
-def test_residual_signals_name_constraints_and_derivatives():
-    signals = find_structure(pendulum().system).manifold.residual_signals
-    assert [(s.name, s.unit) for s in signals] == [("y0", ""), ("y0'", "1/s")]
-    mixed = find_structure(PROBLEMS["mixed_degrees"]().system).manifold.residual_signals
-    assert [s.name for s in mixed] == ["y0", "y1", "y1'"]
-
-
-def test_without_constraints_every_state_is_consistent():
-    problem = PROBLEMS["cart"]()
-    manifold = problem.structure.manifold
-    assert manifold.dimension == 2
-    assert manifold.residual([1.0, 2.0]).shape == (0,)
-    np.testing.assert_array_equal(manifold.project([1.0, 2.0]), [1.0, 2.0])
-
-
-def test_a_manifold_may_be_a_point():
-    manifold = manifold_of(lambda x: [x[0] - 1, x[1] * x[0] - 2])
-    assert manifold.dimension == 0
-    assert manifold.project([0.7, 1.5]) == pytest.approx([1.0, 2.0], abs=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -248,24 +184,6 @@ def test_projection_does_not_depend_on_the_unit_of_length(length):
         np.testing.assert_allclose(state, point, rtol=0, atol=1e-14 * length)
 
 
-def test_projection_in_mixed_units_reaches_the_manifold():
-    """Sizes of 1e-5, 40 and 6e5 in one state: the steps of least norm move the smallest alone."""
-    sizes, random = np.array([1e-5, 37.0, 6e5]), np.random.default_rng(0)
-    C = np.array([[1.0, 0.5, -0.7], [-0.4, 1.2, 0.9]])
-
-    def k(x):
-        z = x / ca.DM(sizes)
-        return ca.mtimes(ca.DM(C), z) + 0.3 * ca.sin(z[0])
-
-    manifold = manifold_of(k, 3)
-    for size in (0.1, 1.0, 10.0):
-        for _ in range(50):
-            start = size * sizes * random.standard_normal(3)
-            left = manifold.residual(manifold.project(start))
-            # CONSISTENT, where the search ends without another proof.
-            np.testing.assert_allclose(left, 0.0, atol=1e-8)
-
-
 def test_a_given_start_is_settled_level_by_level():
     """A fast pendulum whose velocity is 1e-6 off: the position that was right stays as it is.
 
@@ -285,17 +203,6 @@ def test_a_given_start_is_settled_level_by_level():
     )
     assert np.abs(manifold.project(wrong)[:2] - wrong[:2]).max() > 1e-10
     assert np.max(np.abs(manifold.residual(found))) < 1e-13
-
-
-def test_settling_reaches_the_manifold(problem):
-    """As projection does, also where a level has no states of its own."""
-    structure = problem.structure
-    random = np.random.default_rng(3)
-    for state in structure.states[:4]:
-        start = state + 1e-3 * structure.scale * random.standard_normal(state.size)
-        found = structure.manifold.settle(start)
-        assert structure.manifold.is_consistent(found)
-        assert np.max(np.abs(found - start) / structure.scale, initial=0.0) < 0.1
 
 
 @pytest.mark.slow

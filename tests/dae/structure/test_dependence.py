@@ -3,9 +3,9 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import redundant, system_of
+from problems import system_of
 
-from drake_dae import DaeSystem, analyze, find_structure
+from drake_dae import DaeSystem, find_structure
 from drake_dae.dae.structure.assumptions import ViolationKind
 from drake_dae.errors import AssumptionError, ModelError
 
@@ -55,13 +55,6 @@ def test_the_rows_that_follow_are_named_with_their_factors():
     assert "'corner' ~ 3 floor - 1 wall; 'wall again' ~ 1000 wall" in str(found)
 
 
-def test_rows_are_named_also_where_their_derivatives_have_no_room():
-    """Eight derivatives in six states."""
-    found = violation(mass_point(lambda q: [q[0], q[1], 3 * q[0] - q[1], 1000 * q[1]]))
-    assert found.cause is ViolationKind.NO_FORCE
-    assert "'y2' ~ 3 y0 - 1 y1; 'y3' ~ 1000 y1" in str(found)
-
-
 def test_factors_that_depend_on_the_state_are_reported():
     """k_2 = (2 + sin q_2) k_1 has the gradient (2 + sin q_2) dk_1 on N*."""
     found = violation(mass_point(lambda q: [q[0], (2 + ca.sin(q[1])) * q[0]]))
@@ -108,28 +101,6 @@ def test_a_regular_difference_is_not_called_redundant(factor):
     np.testing.assert_allclose(combination.factors, [factor], rtol=1e-9)
     # The difference in its place.
     assert find_structure(hidden(lambda x: [x[0], x[1]])).constraint_degrees == (1, 2)
-
-
-def test_inputs_that_do_not_act_independently_at_one_state():
-    """A = diag(1, x_2) turned by 45 degrees, and gradients that never depend on each other."""
-    found = violation(
-        system_of(
-            3,
-            f=lambda x: [0, 0, 0],
-            g=lambda x: [[1 + x[2], 1 - x[2]], [1 - x[2], 1 + x[2]], [0, 0]],
-            h=lambda x: [0, 0, 1],
-            k=lambda x: [x[0], x[1]],
-            l=lambda x: [x[2]],
-            m=lambda x: [[0, 0]],
-        )
-    )
-    assert found.cause is ViolationKind.CONSTRAINT_RANK
-    assert "'y1' ~ 1 y0" in str(found)
-
-
-def test_the_analysis_names_them_too():
-    analysis = analyze(redundant(lambda x: [x[0], 2 * x[0]]))
-    assert "'y1' ~ 2 y0" in analysis.problems[0]
 
 
 def test_a_singular_mass_matrix_comes_with_its_remedy():

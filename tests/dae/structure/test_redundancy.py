@@ -34,11 +34,6 @@ def test_a_table_with_four_legs_stands_on_three(names):
     np.testing.assert_allclose(rates, 0.0, atol=1e-12)
 
 
-def test_where_nothing_is_redundant_nothing_goes():
-    system = plate(TABLE[:3])
-    assert drop_constraints(system) is system
-
-
 def test_a_robot_keeps_its_shorter_form():
     """A row twice, then once: the same derivatives as the robot's own, to round-off."""
     own = arm("two_link").model.dae

@@ -7,18 +7,15 @@ from numpy.testing import assert_allclose
 from problems import (
     changed,
     double_integrator,
-    redundant,
     system_of,
 )
-from problems.found import degrees, violation
+from problems.found import violation
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.dae.structure.constrained import find_constraint_structure
 from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.signals import Parameter
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.functions import TracedFunction
 
 
 @pytest.mark.parametrize("k", [lambda x: x[1] ** 2 + 1, lambda x: ca.exp(x[1]) + 0.5])
@@ -37,11 +34,6 @@ def test_a_constraint_that_cannot_be_met(k):
         )
 
 
-def test_constraints_that_contradict_each_other():
-    with pytest.raises(InconsistentStateError, match="y0"):
-        find_structure(redundant(lambda x: [x[0] - 1, x[0] - 2]))
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -55,11 +47,6 @@ def test_constraints_that_contradict_each_other():
 def test_functions_that_are_not_finite_at_the_nominal_state(fields, message):
     with pytest.raises(ModelError, match=message):
         find_structure(double_integrator(**fields))
-
-
-def test_a_constraint_that_is_not_finite_at_the_nominal_state():
-    with pytest.raises(InconsistentStateError, match="y0"):
-        find_structure(redundant(lambda x: [ca.sqrt(x[0] - 1) - 1, x[2]]), spread=0.0)
 
 
 def test_samples_outside_the_domain_are_left_out():
@@ -86,25 +73,6 @@ def test_branches_of_the_manifold_are_no_singularity():
     )
     assert {-1.0, 1.0} == set(structure.states[:, 0])
     assert structure.constraint_degrees == (1,)
-
-
-def test_infinite_matrices_are_no_singularity():
-    """B = 1/(x0 - 0.02) changes its sign through infinity."""
-    with pytest.raises(ModelError, match=r"x = \[0\.\]"):
-        find_structure(system_of(1, f=lambda x: 0, h=lambda x: 1 / x, l=lambda x: x))
-    structure = find_structure(
-        system_of(1, f=lambda x: 0, h=lambda x: 1 / (x - 0.02), l=lambda x: x)
-    )
-    assert structure.output_degrees == (1,)
-
-
-def test_a_law_needs_as_many_outputs_as_controls():
-    with pytest.raises(ModelError, match="control"):
-        find_structure(system_of(1, f=lambda x: 0))
-    for outputs, l in ((0, None), (2, lambda x: x[:2])):  # noqa: E741
-        system = system_of(3, f=lambda x: 0 * x, h=lambda x: [1, 0, 0], l=l)
-        with pytest.raises(ModelError, match=rf"{outputs} .*1 "):
-            find_structure(system)
 
 
 def test_constraints_alone_decide_how_a_system_moves():
@@ -144,31 +112,6 @@ def test_constraints_alone_decide_how_a_system_moves():
     assert not analysis.problems
 
 
-def test_parameters_take_part_with_their_defaults():
-    """The same expressions with other numbers: where the gain is 0 the control never acts."""
-    gain = Parameter("gain", 2.0)
-    fields = {
-        "h": lambda x: ca.vertcat(0, gain.symbol),
-        "parameters": None,
-    }
-    x = ca.SX.sym("x", 2)
-    for value, degree in ((2.0, 2), (0.0, None)):
-        system = DaeSystem(
-            state=x,
-            f=ca.vertcat(x[1], 0),
-            g=[],
-            h=fields["h"](x),
-            k=[],
-            l=x[0],
-            m=[],
-            parameters=(Parameter("gain", value, symbol=gain.symbol),),
-        )
-        if degree:
-            assert degrees(system) == ((), (degree,))
-        else:
-            assert violation(system).assumption == 5
-
-
 @pytest.mark.parametrize(
     "mass", [[[2.0, 1.0], [0.0, 3.0]], [[2.0, 0.0], [0.0, -3.0]], [[1.0, 1.0], [1.0, 1.0]]]
 )
@@ -189,22 +132,3 @@ def test_a_column_of_b_that_is_only_round_off_is_zero():
     error = violation(system)
     assert error.assumption == 5
     assert "dynamic_extension" in str(error)
-
-
-def test_b_keeps_what_is_zero_at_the_default_parameters_alone():
-    coupling = Parameter("c", 0.0)
-    x = ca.SX.sym("x", 2)
-    system = DaeSystem(
-        state=x,
-        f=-x,
-        g=[],
-        h=[[1, coupling.symbol], [0, 1]],
-        k=[],
-        l=[x[0], x[1]],
-        m=[],
-        parameters=(coupling,),
-    )
-    function = TracedFunction(
-        "B", {"x": x, "c": coupling.symbol}, {"B": find_structure(system).control_matrix}
-    )
-    np.testing.assert_array_equal(function([0.1, 0.2], [0.5])[0], [[1.0, 0.5], [0.0, 1.0]])

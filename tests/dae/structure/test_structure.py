@@ -50,17 +50,6 @@ def test_the_order_of_the_outputs_is_that_of_15(problem):
 
 
 @pytest.mark.slow
-def test_numbers_were_decided_at_consistent_states(problem):
-    structure = find_structure(problem.system, count=5)
-    assert structure.states.shape == (6, problem.system.num_states)
-    nominal = structure.manifold.project(problem.system.nominal_state)
-    np.testing.assert_array_equal(structure.states[0], nominal)
-    for state in structure.states:
-        # Projected to round-off of numbers of order 10.
-        np.testing.assert_allclose(problem.derivatives(state), 0.0, atol=1e-14)
-
-
-@pytest.mark.slow
 def test_margins_are_singular_values_at_the_states(problem):
     structure = problem.structure
     b = [np.linalg.svd(problem.known(x).control_matrix)[1][-1] for x in structure.states]
@@ -71,13 +60,6 @@ def test_margins_are_singular_values_at_the_states(problem):
         assert structure.constraint_margin.singular_value == pytest.approx(min(a), rel=1e-10)
     else:
         assert structure.constraint_margin is None
-
-
-def test_the_same_seed_gives_the_same_states():
-    system = PROBLEMS["two_link_arm"]().system
-    one, two, other = (find_structure(system, seed=seed).states for seed in (3, 3, 4))
-    np.testing.assert_array_equal(one, two)
-    assert np.abs(one[1:] - other[1:]).min() > 0.0
 
 
 def test_spread_and_count():
@@ -192,16 +174,6 @@ def test_a_mass_matrix_changes_nothing(problem):
             )
 
 
-def test_a_control_that_the_constraint_cancels_never_acts():
-    """A radial force on a pendulum is borne by the rod: h* is zero up to round-off, p = 1."""
-    system = PROBLEMS["pendulum"]().system
-    x = system.state
-    radial = ca.vertcat(0, 0, x[0] * untidy_one(x[1]), x[1])
-    error = violation(changed(system, h=radial))
-    assert error.assumption == 5
-    assert "output 'x'" in str(error)
-
-
 def test_a_force_that_the_control_does_not_act_on_is_not_met_at_once():
     """A tangential force u on a pendulum: n* = beta is zero except for round-off, p = 1.
 
@@ -226,20 +198,3 @@ def test_small_numbers_are_not_zeros():
     # And through 1e-17, as a similarity transform in floating point leaves behind, it does not.
     noise = system_of(2, f=lambda x: [x[1], x[0]], h=lambda x: [1e-17, 1], l=lambda x: x[0])
     assert degrees(noise) == ((), (2,))
-
-
-def test_a_transformed_linear_system_keeps_its_degree():
-    """A chain of five integrators behind T F T^-1 in floating point."""
-    t = np.random.default_rng(3).normal(size=(5, 5))
-    inverse = np.linalg.inv(t)
-    x = ca.SX.sym("x", 5)
-    system = DaeSystem(
-        state=x,
-        f=(t @ np.eye(5, k=1) @ inverse) @ x,
-        g=[],
-        h=t[:, -1],
-        k=[],
-        l=inverse[:1] @ x,
-        m=[],
-    )
-    assert degrees(system) == ((), (5,))

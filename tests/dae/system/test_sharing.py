@@ -25,16 +25,10 @@ from drake_dae import (
     DaeSystem,
     RobotModel,
     RobotPlant,
-    TrackingLaw,
-    analyze,
     drop_constraints,
-    find_constraint_structure,
-    find_structure,
-    poles,
     share_forces,
 )
-from drake_dae.dae.structure.assumptions import ViolationKind
-from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
+from drake_dae.errors import ModelError
 
 LOAD = np.array([9.81 * 4.0, -0.3, 0.2])
 """What the legs of the table bear: weight and moments."""
@@ -45,17 +39,6 @@ def forces_of(system):
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, [0.0])
     return plant.GetOutputPort("constraint_force").Eval(context)
-
-
-@pytest.mark.parametrize("names", [None, ["leg3"], ["leg0"]])
-def test_the_legs_of_a_table_share_its_load(names):
-    """The pseudo-inverse by NumPy, whichever leg is left out: to round-off of 40 N."""
-    system = share_forces(plate(TABLE), names)
-    jacobian = np.array([[1.0, *place] for place in TABLE])
-    assert_allclose(forces_of(system), np.linalg.pinv(jacobian.T) @ LOAD, rtol=1e-14)
-    # Closed form: a quarter of the weight each, and the moments by the lever arms.
-    shares = [LOAD @ [0.25, x / 4, y / 4] for x, y in TABLE]
-    assert_allclose(forces_of(system), shares, rtol=1e-14)
 
 
 def test_compliances_share_as_springs_do():
@@ -71,11 +54,6 @@ def test_compliances_share_as_springs_do():
         compliances = dict(zip(names, unit / stiffness, strict=True))
         found = forces_of(share_forces(plate(TABLE), compliances=compliances))
         assert_allclose(found, stiffness * (jacobian @ sinking), rtol=1e-13)
-
-
-def test_where_nothing_is_redundant_all_stays():
-    system = plate(TABLE[:3])
-    assert share_forces(system) is system
 
 
 def test_what_is_not_determined_is_no_output():
@@ -114,12 +92,6 @@ def test_what_makes_no_sense_is_refused():
         share_forces(plate(TABLE), ["leg0", "leg1"])
     with pytest.raises(ModelError, match="'leg9'"):
         share_forces(plate(TABLE), ["leg9"])
-
-
-def test_a_law_with_measured_force_is_refused():
-    system = share_forces(plate(TABLE))
-    with pytest.raises(ModelError, match="measured_force"):
-        TrackingLaw(system, poles(-2.0), structure=find_structure(system), measured_force=True)
 
 
 def test_constraints_that_move_apart_are_not_redundant():
@@ -264,62 +236,3 @@ def test_the_motion_is_that_without_redundant_constraints():
         plant.set_state(context, state)
         rates.append(plant.EvalTimeDerivatives(context).CopyToVector())
     assert_allclose(rates[0], rates[1], rtol=1e-12, atol=1e-12)
-
-
-def test_another_assembly_is_refused():
-    """The pins that stay let the table turn round: then the row that was left out is broken."""
-    model = cranks()
-    plant = RobotPlant(model)
-    context = plant.CreateDefaultContext()
-    manifold, random = plant.structure.manifold, np.random.default_rng(0)
-    others = 0
-    for _ in range(20):
-        guess = np.concatenate([random.uniform(-3.0, 3.0, 4), np.zeros(4)])
-        try:
-            state = manifold.settle(guess)
-        except InconsistentStateError:
-            continue
-        broken = np.abs(by_position(state)).max() > 1e-6
-        others += broken
-        plant.set_state(context, state)
-        if broken:
-            with pytest.raises(InconsistentStateError, match="pin"):
-                plant.set_consistent_state(context, guess)
-    assert others
-
-
-def by_position(state):
-    """How far the pins are apart."""
-    q = state[:4]
-    tip = CRANK * np.array([np.cos(q[0]), np.sin(q[0])])
-    gaps = []
-    for i, place in enumerate(PLACES[1:], start=1):
-        pin = tip + place * np.array([np.cos(q[0] + q[1]), np.sin(q[0] + q[1])])
-        gaps += [*(pin - [place, 0.0] - CRANK * np.array([np.cos(q[i + 1]), np.sin(q[i + 1])]))]
-    return np.array(gaps)
-
-
-def test_rest_forces_are_all_of_them():
-    """At rest upright, where the motion is at rest: least squares of the statics, by NumPy."""
-    model = cranks()
-    q = np.pi / 2 * PARALLEL
-    found = model.rest_forces(q, [])
-    assert_allclose(found, by_hand(q, np.zeros(4), np.ones(4)), atol=1e-9)
-
-
-def test_the_analysis_says_what_is_not_determined():
-    analysis = analyze(cranks().dae)
-    assert "Left out as redundant: 'pin" in str(analysis)
-    found = analysis.to_dict()["redundant"]
-    assert len(found["left_out"]) == 1
-    assert "pin1.fx" in found["undetermined_forces"]
-
-
-@pytest.mark.slow
-def test_a_redundant_mechanism_is_reported():
-    """Though next to its motion the pins are independent, and lead to the cranks laid flat."""
-    dae = RobotModel.from_multibody(platform(), pins(), [], 0.8 * PARALLEL, forces=[]).dae
-    with pytest.raises(AssumptionError, match="pin") as caught:
-        find_constraint_structure(dae)
-    assert caught.value.violation.cause is ViolationKind.REDUNDANT
-    assert "'pin2." in str(caught.value)

@@ -78,15 +78,6 @@ def test_a_scale_that_is_not_given_is_that_of_the_nominal_state_or_one():
     np.testing.assert_array_equal(system.scale, [1.0, 300.0, 1.0])
 
 
-def test_a_scale_that_is_given_is_taken():
-    system = DaeSystem.from_functions(
-        2, f=lambda x: [x[1], 0], h=lambda x: [0, 1], l=lambda x: x[0], state_scale=[2.0, 5.0]
-    )
-    np.testing.assert_array_equal(system.scale, [2.0, 5.0])
-    np.testing.assert_array_equal(system.explicit.scale, [2.0, 5.0])
-    np.testing.assert_array_equal(system.nominal_spread, [0.2, 0.5])
-
-
 @pytest.mark.parametrize("scale", [[1.0], [1.0, 0.0], [1.0, -2.0], [1.0, np.nan], "one"])
 def test_a_scale_that_is_none_is_refused(scale):
     with pytest.raises(ModelError, match="state_scale"):

@@ -6,12 +6,11 @@ integrated by SciPy.
 
 import warnings
 
-import casadi as ca
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from arms import arm, touching
+from arms import touching
 from numpy.testing import assert_allclose
 from runs import some
 
@@ -29,7 +28,7 @@ from drake_dae import (
     poles,
     simulate,
 )
-from drake_dae.errors import AdviceWarning, GainError, ModelError, ScenarioError
+from drake_dae.errors import AdviceWarning, ModelError
 from drake_dae.references import stack_references
 from drake_dae.scenario.shipped import find_scenario
 
@@ -149,46 +148,6 @@ def test_behind_motors_and_springs_a_fast_force_damps_it_too(stage, degree, rati
         assert_allclose(forces[0], 20.0 - np.array(off), atol=0.5)
 
 
-def third_order():
-    """y''' = v + u_1 for the constraint y = x0, r = 3; x3 is steered by u_2."""
-    return DaeSystem.from_functions(
-        4,
-        f=lambda x: [x[1], x[2], -x[3] * x[0], ca.sin(x[3])],
-        g=lambda x: [0.0, 0.0, 2.0, 0.0],
-        h=lambda x: [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [0.0, 1.0]],
-        k=lambda x: x[0],
-        l=lambda x: [x[3], 0.0],
-        m=lambda x: [0.0, 1.0],
-        name="third",
-    )
-
-
-def test_a_constraint_of_degree_three_takes_two_poles():
-    """y''' + 7 y'' + 12 y' = A (F - lambda_d), whatever F is: here a function of y, by hand."""
-    law = TrackingLaw(third_order(), poles(-2.0), constraint_damping=poles([-3.0, -4.0]))
-    assert law.structure.constraint_degrees == (3,)
-    random = np.random.default_rng(0)
-    for _ in range(5):
-        x, force = random.standard_normal(4), random.standard_normal()
-        u = law.control(x, [0.4, 0.0, 5.0])
-        third = -x[3] * x[0] + 2.0 * force + u[0]
-        assert third + 7.0 * x[2] + 12.0 * x[1] == pytest.approx(2.0 * (force - 5.0), abs=1e-12)
-        assert np.sin(x[3]) + u[1] == pytest.approx(-2.0 * (x[3] - 0.4), abs=1e-12)
-
-
-def test_each_constraint_has_poles_of_its_own_and_bad_ones_are_refused():
-    system = arm("two_link").model.dae
-    known = {"structure": arm("two_link").structure}
-    TrackingLaw(system, poles(-4.0), constraint_damping=poles({"wall.distance": -50.0}), **known)
-    with pytest.raises(GainError, match=r"tool\.z"):
-        TrackingLaw(system, poles(-4.0), constraint_damping=poles({"tool.z": -50.0}), **known)
-    with pytest.raises(GainError, match="50"):
-        TrackingLaw(system, poles(-4.0), constraint_damping=poles(50.0), **known)
-    gains = TrackingLaw(system, poles(-4.0), **known).gains
-    with pytest.raises(GainError, match=r"constraint_damping.*\(1,\)"):
-        TrackingLaw(system, poles(-4.0), constraint_damping=gains, **known)
-
-
 @pytest.mark.parametrize(
     "name",
     some(
@@ -227,14 +186,6 @@ def test_on_an_ideal_plant_nothing_changes_but_round_off(name):
         assert np.abs((one - other) / scale).max() < 1e-9
 
 
-def test_a_scenario_reports_which_key_has_bad_damping():
-    scenario = load_scenario(
-        find_scenario("two_link_wall"), ["law.constraint_damping={all: [50.0]}"]
-    )
-    with pytest.raises(ScenarioError, match="constraint_damping: "):
-        build_scenario(scenario)
-
-
 # Advice.
 
 
@@ -267,16 +218,6 @@ def test_the_advice_brings_a_sampled_contact_to_rest_sooner_than_others(share, d
     left = [sampled(np.sqrt(k), f * c, T, delay, samples)[-5:].max() for f in (1.0, 0.5, 2.0)]
     if c > 0.0:
         assert left[0] < min(*left[1:], 1.0)
-
-
-def test_soft_contacts_are_damped_critically_and_hard_ones_by_the_sample_time():
-    T = 1e-3
-    assert contact_damping(100.0, 1.0, T) == pytest.approx(20.0, rel=0.05)
-    assert contact_damping(1e5, 1.0, T) < 0.5 / T < contact_damping(1e5, 1.0, T, 0)
-    # w T = 2: late by more than a quarter of a swing, any damping would drive it.
-    with pytest.warns(AdviceWarning, match=r"4e\+06"):
-        assert contact_damping(4e6, 1.0, T) == 0.0
-    assert contact_damping(1e5, 0.5) == pytest.approx(2.0 * np.sqrt(5e4))
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2])

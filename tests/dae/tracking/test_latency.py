@@ -6,7 +6,7 @@ import pytest
 from runs import roll, run_scenario, scenario
 from scipy.linalg import expm
 
-from drake_dae import DaeSystem, Parameter, TrackingLaw, poles, sampling_error
+from drake_dae import DaeSystem, TrackingLaw, poles, sampling_error
 from drake_dae.errors import ModelError
 
 INERTIA, DAMPING, PERIOD, POLE = 1e-3, 2.0, 1e-3, -10.0
@@ -52,46 +52,10 @@ def test_a_light_damped_joint_decays_as_designed_under_a_late_control():
     assert min(sampled_error(0.5 * LATENCY), sampled_error(2.0 * LATENCY)) > 0.03
 
 
-def test_the_law_takes_the_inertia_with_the_damping():
-    """(M + T d) v' + d v = u, at a state and a reference of their own."""
-    law = TrackingLaw(joint(), poles(POLE), latency=LATENCY)
-    (control,) = law.control([0.3, 0.2], [0.1, -0.4, 2.0])
-    wanted = 2.0 - 100.0 * (0.3 - 0.1) - 20.0 * (0.2 + 0.4)
-    assert control == pytest.approx((INERTIA + LATENCY * DAMPING) * wanted + DAMPING * 0.2)
-
-
-def test_only_damping_counts():
-    """Neither Coulomb friction, whose slope at rest is that of its regularization, nor growth."""
-    q, v, dry, growth = (ca.SX.sym(name) for name in ("q", "v", "dry", "growth"))
-    friction = -dry * v / ca.sqrt(v**2 + 1e-6) + growth * v
-    system = DaeSystem(
-        state=ca.vertcat(q, v),
-        f=ca.vertcat(v, friction),
-        g=ca.SX(2, 0),
-        h=ca.DM([0.0, 1.0]),
-        k=ca.SX(0, 1),
-        l=q,
-        m=ca.SX(1, 0),
-        parameters=(Parameter("dry", 2.0, symbol=dry), Parameter("growth", 3.0, symbol=growth)),
-        dry=("dry",),
-    )
-    law = TrackingLaw(system, poles(POLE), latency=LATENCY)
-    assert law.damped_structure is law.structure
-    late = TrackingLaw(system.with_values({"growth": -3.0}), poles(POLE), latency=LATENCY)
-    assert late.damped_structure is not late.structure
-
-
 def test_the_error_by_sampling_is_predicted_without_a_latency_for_damping():
     law, times = TrackingLaw(joint(), poles(POLE), latency=LATENCY), np.arange(3.0)
     with pytest.raises(ModelError, match=r"latency.*0\.0015"):
         sampling_error(law, times, np.zeros((3, 2)), np.zeros((3, 1)), PERIOD)
-
-
-def test_a_latency_is_a_time():
-    with pytest.raises(ModelError, match=r"latency.*-0\.001"):
-        TrackingLaw(joint(), poles(POLE), latency=-1e-3)
-    with pytest.raises(ModelError, match=r"latency.*'1 ms'"):
-        TrackingLaw(joint(), poles(POLE), latency="1 ms")
 
 
 def tool_with_drag():
@@ -127,32 +91,6 @@ def test_damping_of_several_joints_at_once_is_a_matrix():
     np.testing.assert_allclose(control, inertia @ wanted + damping @ speed, rtol=1e-12)
 
 
-def test_coulomb_friction_is_left_out_beside_parameters_of_any_size():
-    q, v = ca.SX.sym("q"), ca.SX.sym("v")
-    sizes, dry, viscous = ca.SX.sym("sizes", 3), ca.SX.sym("dry"), ca.SX.sym("viscous")
-    friction = -dry * v / ca.sqrt(v**2 + 1e-6) - viscous * v
-    system = DaeSystem(
-        state=ca.vertcat(q, v),
-        f=ca.vertcat(v, friction + sizes[0]),
-        g=ca.SX(2, 0),
-        h=ca.DM([0.0, 1.0]),
-        k=ca.SX(0, 1),
-        l=q,
-        m=ca.SX(1, 0),
-        parameters=(
-            Parameter("sizes", np.zeros(3), symbol=sizes),
-            Parameter("dry", 2.0, symbol=dry),
-            Parameter("viscous", 100.0, symbol=viscous),
-        ),
-        dry=("dry",),
-    )
-    law = TrackingLaw(system, poles(POLE), latency=LATENCY)
-    # At rest; the viscous friction is that of the run, not the default.
-    for parameters, viscous_friction in ((None, 100.0), ([0, 0, 0, 2.0, 300.0], 300.0)):
-        (control,) = law.control([0.01, 0.0], np.zeros(3), parameters=parameters)
-        assert control == pytest.approx(-(1.0 + LATENCY * viscous_friction) * POLE**2 * 0.01)
-
-
 LATE = "sampling={period: 0.001, delay: 0.001}"
 DAMPED = "robot.known_forces=[!JointFriction {joints: [joint1, joint2], viscous: 1000}]"
 
@@ -178,13 +116,6 @@ def test_a_sampled_scenario_knows_the_latency_of_its_law(monkeypatch):
     assert late < 2.0 * undamped
     monkeypatch.setattr("drake_dae.scenario.loop.latency_of", lambda *_: 0.0)
     assert off_prediction(LATE, DAMPED)[1] > 5.0 * late
-
-
-def test_continuous_laws_and_those_behind_springs_have_no_latency():
-    loop, *_ = run_scenario(scenario("two_link_wall", "duration=0.01"))
-    assert loop.controller.law.latency == 0.0
-    loop, *_ = run_scenario(scenario("two_link_flexible", LATE, "duration=0.01"))
-    assert loop.controller.law.latency == 0.0
 
 
 @pytest.mark.slow

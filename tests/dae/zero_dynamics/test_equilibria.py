@@ -1,6 +1,5 @@
 """Equilibria of zero dynamics: where they are, which are none, and what is said of those."""
 
-import re
 import warnings
 
 import casadi as ca
@@ -11,16 +10,12 @@ from problems import (
     PROBLEMS,
 )
 from problems.zero_systems import (
-    GRAVITY,
     HOLES,
     MINIMUM_PHASE,
     NON_MINIMUM_PHASE,
     TANK_AREAS,
     TANK_GRAVITY,
     Array,
-    assert_same_numbers,
-    cart_pendulum,
-    free_arm,
     internal,
     quadruple_tank,
     zero_dynamics,
@@ -29,12 +24,10 @@ from problems.zero_systems import (
 from drake_dae import (
     ConstantReference,
     DaePlant,
-    ExpressionReference,
-    LoopSettings,
     analyze,
     make_closed_loop,
 )
-from drake_dae.dae.structure.structure import examine_structure, find_structure
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -42,7 +35,6 @@ from drake_dae.dae.zero_dynamics.stability import Verdict
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import (
     InconsistentStateError,
-    ModelError,
     NonMinimumPhaseWarning,
 )
 
@@ -55,20 +47,6 @@ def tanks_at_rest(pumps, valves, levels) -> tuple[Array, Array]:
     u = np.linalg.solve(inflow, out)
     upper = np.array([(1 - g[1]) * k[1] * u[1], (1 - g[0]) * k[0] * u[0]])
     return np.concatenate([levels, (upper / HOLES[2:]) ** 2 / (2 * TANK_GRAVITY)]), u
-
-
-@pytest.mark.parametrize("plant", [MINIMUM_PHASE, NON_MINIMUM_PHASE])
-def test_equilibrium_of_the_four_tanks(plant):
-    dynamics = zero_dynamics(quadruple_tank(**plant))
-    expected, voltages = tanks_at_rest(**plant)
-    found = dynamics.equilibrium(plant["levels"])
-    # A dozen operations.
-    np.testing.assert_allclose(found, expected, rtol=1e-11)
-    motion = dynamics.motion(lambda t: [plant["levels"][0], 0, plant["levels"][1], 0], [0.0], found)
-    np.testing.assert_allclose(motion.controls[0], voltages, rtol=1e-10)
-    # The published upper levels are measured ones.
-    published = (1.8, 1.4) if plant is MINIMUM_PHASE else (4.8, 4.9)
-    np.testing.assert_allclose(found[2:], published, atol=0.25)
 
 
 @pytest.mark.parametrize("plant", [MINIMUM_PHASE, NON_MINIMUM_PHASE])
@@ -107,33 +85,6 @@ def test_equilibrium_of_a_robot_against_multibody_plant():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
-def test_eigenvalues_belong_to_equilibria():
-    dynamics = zero_dynamics(cart_pendulum())
-    with pytest.raises(ModelError, match="' = "):
-        dynamics.eigenvalues([0.0, 0.7 * np.sin(0.3), 0.7 * np.cos(0.3), 0, 0, 0])
-    for off in ([0, 0, 0.8, 0, 0, 0], [0, 0, 0.7, 1.0, 1.0, 0]):
-        with pytest.raises(ModelError, match=r"N\*"):
-            dynamics.eigenvalues(off)
-    upright = [0.0, 0.0, 0.7, 0, 0, 0]
-    assert dynamics.eigenvalues(upright)[0] == pytest.approx(np.sqrt(GRAVITY / 0.7), rel=1e-10)
-
-
-def test_singular_states_are_named():
-    """The arm stretched out, where its Jacobian is singular."""
-    dynamics = zero_dynamics(free_arm())
-    with pytest.raises(InconsistentStateError, match=r"x = .*A\(x\).*B\(x\)"):
-        dynamics.state([1.8, 0, 0, 0, 0, 0], np.zeros(4))
-    with pytest.raises(ModelError, match=r"B\(x\)"):
-        dynamics.eigenvalues(np.zeros(4))
-    # z' = (s + 1) u, s' = -1 - s: at rest with s = -1 nothing moves z.
-    system = DaeSystem.from_functions(
-        2, f=lambda x: [0, -1 - x[1]], h=lambda x: [1 + x[1], 0], l=lambda x: x[0]
-    )
-    stability = zero_dynamics(system).stability()
-    assert stability.verdict is Verdict.UNDECIDED
-    assert r"A(x) or B(x)" in stability.reason
-
-
 def test_no_equilibrium_is_reported():
     """s' = 1 + s^2 has none, nor has a blade pinned to a speed; with speed 0 it has many."""
     dynamics = zero_dynamics(internal(lambda s, z: 1 + s**2))
@@ -156,90 +107,6 @@ def test_no_equilibrium_is_reported():
     assert still.verdict is Verdict.UNDECIDED
     np.testing.assert_allclose(still.state, rest, rtol=0, atol=1e-12)
     np.testing.assert_allclose(still.eigenvalues, [0.0, 0.0], atol=1e-12)
-
-
-def test_a_continuum_is_not_left_for_round_off():
-    """z'' = u and s1' = s2' = 0 in turned coordinates: any (s1, s2) is at rest."""
-    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(4, 4)))[0]
-    shift = np.zeros((4, 4))
-    shift[0, 1] = 1.0
-    system = DaeSystem.from_functions(
-        4,
-        f=lambda x: turn @ shift @ turn.T @ x,
-        h=lambda x: turn[:, 1],
-        l=lambda x: ca.mtimes(turn[:, :1].T, x),
-        state_scale=np.ones(4),  # So that the nearest is that of the turned coordinates.
-    )
-    guess = turn @ [0.7, 0.0, 0.3, -0.4] + turn @ [0.0, 0.2, 0.0, 0.0]
-    rest = zero_dynamics(system).stability(guess).state
-    np.testing.assert_allclose(turn.T @ rest, [0.7, 0.0, 0.3, -0.4], rtol=0, atol=1e-12)
-
-
-def test_tension_as_output():
-    """The pendulum with its tension held, by hand.
-
-    At rest the control balances nothing: x = 0 is not regular, so it is held aside at angle a. With
-    T = v L constant: m x'' = v x + u, m y'' = v y - m g on the circle; u makes v what it is. With a
-    the angle from the vertical and w = -v L > 0: m L a'' = -m g sin a + u cos a and
-    w = m L a'^2 + m g cos a + u sin a, so m L a'' = (w cos a - m g) / sin a - m L a'^2 / tan a.
-    At rest cos a = m g/w, and the slope there is -w sin a/sin a = -w: m L a'' = -w (a - a_0).
-    """
-    problem = PROBLEMS["pendulum_tension"]()
-    mass, length, gravity = 2.0, 0.8, 9.81
-    dynamics, tension = zero_dynamics(problem.system), -30.0
-    weight = -tension * length
-    angle = np.arccos(mass * gravity / weight)
-    rest = dynamics.equilibrium([tension])
-    expected = [length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0]
-    np.testing.assert_allclose(rest, expected, rtol=0, atol=1e-11)
-    rate = np.sqrt(weight / (mass * length))
-    found = dynamics.eigenvalues(rest)
-    assert_same_numbers(found, np.array([1j, -1j]) * rate, rtol=1e-9, atol=1e-9)
-    # Without a given tension it is that of the equilibrium that is found.
-    free = dynamics.stability()
-    assert free.verdict is Verdict.UNDECIDED
-    np.testing.assert_allclose(dynamics.eigenvalues(free.state).imag, free.eigenvalues.imag)
-
-
-@pytest.mark.slow
-def test_verdicts_on_known_systems(problem):
-    stability = zero_dynamics(problem.system).stability()
-    if problem.zero_dynamics == 0:
-        assert stability.verdict is Verdict.STABLE
-        assert stability.reason.startswith("no zero dynamics")
-        assert (stability.state, stability.eigenvalues.shape) == (None, (0,))
-    elif problem.minimum_phase is not None:
-        assert (stability.verdict is Verdict.STABLE) == problem.minimum_phase
-        assert stability.eigenvalues.shape == (problem.zero_dynamics,)
-
-
-def test_an_equilibrium_without_zero_dynamics():
-    dynamics = zero_dynamics(free_arm())
-    rest = dynamics.equilibrium([1.2, 0.5], [0.2, 1.0, 0.3, 0.3])
-    np.testing.assert_allclose(rest[2:], 0.0, atol=1e-14)
-    assert dynamics.eigenvalues(rest).shape == (0,)
-
-
-@pytest.mark.parametrize(
-    ("columns", "where"),
-    [
-        (lambda x: [[1, 1], [1, 1]], ""),
-        # x1 passes 0 among the states around (0, 0.05).
-        (lambda x: [[x[1], 0], [0, 1]], r"x = \[.*, *-?[0-9.]+e-"),
-    ],
-)
-def test_a_singular_b_leaves_undecided_what_has_no_zero_dynamics(columns, where):
-    """Two outputs that move alike, and one that is not moved where x1 = 0: n = mu_1 + mu_2."""
-    system = DaeSystem.from_functions(
-        2, f=lambda x: [0, 0], h=columns, l=lambda x: [x[0], x[1]], nominal_state=[0.0, 0.05]
-    )
-    structure, violation = examine_structure(system, spread=0.1)
-    assert violation is not None
-    dynamics = ZeroDynamics(structure.system, structure=structure)
-    assert dynamics.dimension == 0
-    stability = dynamics.stability()
-    assert (stability.verdict, stability.state) == (Verdict.UNDECIDED, None)
-    assert re.search(r"B\(x\) of \(16\) is singular at " + where, stability.reason)
 
 
 def slider() -> DaeSystem:
@@ -281,22 +148,6 @@ def test_the_force_that_is_asked_for_decides(force, rate):
     assert [w.category for w in caught] == [NonMinimumPhaseWarning] * (rate > 0)
 
 
-def test_a_loop_is_judged_when_it_begins():
-    """The force grows from 20 to 60 N in 2 s: unstable above 40 N."""
-    law = TrackingLaw(slider(), poles(-3.0))
-    force = ExpressionReference(lambda t: [20 + 20 * t])
-    for start, unstable in ((0.0, False), (2.0, True)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            make_closed_loop(
-                DaePlant(law.structure.system, structure=law.structure),
-                law,
-                [ConstantReference([0.0]), force],
-                LoopSettings(start_time=start),
-            )
-        assert [w.category for w in caught] == [NonMinimumPhaseWarning] * unstable
-
-
 @pytest.mark.parametrize(
     ("rate", "nominal"),
     [(lambda x: -(x**2), 0.1), (lambda x: ca.cos(x) - 1, 0.3), (lambda x: 0 * x, 0.2)],
@@ -309,18 +160,6 @@ def test_an_equilibrium_that_is_found_slowly_decides_nothing(rate, nominal):
         h=lambda x: [1, 0],
         l=lambda x: [x[0]],
         nominal_state=[0.0, nominal],
-    )
-    assert ZeroDynamics(system).stability().verdict is Verdict.UNDECIDED
-
-
-def test_a_zero_at_zero_of_a_linear_system_decides_nothing():
-    """The zero is s = 0 exactly; what is left of it after cancellation is round-off."""
-    a = [[0, 0, 0], [1, 0, 0], [0, 0, 1]]
-    system = DaeSystem.from_functions(
-        3,
-        f=lambda x: ca.mtimes(ca.DM(a), x),
-        h=lambda x: [[-2, 0], [2, 0], [0, 1]],
-        l=lambda x: [2 * x[0], x[1] - 2 * x[2]],
     )
     assert ZeroDynamics(system).stability().verdict is Verdict.UNDECIDED
 
@@ -380,15 +219,3 @@ def test_a_clock_among_the_states_is_reported():
         assert stability.verdict is Verdict.UNDECIDED
         assert "c' = 1" in stability.reason
         assert "z1" not in stability.reason
-
-
-def test_a_constant_rate_that_something_steers_is_no_clock():
-    """x' = 1 + u rests at u = -1, which keeps x, and xi' = -xi + x with it."""
-    system = DaeSystem.from_functions(
-        ["x", "xi"],
-        f=lambda s: [1, s[0] - s[1]],
-        h=lambda s: [1, 0],
-        l=lambda s: [s[0]],
-    )
-    dynamics = ZeroDynamics(system)
-    assert dynamics.stability(dynamics.structure.states[0]).verdict is Verdict.STABLE

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 import pytest
-from problems import in_other_units
 from runs import some
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
@@ -98,34 +97,6 @@ def test_growth_by_a_parameter_that_oscillates():
     assert found.verdict is Verdict.UNSTABLE
     # At rest nothing is wrong.
     assert ZeroDynamics(oscillator(mathieu)).stability().verdict is Verdict.STABLE
-
-
-@pytest.mark.thorough
-def test_growth_by_an_exogenous_signal():
-    """The same oscillator, pumped by a known signal while its output stands still."""
-    system = DaeSystem.from_functions(
-        ["z", "s", "w"],
-        f=lambda x, p: [0, x[2], mathieu(x[1], x[2], p.pump)],
-        h=lambda x, p: [1, 0, 0],
-        l=lambda x, p: x[0],
-        parameters={"pump": 1.0},
-        exogenous=["pump"],
-        nominal_state=[0.0, 0.01, 0.0],
-        name="pumped",
-    )
-    pump, still = ExpressionReference(lambda t: ca.cos(2 * t)), lambda t: np.zeros(2)
-    times = np.linspace(0.0, 60.0, 61)
-    dynamics = ZeroDynamics(system)
-    motion = dynamics.motion(still, times, exogenous=[pump])
-    found = dynamics.stability_along(still, motion, np.pi, exogenous=[pump])
-    matrix = monodromy(lambda t: np.array([[0.0, 1.0], [-(1 + 0.9 * np.cos(2 * t)), -0.02]]), np.pi)
-    np.testing.assert_allclose(found.multipliers, by_size(np.linalg.eigvals(matrix)), rtol=1e-7)
-    # Nobody pumps: it is at rest, with the pump where its parameter is.
-    alone = dynamics.stability_along(still, dynamics.motion(still, times), np.pi)
-    assert alone.verdict is Verdict.STABLE
-    report = analyze(system, reference=still, times=times, period=np.pi, exogenous=[pump])
-    assert report.zero_dynamics_along.verdict is Verdict.UNSTABLE
-    assert len(report.problems) == 1
 
 
 @pytest.mark.slow
@@ -228,20 +199,6 @@ def test_multipliers_with_a_constraint():
     assert found.verdict is Verdict.UNSTABLE
 
 
-@pytest.mark.thorough
-def test_multipliers_do_not_depend_on_units():
-    system = oscillator(lambda s, w, z: -(1 + 0.9 * z) * s - 0.02 * w - s**3)
-    first = along(system, sinusoid(2.0, 0.1), np.pi)
-    unit = np.array([1e-3, 1e4, 1e-2])
-    second = along(
-        in_other_units(system, unit, np.ones(0), np.ones(1), np.ones(0), np.array([1e-3])),
-        lambda t: sinusoid(2.0, 0.1)(t) * 1e3,
-        np.pi,
-    )
-    np.testing.assert_allclose(first.multipliers, second.multipliers, rtol=1e-6)
-    assert first.verdict is second.verdict
-
-
 def test_a_multiplier_of_a_thousand_is_unstable():
     """s' = a(t) s with the mean 4.5: the multiplier is exp(4.5 P) = 1195 over P = 1.574 s."""
     period = np.log(1195.0) / 4.5
@@ -283,31 +240,11 @@ def test_a_limit_cycle_without_the_period_of_the_reference_is_not_called_stable(
         np.testing.assert_allclose(by_size(found.multipliers), by_size(expected), rtol=1e-5)
 
 
-def test_a_drift_has_no_periodic_motion():
-    """s' = 0.2 + 0.1 z moves on by 0.2 P in each period."""
-    system = DaeSystem.from_functions(
-        ["z", "s"], f=lambda x: [0, 0.2 + 0.1 * x[0]], h=lambda x: [1, 0], l=lambda x: x[0]
-    )
-    found = along(system, sinusoid(2.0), np.pi)
-    assert (found.verdict, found.multipliers.size) == (Verdict.UNDECIDED, 0)
-
-
 def test_multipliers_on_the_unit_circle_do_not_decide():
     """s'' = -s + z at rate 2: an oscillator without damping, multipliers exp(+- i pi)."""
     found = along(oscillator(lambda s, w, z: -2.0 * s + z), sinusoid(2.0), np.pi)
     np.testing.assert_allclose(np.abs(found.multipliers), 1.0, rtol=1e-7)
     assert found.verdict is Verdict.UNDECIDED
-
-
-def test_a_motion_without_a_start_is_not_decided():
-    dynamics = ZeroDynamics(oscillator(mathieu))
-
-    def nowhere(t):
-        return np.array([np.nan, 0.0])
-
-    motion = dynamics.motion(nowhere, [0.0, 1.0])
-    found = dynamics.stability_along(nowhere, motion, 0.5)
-    assert (found.verdict, found.period) == (Verdict.UNDECIDED, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -339,21 +276,6 @@ def test_arguments_that_do_not_fit_are_refused():
             dynamics.stability_along(sinusoid(2.0), motion, period)
 
 
-def test_without_zero_dynamics():
-    system = DaeSystem.from_functions(
-        2, f=lambda x: [x[1], 0], h=lambda x: [0, 1], l=lambda x: x[0]
-    )
-    dynamics = ZeroDynamics(system)
-
-    def reference(t):
-        return np.array([np.sin(t), np.cos(t), -np.sin(t)])
-
-    motion = dynamics.motion(reference, [0.0, 1.0])
-    found = dynamics.stability_along(reference, motion, 2 * np.pi)
-    assert found.verdict is Verdict.STABLE
-    assert dynamics.equilibria(outputs=[0.3]).shape == (1, 2)
-
-
 @pytest.mark.slow
 def test_analyze_reports_growth_along_a_reference():
     told = analyze(
@@ -369,39 +291,3 @@ def test_analyze_reports_growth_along_a_reference():
     data = told.to_dict()["zero_dynamics_along"]
     np.testing.assert_allclose(data["multipliers"], [[-1.93398, 0], [-0.48558, 0]], atol=1e-5)
     assert data["verdict"] == "unstable"
-
-
-@pytest.mark.slow
-def test_what_is_stable_along_a_reference_may_be_unstable_at_rest():
-    """Kapitza's pendulum, standing on a pivot that shakes: both are told."""
-    length, gravity, rate, size = 0.2, 9.81, 100.0, 0.04
-    system = DaeSystem.from_functions(
-        ["h", "v", "a", "w"],
-        f=lambda x: [x[1], 0, x[3], gravity / length * ca.sin(x[2]) - 2.0 * x[3]],
-        h=lambda x: [0, 1, 0, ca.sin(x[2]) / length],
-        l=lambda x: x[0],
-        nominal_state=[size, 0.0, 0.01, 0.0],
-    )
-
-    def reference(t):
-        c, s = np.cos(rate * t), np.sin(rate * t)
-        return size * np.array([c, -rate * s, -(rate**2) * c])
-
-    told = analyze(
-        system,
-        reference=reference,
-        times=np.linspace(0.0, 2.0, 201),
-        period=2 * np.pi / rate,
-    )
-
-    def slopes(t):
-        return np.array([[0.0, 1.0], [(gravity + reference(t)[2]) / length, -2.0]])
-
-    expected = by_size(np.linalg.eigvals(monodromy(slopes, 2 * np.pi / rate)))
-    np.testing.assert_allclose(
-        by_size(told.zero_dynamics_along.multipliers), expected, rtol=0, atol=1e-6
-    )
-    assert told.zero_dynamics_along.verdict is Verdict.STABLE
-    assert told.zero_dynamics.verdict is Verdict.UNSTABLE
-    assert told.zero_dynamics_finding is Finding.VIOLATED
-    assert len(told.problems) == 1

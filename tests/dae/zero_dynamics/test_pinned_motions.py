@@ -8,14 +8,12 @@ from problems import (
     PROBLEMS,
     Problem,
     closed_loop_outputs,
-    double_integrator,
     reference_at,
     wanted_outputs,
 )
 from problems.zero_systems import (
     GRAVITY,
     Array,
-    aircraft,
     cart_pendulum,
     derivatives,
     free_arm,
@@ -29,7 +27,6 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import (
-    InconsistentStateError,
     ModelError,
 )
 
@@ -84,46 +81,6 @@ def test_motions_agree_with_the_closed_loop_started_on_them(problem):
     np.testing.assert_allclose(motion.controls, controls, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_margins_are_the_singular_values_of_a_and_b(problem):
-    _, _, motion = following(problem, 5)
-    for i, x in enumerate(motion.states):
-        known = problem.known(x)
-        expected = np.linalg.svd(known.control_matrix, compute_uv=False)[-1]
-        assert motion.control_margins[i] == pytest.approx(expected, rel=1e-9)
-        if problem.constraint_degrees:
-            expected = np.linalg.svd(known.constraint_matrix, compute_uv=False)[-1]
-        else:
-            expected = np.inf
-        assert motion.constraint_margins[i] == pytest.approx(expected, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_shapes(problem):
-    dynamics, times, motion = following(problem, 4)
-    system, k = problem.system, times.size
-    assert dynamics.dimension == problem.zero_dynamics
-    assert motion.states.shape == (k, system.num_states)
-    assert motion.controls.shape == (k, system.num_controls)
-    assert motion.constraint_inputs.shape == (k, system.num_constraints)
-    assert motion.constraint_margins.shape == motion.control_margins.shape == (k,)
-    assert len(dynamics.residual_signals) == system.num_states - dynamics.dimension
-
-
-@pytest.mark.slow
-def test_a_state_on_the_reference_from_a_guess_off_it(problem):
-    dynamics = zero_dynamics(problem.system)
-    guess = problem.consistent(np.random.default_rng(3)) + 0.01
-    reference = reference_at(problem, 0.0)
-    state = dynamics.state(reference, guess)
-    law = TrackingLaw(problem.system, poles(-3.0), structure=dynamics.structure)
-    # Newton's method ends at the round-off of numbers of order 10.
-    np.testing.assert_allclose(problem.derivatives(state), 0.0, atol=1e-13)
-    np.testing.assert_allclose(law.error_coordinates(state, reference), 0.0, atol=1e-12)
-    # Steps below 1e-12 of the state end the search.
-    np.testing.assert_allclose(dynamics.state(reference, state), state, rtol=0, atol=1e-11)
-
-
 @pytest.mark.parametrize("angle", [0.0, 0.4])
 def test_the_internal_motion_of_a_pendulum_on_a_moved_cart(angle):
     """Against L a'' = g sin a - s'' cos a, written and integrated in the angle."""
@@ -175,32 +132,6 @@ def test_motions_of_robots_agree_with_multibody_plant(name, kind):
     np.testing.assert_allclose(truth.force, 20.0 + 3.0 * np.sin(1.0), rtol=1e-8)
 
 
-def test_a_motion_may_be_one_state():
-    motion = zero_dynamics(aircraft()).motion(lambda t: np.zeros(6), [2.0])
-    assert motion.ending is None
-    np.testing.assert_allclose(motion.states, np.zeros((1, 6)), atol=1e-15)
-
-
-def test_motions_take_parameters():
-    """The zero dynamics of the aircraft with another epsilon, against their own equation."""
-    times = np.linspace(0.0, 1.0, 6)
-    start = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
-    motion = zero_dynamics(aircraft()).motion(lambda t: np.zeros(6), times, start, [0.7])
-    expected = solve_ivp(
-        lambda t, a: [a[1], np.sin(a[0]) / 0.7],
-        (0, 1),
-        start[[2, 5]],
-        "DOP853",
-        times,
-        rtol=1e-11,
-        atol=1e-12,
-    ).y
-    # 1e-8 a step.
-    np.testing.assert_allclose(motion.states[:, [2, 5]].T, expected, rtol=0, atol=1e-7)
-    u1, u2 = np.cos(expected[0]), np.sin(expected[0]) / 0.7
-    np.testing.assert_allclose(motion.controls, np.transpose([u1, u2]), rtol=0, atol=1e-7)
-
-
 def test_wrong_arguments_are_refused():
     dynamics = zero_dynamics(free_arm())
     still = np.array([1.2, 0, 0, 0.5, 0, 0])
@@ -223,15 +154,3 @@ def test_wrong_arguments_are_refused():
         dynamics.equilibrium([1, 2, 3])
     with pytest.raises(ModelError, match="outputs"):
         dynamics.equilibrium(["far", "away"])
-
-
-def test_outputs_out_of_reach_are_named():
-    dynamics = zero_dynamics(free_arm())
-    with pytest.raises(InconsistentStateError, match=r"free arm: .*x = 2, y = 0") as info:
-        dynamics.state([2.0, 0, 0, 0, 0, 0])
-    # The nearest the tip gets is 0.2 short.
-    assert np.max(np.abs(info.value.residual)) > 0.1
-    with pytest.raises(InconsistentStateError, match="z0"):
-        zero_dynamics(double_integrator(l=lambda x: ca.sqrt(x[0]), nominal_state=[1, 0])).state(
-            [1.0, 0.0, 0.0], [-1.0, 0.0]
-        )

@@ -6,7 +6,6 @@ import pytest
 from runs import some
 
 from drake_dae import DaePlant, analyze, make_closed_loop
-from drake_dae.analysis.findings import Finding
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -185,17 +184,6 @@ def test_a_zero_without_a_slope_is_no_equilibrium(name, others):
     assert dynamics.stability([0.0, *[0.01] * (1 + others)]).verdict is Verdict.UNDECIDED
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rate", some([1e-9, 1e-6, 0.3, 1e6], of=3))
-@pytest.mark.parametrize("others", [0, 1])
-def test_slow_and_fast_states_have_one_equilibrium(rate, others):
-    more = [lambda *_: [], lambda a, b, z: [-b + a]][others]
-    system = beside(lambda *x: [-rate * (x[0] - 0.2), *more(*x)], 1 + others)
-    told = analyze(system)
-    assert [one.verdict for one in told.equilibria] == [Verdict.STABLE]
-    assert told.zero_dynamics.state[1] == pytest.approx(0.2, abs=1e-6)
-
-
 DEFECTIVE = {
     "two": [[-0.1, 1.0], [0.0, -0.1]],
     "two of 1e-3": [[-1e-3, 1.0], [0.0, -1e-3]],
@@ -221,13 +209,6 @@ def test_a_defective_matrix_is_decided(name, sign):
     )
     told = ZeroDynamics(system).stability()
     assert told.verdict is (Verdict.STABLE if sign > 0.0 else Verdict.UNSTABLE)
-
-
-def test_several_equilibria_of_a_slow_state_are_several():
-    dynamics = ZeroDynamics(beside(lambda a, z: [1e-9 * ca.sin(a)], 1))
-    guesses = np.array([[0.0, s] for s in (0.1, 3.0, 6.0, -3.3, 3.2)])
-    found = np.sort(dynamics.equilibria(guesses, outputs=[0.0])[:, 1])
-    np.testing.assert_allclose(found, [-np.pi, 0.0, np.pi, 2 * np.pi], rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -268,29 +249,3 @@ def test_eigenvalues_eleven_orders_apart_are_decided(small):
 
 
 # In a region.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("region", "inside"),
-    some([((-2.0, 2.0), 1), ((0.5, 1.5), 0), ((-1.6, -0.5), 0), (None, None)]),
-)
-def test_an_unstable_equilibrium_inside_the_region_is_a_finding(region, inside):
-    """s'' = s - s^3 - s': unstable at 0, and stable at 1 and -1, from which it begins."""
-    system = DaeSystem.from_functions(
-        ["z", "s", "w"],
-        f=lambda x: [0, x[2], x[1] - x[1] ** 3 - x[2]],
-        h=lambda x: [1, 0, 0],
-        l=lambda x: x[0],
-        nominal_state=[0.0, 0.95, 0.0],
-    )
-    told = analyze(system, region=None if region is None else {"s": region})
-    assert told.zero_dynamics.verdict is Verdict.STABLE
-    if inside is None:
-        assert not told.problems
-        return
-    assert len(told.problems) == inside
-    (row,) = (line for line in str(told).splitlines() if line.startswith("2.2 "))
-    assert (str(Finding.VIOLATED) in row) == bool(inside)
-    if inside:
-        assert "s=" in told.problems[0]

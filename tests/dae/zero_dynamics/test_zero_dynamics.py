@@ -4,11 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from arms import touching
-from problems import (
-    PROBLEMS,
-    in_other_units,
-)
 from problems.zero_systems import (
     GRAVITY,
     NON_MINIMUM_PHASE,
@@ -26,7 +21,6 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import poles
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.stability import Verdict
-from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
 
 
 def finite_zeros(system: DaeSystem) -> Array:
@@ -79,42 +73,6 @@ def test_eigenvalues_of_linear_systems_are_their_invariant_zeros(seed):
     assert stability.verdict == (Verdict.STABLE if stable else Verdict.UNSTABLE)
 
 
-def test_zeros_with_feedthrough():
-    """z2 = L2 x + M2 v is met at once: r = (1, 1), mu = (1, 0)."""
-    problem = PROBLEMS["linear"]()
-    dynamics = zero_dynamics(problem.system)
-    found = dynamics.eigenvalues(np.zeros(6))
-    assert_same_numbers(found, finite_zeros(problem.system), rtol=1e-8)
-    # Anywhere the outputs put it, too: the linear system at rest with outputs (0.3, -0.2).
-    rest = dynamics.equilibrium([0.3, -0.2])
-    np.testing.assert_allclose(problem.derivatives(rest), 0.0, atol=1e-12)
-    assert_same_numbers(dynamics.eigenvalues(rest), found, rtol=1e-8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "size"), [("two_link", 2), ("seven_joint", 7)])
-def test_damped_flexible_joints_leave_their_deflections(name, size):
-    """K d + D d' = tau: the eigenvalues of -D^-1 K, whatever links and motors do."""
-    random = np.random.default_rng(1)
-
-    def positive(scale: float) -> Array:
-        root = np.eye(size) + 0.2 * random.normal(size=(size, size))
-        return scale * root @ root.T
-
-    stiffness, damping = positive(8000.0), positive(20.0)
-    model = touching(name, [FlexibleJoints(stiffness, np.eye(size), damping)])
-    dynamics = zero_dynamics(model.dae)
-    assert dynamics.dimension == size
-    stability = dynamics.stability()
-    assert stability.verdict is Verdict.STABLE
-    assert "minimum phase" in stability.reason
-    expected = np.linalg.eigvals(-np.linalg.solve(damping, stiffness))
-    # A state of 28 numbers, and forces that are differences of large ones.
-    assert_same_numbers(stability.eigenvalues, expected + 0j, rtol=1e-8)
-    rate, still = np.split(stability.state.reshape(4, size), 2)[0][1], stability.state[-size:]
-    np.testing.assert_allclose([rate, still], 0.0, atol=1e-10)
-
-
 def test_pendulum_on_a_cart_is_not_minimum_phase():
     """Upright +- sqrt(g/L); hanging +- i sqrt(g/L), or damped."""
     rate = np.sqrt(GRAVITY / 0.7)
@@ -138,20 +96,6 @@ def test_pendulum_on_a_cart_is_not_minimum_phase():
     np.testing.assert_allclose(swung.state[:3], [0.3, 0.3, -0.7], rtol=0, atol=1e-10)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("epsilon", [0.01, 0.25, 4.0])
-def test_the_aircraft_is_not_minimum_phase(epsilon):
-    """eps a'' = sin a (Hauser, Sastry and Meyer, 1992, section 3)."""
-    rate = 1 / np.sqrt(epsilon)
-    stability = zero_dynamics(aircraft()).stability(parameters=[epsilon])
-    np.testing.assert_allclose(stability.eigenvalues, [rate, -rate], rtol=1e-12)
-    assert stability.verdict is Verdict.UNSTABLE
-    # Upside down it is a center.
-    down = zero_dynamics(aircraft()).stability([0, 0, 3.0, 0, 0, 0], [epsilon])
-    np.testing.assert_allclose(down.state[2], np.pi, rtol=1e-10)
-    assert down.verdict is Verdict.UNDECIDED
-
-
 @pytest.mark.parametrize("damping", [0.0, 1e-6, 0.1, -1e-6])
 def test_a_center_is_undecided_and_the_least_damping_is_not(damping):
     """2 q2'' + d q2' + 8 q2 = 8 q1."""
@@ -163,20 +107,6 @@ def test_a_center_is_undecided_and_the_least_damping_is_not(damping):
     )
     expected = {0.0: Verdict.UNDECIDED, -1e-6: Verdict.UNSTABLE}
     assert stability.verdict is expected.get(damping, Verdict.STABLE)
-
-
-def test_slow_modes_beside_fast_ones_are_decided():
-    """s1' = -1e5 s1, s2' = -1e-3 s2, coupled: eigenvalues eight orders apart."""
-    system = DaeSystem.from_functions(
-        3,
-        f=lambda x: [0, -1e5 * x[1] + 3e4 * x[2], -1e-3 * x[2]],
-        h=lambda x: [1, 2, 3],
-        l=lambda x: x[0],
-    )
-    # z = x0, u = 0 at rest; u also moves x1, x2: x1' ... with u = r' = 0.
-    stability = zero_dynamics(system).stability()
-    np.testing.assert_allclose(stability.eigenvalues, [-1e-3, -1e5], rtol=1e-9)
-    assert stability.verdict is Verdict.STABLE
 
 
 def test_a_defective_zero_is_undecided():
@@ -193,17 +123,6 @@ def test_a_defective_zero_is_undecided():
     stability = zero_dynamics(system).stability()
     assert stability.verdict is Verdict.UNDECIDED
     np.testing.assert_allclose(stability.eigenvalues, 0.0, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_eigenvalues_do_not_depend_on_units():
-    system = cart_pendulum(0.3)
-    random = np.random.default_rng(0)
-    scales = [10.0 ** random.uniform(-3, 3, size) for size in (6, 1, 1, 1, 1)]
-    found = zero_dynamics(in_other_units(system, *scales)).stability()
-    expected = zero_dynamics(system).stability()
-    np.testing.assert_allclose(found.eigenvalues, expected.eigenvalues, rtol=1e-8)
-    assert found.verdict is expected.verdict is Verdict.UNSTABLE
 
 
 @pytest.mark.slow

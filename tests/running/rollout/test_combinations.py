@@ -31,8 +31,8 @@ def test_a_rollout_is_drakes_run_or_says_why_not(names, tmp_path):
         assert re.fullmatch(r"[^.]+(\. [^.]+)?", refused), refused
         return
     seeds = {"force_noise": chosen.sensors.force.seed} if chosen.sensors.force else {}
-    if chosen.encoders is not None:
-        seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
+    if chosen.sensors.encoders is not None:
+        seeds["encoder_noise"] = encoder_seed(chosen.sensors.encoders.seed)
     simulate(loop.diagram, context, chosen.duration, chosen.integrator, may_diverge=True)
     wanted = loop.record(context)
     arguments = (loop, start, parameters, wanted.time)

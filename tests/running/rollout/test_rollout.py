@@ -7,16 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.trajectories import PiecewisePolynomial
 from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, run, scenario, some
 
 from drake_dae import (
-    ConstantReference,
     ForceSensor,
     LoopSettings,
     RobotPlant,
     TrackingLaw,
-    TrajectoryReference,
     build_scenario,
     make_closed_loop,
     poles,
@@ -113,7 +110,7 @@ def test_a_reference_of_many_polynomials_is_the_same(compiled):
     step, duration = 2.0**-10, 0.5
     chosen = scenario("two_link_wall", MANY_PIECES, f"duration={duration}", *fixed(step=step))
     loop, context = build_scenario(chosen)
-    assert loop.generator.references[0].spline.spans > UNROLLED
+    assert len(loop.generator.references[0].spline.points) > UNROLLED
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, duration, chosen.integrator)
     assert np.ptp(wanted["desired_output"][:, 0]) > 0.005
@@ -329,7 +326,7 @@ def test_integrals_are_those_of_drake(case, compiled):
         grid(0.1, 1e-3),
         config=chosen.integrator,
         compiled=compiled,
-        seeds=[chosen.sensors.force.seed],
+        seeds=[0 if chosen.sensors.force is None else chosen.sensors.force.seed],
     )
     assert_equal_records(found.record, wanted, 1e-12)
 
@@ -391,11 +388,6 @@ def test_what_cannot_be_rolled_out_is_refused():
     implicit.integration_scheme, implicit.use_error_control = "implicit_euler", False
     with pytest.raises(ModelError, match="implicit_euler"):
         rollout(loop, start, parameters, [0.0, 0.1], config=implicit)
-    path = TrajectoryReference(PiecewisePolynomial.CubicHermite([0, 1], [[0.3, 0.3]], [[0, 0]]))
-    plant = RobotPlant(loop.plant.model, structure=loop.controller.law.structure)
-    other = make_closed_loop(plant, loop.controller.law, [path, ConstantReference(10.0)])
-    with pytest.raises(ModelError, match="TrajectoryReference"):
-        rollout(other, start, parameters, [0.0, 0.1])
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
@@ -515,8 +507,8 @@ def test_sampled_laws_are_those_of_drake(settings, compiled):
     start, parameters = start_values(loop, context)
     wanted = run(loop, context, 0.2, chosen.integrator)
     seeds = {"force_noise": chosen.sensors.force.seed} if chosen.sensors.force else {}
-    if chosen.encoders is not None:
-        seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
+    if chosen.sensors.encoders is not None:
+        seeds["encoder_noise"] = encoder_seed(chosen.sensors.encoders.seed)
     (found,) = rollout(
         loop,
         start,
@@ -562,8 +554,8 @@ def test_observed_loops_are_those_of_drake(name, settings, compiled):
     wanted = run(loop, context, 0.2, chosen.integrator)
     assert np.ptp(wanted["disturbance"], axis=0).max() > 1.0
     seeds = {"force_noise": chosen.sensors.force.seed}
-    if chosen.encoders is not None:
-        seeds["encoder_noise"] = encoder_seed(chosen.encoders.seed)
+    if chosen.sensors.encoders is not None:
+        seeds["encoder_noise"] = encoder_seed(chosen.sensors.encoders.seed)
     settings = {"config": chosen.integrator, "compiled": compiled, "seeds": [seeds]}
     (found,) = rollout(loop, start, parameters, grid(0.2, 1e-3), **settings)
     assert found.failure is None

@@ -1,20 +1,23 @@
-"""Dataclasses from outside the package as forms: read, refused, written back."""
+"""Dataclasses from outside the package as forms: read, refused, written back, described."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
-from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.forms.forms import Choice, Form
-from drake_dae.scenario.forms.reader import Reader
-from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_yaml, set_entry
-from drake_dae.scenario.forms.values import Numbers, Triple
-from drake_dae.scenario.scenario import scenario_reader
+from drake_dae.scenario.forms.forms import (
+    Family,
+    Key,
+    Reader,
+    attribute_texts,
+    introduction,
+    keys_of,
+)
+from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_lines, load_yaml
+from drake_dae.scenario.forms.values import NUMBERS, TRIPLE
 
 
 class Surface:
@@ -51,32 +54,38 @@ class Contact:
     names: Sequence[str] = ()
 
 
-Surfaces = Annotated[
-    Bowl | Annotated[Cone, Form(tag="!Funnel", defaults={"angle": 30.0})],
-    Choice({tuple[float, float, float]: Triple}),
-]
+class Config:
+    """No dataclass, as of Drake."""
+
+    def __init__(self, accuracy=0.25, step=0.1):
+        self.accuracy, self.step = accuracy, step
 
 
 @dataclass(frozen=True, eq=False)
 class Everything:
-    contact: Annotated[Contact, Form({Surface: Surfaces})]
-    spring: Annotated[Spring, Form({ArrayLike: Numbers})] = field(
-        default_factory=lambda: Spring(1.0)
-    )
-    config: Annotated[SimulatorConfig, Form(defaults={"accuracy": 0.25})] = field(
-        default_factory=SimulatorConfig
-    )
+    contact: Contact
+    spring: Spring = field(default_factory=lambda: Spring(1.0))
+    config: Config = field(default_factory=Config)
     free: dict[str, dict[str, int]] = field(default_factory=dict)
 
 
-READER = Reader(Everything)
+READER = Reader(
+    Everything,
+    {Surface: Family({"!Bowl": Bowl, "!Funnel": Cone})},
+    {ArrayLike: NUMBERS, tuple[float, float, float]: TRIPLE},
+    {
+        Config: {"accuracy": Key(float, 0.25, "How well."), "step": Key(float, 0.1, "How far.")},
+        Cone: {**keys_of(Cone), "angle": Key(float, 30.0, "")},
+    },
+)
 
 
 def read(text, *settings):
-    data = load_yaml(text, "text")
+    data, line_of = load_lines(text, "text")
     for setting in settings:
-        set_entry(data, setting, READER.free_names)
-    return READER.read(data)
+        key, _, value = setting.partition("=")
+        READER.put(data, key, load_yaml(value, key))
+    return READER.read(data, place_of=lambda key: f"[{line_of(key)}]")
 
 
 def problems(text, *settings):
@@ -92,11 +101,28 @@ def test_a_member_has_a_tag_and_defaults_of_its_own():
     assert read("contact: {surface: {depth: 3}}").contact.surface == Bowl(3.0)
     found = problems("contact: {surface: !Cone {}}")["contact.surface"]
     assert all(tag in found for tag in ("!Bowl", "!Funnel", "!Cone"))
+    assert "!Funnel" in problems("contact: !Funnel {surface: {}}")["contact"]
 
 
-def test_what_a_class_refuses_is_reported_in_one_line_at_its_key():
-    ((key, text),) = problems("contact: {surface: !Funnel {apex: [0, 0, 0], angle: 90}}").items()
-    assert (key, text[:5], "\n" in text) == ("contact.surface", "angle", False)
+def test_all_problems_are_told_at_once_with_their_lines():
+    found = problems(
+        "contact:\n"
+        "  surface: !Funnel {apex: [0, 0, 0],\n"
+        "    angle: 90}\n"
+        "  naems: []\n"
+        "spring: {inertia: abc}\n"
+        "config:\n"
+        "  accuracy: high\n"
+    )
+    assert {key: text[-3:] for key, text in found.items()} == {
+        "contact.surface": "[2]",
+        "contact": "[4]",
+        "spring": "[5]",
+        "spring.inertia": "[5]",
+        "config.accuracy": "[7]",
+    }
+    assert "'names'" in found["contact"]
+    assert not any("\n" in text for text in found.values())
 
 
 def test_fields_that_are_not_arguments_are_no_keys():
@@ -122,38 +148,25 @@ def test_numbers(text, value):
     assert read(head, "spring.inertia=").spring.inertia is None
 
 
-def test_a_class_of_drake_with_defaults():
-    made = read("contact: {surface: {}}\nconfig: {max_step_size: 1}")
-    assert (made.config.max_step_size, made.config.accuracy) == (1.0, 0.25)
-    # Drake's own defaults are left to Drake, whose fields differ between versions.
-    assert READER.write(made)["config"] == {"max_step_size": 1.0, "accuracy": 0.25}
-    found = problems("contact: {surface: {}}\nconfig: {accuracy: high, max_step: 1}")
-    assert "'high'" in found["config.accuracy"]
-    assert "'max_step_size'" in found["config"]
-
-
 def test_names_with_dots():
     made = read("contact: {surface: {}}", "free.a.b={c: 1}", "free.d={}")
     assert made.free == {"a.b": {"c": 1}, "d": {}}
+    assert read("contact: {surface: {}}\nfree: {a.b: {}}", "free.a.b.c=2").free["a.b"] == {"c": 2}
 
 
-def test_what_is_written_reads_back():
+def test_what_differs_from_the_defaults_is_written_and_reads_back():
     made = read(
         "contact: {surface: !Funnel {apex: [1, 2, 3]}, names: [a, 'on', 'é: 1']}\n"
-        "spring: {stiffness: [[1, 2], [3, 4]]}\nfree: {x: {y: 1}}"
+        "spring: {stiffness: [[1, 2], [3, 4]]}\nfree: {x: {y: 1}}\nconfig: {step: 2}"
     )
     text = dump_yaml(READER.write(made))
     assert text.splitlines()[0:2] == ["contact:", "  surface: !Funnel"]
+    assert not {"angle", "inertia", "accuracy"} & set(text.replace(":", " ").split())
     again = read(text)
-    assert (again.contact, again.free) == (made.contact, made.free)
+    assert (again.contact, again.free, again.config.step) == (made.contact, made.free, 2.0)
     np.testing.assert_array_equal(again.spring.stiffness, made.spring.stiffness)
-    assert READER.write(again) == READER.write(made)
-
-
-def test_an_array_is_written_as_lists():
-    everything = Everything(Contact(Bowl()), Spring(np.eye(2), geometry=np.array([1.0, 2.0])))
-    data = READER.write(everything)["spring"]
-    assert data == {"stiffness": [[1, 0], [0, 1]], "inertia": None, "geometry": [1, 2]}
+    arrays = Everything(Contact(Bowl()), Spring(np.eye(2), geometry=np.array([1.0, 2.0])))
+    assert READER.write(arrays)["spring"] == {"stiffness": [[1, 0], [0, 1]], "geometry": [1, 2]}
 
 
 def test_merged_keys_and_aliases():
@@ -166,40 +179,37 @@ def test_an_alias_inside_itself_is_refused(text):
     assert problems(text)
 
 
-def test_the_json_schema_knows_tags():
-    bowl, cone = READER.schema["properties"]["contact"]["properties"]["surface"]["oneOf"]
-    assert bowl["properties"]["_tag"]["const"] == "!Bowl"
-    assert "_tag" not in bowl.get("required", [])
-    assert set(cone["required"]) == {"_tag", "apex"}
+def test_the_json_schema_has_defaults_and_no_tags():
+    parts = READER.schema["$defs"]
+    assert parts["Config"]["properties"]["accuracy"]["default"] == 0.25
+    assert parts["Config"]["properties"]["step"]["description"] == "How far."
+    assert READER.tags == ["!Bowl", "!Funnel"]
+    assert "_tag" not in str(READER.schema)
 
 
-def test_names_are_free_where_the_json_schema_allows_any_key():
-    def free(schema, path):
-        if schema.get("additionalProperties"):
-            yield ".".join(path)
-        some = [inner for inner in schema.get("anyOf", []) if inner.get("type") != "null"]
-        for inner in [*(some if len(some) == 1 else []), *schema.get("oneOf", [])]:
-            yield from free(inner, path)
-        if isinstance(schema.get("items"), dict):
-            yield from free(schema["items"], [*path, "*"])
-        for name, inner in schema.get("properties", {}).items():
-            yield from free(inner, [*path, name])
+def test_docstrings_are_read_with_those_of_bases():
+    class Base:
+        """A base.
 
-    reader = scenario_reader()
-    assert {"references", "task.phases.*.references"} < reader.free_names
-    assert reader.free_names == set(free(reader.schema, []))
+        Attributes:
+            first, second: Both of them,
+                on two lines.
+        """
 
+    class Derived(Base):
+        """A class: it
+        derives.
 
-def test_a_class_at_several_places_has_the_tag_and_the_defaults_of_each():
-    @dataclass
-    class Places:
-        plain: Cone
-        steep: Annotated[Cone, Form(defaults={"angle": 80.0})]
-        chosen: Surfaces
+        Attributes:
+            third: With a colon: here.
 
-    apex = "apex: [1, 2, 3]"
-    text = f"plain: {{{apex}, angle: 5}}\nsteep: {{{apex}}}\nchosen: !Funnel {{{apex}}}"
-    made = Reader(Places).read(load_yaml(text, "text"))
-    assert (made.plain.angle, made.steep.angle, made.chosen.angle) == (5.0, 80.0, 30.0)
-    with pytest.raises(ScenarioError, match="steep: "):
-        Reader(Places).read(load_yaml(text.replace("steep: ", "steep: !Funnel "), "text"))
+        Raises:
+            ValueError: Never.
+        """
+
+    assert attribute_texts(Derived) == {
+        "first": "Both of them, on two lines.",
+        "second": "Both of them, on two lines.",
+        "third": "With a colon: here.",
+    }
+    assert introduction(Derived.__doc__) == "A class: it\nderives."

@@ -105,9 +105,9 @@ def test_only_what_must_be_left_out_is(tmp_path):
     both = friction.replace('ixx="0.02"', 'ixx="9"', 1)
     for text, wanted in (
         (arm(2), []),
-        (friction, ["joint_friction"]),
+        (friction, ["dynamics/friction"]),
         (heavy, ["inertia"]),
-        (both, ["joint_friction", "inertia"]),
+        (both, ["dynamics/friction", "inertia"]),
     ):
         (tmp_path / "arm.urdf").write_text(text)
         assert new_robot(str(tmp_path / "arm.urdf")).robot.leave_out == wanted

@@ -11,7 +11,7 @@ from drake_dae import load_scenario
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.robot_file.descriptions import find_description
+from drake_dae.scenario.robot_file.packages import described_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
 
@@ -63,7 +63,6 @@ def test_a_description_is_the_robot_of_its_file(fake, tmp_path):
     assert model.dae.name == "panda_description"
     save_scenario(scenario, tmp_path / "again.yaml")
     assert load_scenario(tmp_path / "again.yaml") == scenario
-    assert "file: ''" in (tmp_path / "again.yaml").read_text()
 
 
 def test_what_is_wrong_with_a_name_is_reported(fake, tmp_path):
@@ -73,7 +72,7 @@ def test_what_is_wrong_with_a_name_is_reported(fake, tmp_path):
     assert key == "robot.description"
     assert "'panda_descripton'" in text
     with pytest.raises(ModelError, match="'xacro_description'"):
-        find_description("xacro_description")
+        described_robot("xacro_description")
 
 
 def test_without_a_network_it_says_what_to_do(fake, tmp_path, monkeypatch):
@@ -82,9 +81,9 @@ def test_without_a_network_it_says_what_to_do(fake, tmp_path, monkeypatch):
             raise RuntimeError("could not resolve host")
         return sys.modules[name]
 
-    monkeypatch.setattr("drake_dae.scenario.robot_file.descriptions.import_module", fail)
+    monkeypatch.setattr("drake_dae.scenario.robot_file.packages.import_module", fail)
     with pytest.raises(ModelError) as caught:
-        find_description("far")
+        described_robot("far")
     for words in ("could not resolve host", "ROBOT_DESCRIPTIONS_CACHE", "robot.file"):
         assert words in str(caught.value)
 

@@ -3,11 +3,14 @@
 from pathlib import Path
 
 import pytest
+from pydrake.geometry import Role, SceneGraph
 from vendors import write_panda
 
 from drake_dae import load_scenario
-from drake_dae.errors import ScenarioError
+from drake_dae.errors import GeometryWarning, ScenarioError
 from drake_dae.scenario.model import scenario_model
+from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Robot
 
 SCENARIO = """
 robot: {file: FILE, base: {weld: panda_link0}, locked: {panda_finger_joint1: 0.02}, actuators: all}
@@ -37,6 +40,13 @@ def joints(folder: Path, file: str = "panda_description/urdf/panda.urdf", *setti
     return len(
         scenario_model(load_scenario(folder / "panda.yaml", settings)).links.position_signals
     )
+
+
+def drawn(folder: Path, file: str, **packages: str) -> int:
+    """The number of visual geometries."""
+    scene_graph = SceneGraph()
+    read_robot(Robot(str(folder / file), packages=packages), scene_graph)
+    return len(scene_graph.model_inspector().GetAllGeometryIds(Role.kIllustration))
 
 
 def away(folder: Path) -> str:
@@ -92,10 +102,18 @@ def test_packages_of_the_scenario_come_first(tmp_path: Path):
     """The meshes of the file's own package are no more: those of the named one are read."""
     write_panda(tmp_path)
     (tmp_path / "panda_description" / "meshes").rename(tmp_path / "meshes")
-    with pytest.raises(ScenarioError, match=r"panda_link\d"):
-        joints(tmp_path)
-    setting = "robot.packages.panda_description=."
-    assert joints(tmp_path, "panda_description/urdf/panda.urdf", setting) == 7
+    with pytest.warns(GeometryWarning, match=r"panda_link1\.dae"):
+        drawn(tmp_path, "panda_description/urdf/panda.urdf")
+    file = "panda_description/urdf/panda.urdf"
+    assert drawn(tmp_path, file, panda_description=str(tmp_path)) == 11
+
+
+def test_a_package_in_ament_prefix_path_is_found(tmp_path: Path, monkeypatch):
+    file = away(tmp_path)
+    (tmp_path / "share").mkdir()
+    (tmp_path / "workspace" / "panda").rename(tmp_path / "share" / "panda_description")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/none:{tmp_path}")
+    assert drawn(tmp_path, file) == 11
 
 
 def test_directives_name_packages_by_files_in_packages(tmp_path: Path, monkeypatch):
@@ -112,36 +130,18 @@ def test_directives_name_packages_by_files_in_packages(tmp_path: Path, monkeypat
     assert joints(tmp_path, "cell/models/all.dmd.yaml") == 7
 
 
-def test_an_unknown_package_names_the_key_and_what_would_be_right(tmp_path: Path):
+def test_geometry_of_an_unknown_package_is_left_out_with_the_key(tmp_path: Path):
     file = away(tmp_path)
-    with pytest.raises(ScenarioError) as caught:
-        joints(tmp_path, file)
-    message = str(caught.value)
-    assert message.startswith("robot.file: ")
-    assert "package.xml" in message
-    assert "ROS_PACKAGE_PATH" in message
-    assert "{panda_description: <folder>}" in message
-    assert joints(tmp_path, file, "robot.packages.panda_description=workspace/panda") == 7
+    with pytest.warns(GeometryWarning, match=r"robot\.packages.*'package://panda_description/"):
+        assert drawn(tmp_path, file) == 3 * 11  # Crosses.
+    assert drawn(tmp_path, file, panda_description=str(tmp_path / "workspace/panda")) == 11
 
 
 def test_a_folder_without_a_package_xml_is_no_package(tmp_path: Path):
     """A file from a stranger must not make a package of whatever lies near it."""
     write_panda(tmp_path)
     (tmp_path / "panda_description" / "package.xml").unlink()
-    with pytest.raises(ScenarioError, match="'panda_description'"):
-        joints(tmp_path)
-
-
-def test_a_package_that_nothing_needs_may_be_unknown(tmp_path: Path):
-    file = write_panda(tmp_path)
-    text = file.read_text()
-    gazebo = "<gazebo><plugin><file>package://other/a.so</file></plugin></gazebo></robot>"
-    comment = "<!-- package://none/a.stl -->"
-    file.write_text(text.replace("</robot>", comment + gazebo))
-    assert joints(tmp_path) == 7
-    file.write_text(file.read_text().replace("panda_link7.dae", "lost.dae"))
-    with pytest.raises(ScenarioError, match=r"lost\.dae"):
-        joints(tmp_path)
+    assert drawn(tmp_path, "panda_description/urdf/panda.urdf") == 3 * 11
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ from vendors import binary_stl, joint, link, robot
 from drake_dae import load_scenario
 from drake_dae.errors import ModelError, RobotFileWarning, ScenarioError
 from drake_dae.scenario.robot_file.changes import change_robot, finalize
+from drake_dae.scenario.robot_file.inertias import nearest_inertia
 from drake_dae.scenario.robot_file.links import robot_links
-from drake_dae.scenario.robot_file.readable.inertias import nearest_inertia
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Pose, Robot, RobotPlacement
 
@@ -84,6 +84,7 @@ def test_an_mjcf_body_of_mass_0_weighs_nothing_and_neither_does_its_geometry(par
     np.testing.assert_allclose(mass_matrix(plant), mass_matrix(other), rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
 @pytest.mark.parametrize("has_trimesh", [True, False])
 def test_a_base_that_stands_needs_no_mass_and_a_link_has_that_of_its_mesh(
     has_trimesh, tmp_path, monkeypatch
@@ -505,7 +506,7 @@ FLOATING["free.xml"] = FLOATING["craft.xml"].replace(
 def test_a_floating_joint_moves_as_drakes_quaternion_does(name, tmp_path):
     """The accelerations of both plants in one pose; twists and torques are the same numbers."""
     file = written(tmp_path, FLOATING[name], name)
-    with pytest.warns(RobotFileWarning, match=r"'root'.*root_qx"):
+    with pytest.warns(RobotFileWarning, match="'root'"):
         ours = plant_of(file)
     theirs = MultibodyPlant(0.0)
     Parser(theirs).AddModels(str(file))

@@ -30,7 +30,6 @@ from drake_dae import (
     ExpressionReference,
     ForceSensor,
     LoopSettings,
-    PointToPointReference,
     ReferenceGenerator,
     RobotPlant,
     SinusoidReference,
@@ -40,7 +39,7 @@ from drake_dae import (
     make_closed_loop,
     poles,
 )
-from drake_dae.errors import ModelError, NonFiniteError, ReferenceSignalError, SingularityError
+from drake_dae.errors import ModelError, NonFiniteError, SingularityError
 
 GRADIENT = 3e-9
 """Of finite differences, relative to the largest entry: sixth order at steps of 1e-3, where the
@@ -220,17 +219,6 @@ def test_references_move_with_the_time(as_trajectory):
     )
 
 
-def test_a_time_that_moves_needs_one_more_derivative():
-    generator = ReferenceGenerator([PointToPointReference(0.0, 1.0, 0.0, 1.0, order=2)], [2])
-    converted = generator.ToAutoDiffXd()
-    context = converted.CreateDefaultContext()
-    context.SetTime(0.5)
-    assert ExtractValue(converted.GetOutputPort("reference").Eval(context))[0] == 0.5
-    context.SetTime(AutoDiffXd(0.5, [1.0]))
-    with pytest.raises(ReferenceSignalError, match="order=3"):
-        converted.GetOutputPort("reference").Eval(context)
-
-
 def test_linearize_a_hanging_pendulum():
     """v = -(vx^2 + vy^2 + x u - g y) / (2 x^2 + 2 y^2): x'' = -g x + u, y'' = 0, z = x."""
     plant = DaePlant(hanging_pendulum())
@@ -399,9 +387,6 @@ def test_a_function_without_derivative_is_named():
 
 
 def test_what_does_not_convert_says_why():
-    with pytest.raises(ModelError, match="time_constant"):
-        ForceSensor(1, sample_period=0.01).ToAutoDiffXd()
-
     class Watched(DaePlant):
         def __init__(self, system):
             super().__init__(system)

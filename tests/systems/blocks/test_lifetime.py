@@ -19,9 +19,7 @@ from drake_dae import (
     ClosedLoop,
     ConstantReference,
     ForceSensor,
-    NormalForm,
     RobotPlant,
-    StateRealization,
     Task,
     TaskController,
     TrackingController,
@@ -51,7 +49,6 @@ SYSTEMS = {
     ),
     "references": lambda: ReferenceGenerator([ConstantReference([0.3, 15.0])], (2, 0)),
     "sensor": lambda: ForceSensor(1, 0.01, 0.001, noise_deviation=0.1),
-    "realization": lambda: StateRealization(NormalForm(arms.arm("two_link").model.dae)),
     "converted": lambda: plant().ToAutoDiffXd(),
 }
 

@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from members import subclasses
-from pydrake.systems.framework import LeafSystem
 from pydrake.trajectories import PiecewisePolynomial
 from runs import some
 
@@ -24,7 +23,6 @@ from drake_dae import (
     ReferenceRows,
     SinusoidReference,
     SpiralReference,
-    SystemReference,
     TrajectoryReference,
     WaypointsReference,
 )
@@ -36,19 +34,6 @@ PATH = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
 
 LIMITS = PathLimits(1.0, 2.0, 20.0)
 EDGES = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]]
-
-
-class Swing(LeafSystem):
-    """sin(2 t) and t^2, with two and with two derivatives."""
-
-    def __init__(self):
-        super().__init__()
-        self.DeclareVectorOutputPort("reference", 6, self._calc, {self.time_ticket()})
-
-    def _calc(self, context, output):
-        t = context.get_time()
-        sine = [np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)]
-        output.SetFromVector([*sine, t**2, 2 * t, 2.0])
 
 
 MEMBERS = {
@@ -71,7 +56,6 @@ MEMBERS = {
     "file": CsvReference(
         str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3, tolerance=0.2
     ),
-    "system": SystemReference(Swing(), [2, 2]),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
     "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),
 }
@@ -80,7 +64,6 @@ TIMES = (0.41, 0.93, 1.62)
 
 ROUGH = {
     "waypoints": WaypointsReference([[0.0], [1.0]], [0.0, 1.0], order=2),
-    "system": SystemReference(Swing(), [2, 2]),
     "line": LineReference(0.0, 1.0, LIMITS, order=2),
     "polyline": PolylineReference([[0.0], [1.0]], LIMITS, 0.1, order=2),
     "rows": ReferenceRows(ExpressionReference(lambda t: [t, ca.fabs(t - 1.0)]), (1,)),

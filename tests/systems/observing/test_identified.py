@@ -33,7 +33,7 @@ from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import FOLDER
 
@@ -271,7 +271,7 @@ def test_the_summary_says_what_is_known_and_what_the_motion_does_not_excite(tmp_
     ("settings", "message"),
     [
         (["estimator.identify=[wall.position]"], "estimator.identify: .*'wall.position'"),
-        (["estimator.identify=[link2.mas]"], "estimator.identify: .*'link2.mass'"),
+        (["estimator.identify=[link2.mas]"], "identify: .*'link2.mass'"),
         (
             [
                 "estimator.identify=[link2.mass]",

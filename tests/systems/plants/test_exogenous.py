@@ -15,10 +15,8 @@ from drake_dae import (
     DaeSystem,
     ExpressionReference,
     LoopSettings,
-    NormalForm,
     Parameter,
     ReferenceGenerator,
-    StateRealization,
     TrackingLaw,
     find_constraint_structure,
     find_structure,
@@ -191,27 +189,6 @@ def test_gradients_by_the_exogenous_signals():
     steps = 1e-6 * np.eye(3)
     differences = np.array([(at(w + d) - at(w - d)) / 2e-6 for d in steps]).T
     assert_allclose(np.vstack([rate, force]), differences, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_the_realization_moves_as_the_plant():
-    """Two integrations of the same motion in other coordinates, each to 1e-11 per step."""
-    system = rod()
-    structure = find_structure(system)
-    values = system.parameter_values
-    values[system.exogenous.places([2])] = length(0.0)
-    start = structure.manifold.project([0.4, -0.9, 0.0, 0.0], values)
-    ends = []
-    for block in (
-        DaePlant(system, structure=structure),
-        StateRealization(NormalForm(system, structure=structure)),
-    ):
-        simulator, own = moving(block, [0.5, 0.2])
-        block.set_state(own, start)
-        simulator.AdvanceTo(2.0)
-        simulator.AdvancePendingEvents()
-        ends.append(block.GetOutputPort("state").Eval(own).copy())
-    assert_allclose(*ends, atol=1e-8)
 
 
 def test_the_linear_model_knows_what_moves():

@@ -1,6 +1,5 @@
 """The equations of a robot in compliant point contact, as traced functions."""
 
-from collections.abc import Mapping
 from functools import reduce
 
 import casadi as ca
@@ -18,7 +17,7 @@ from drake_dae.systems.plants.contact.contact_laws import (
 from drake_dae.systems.plants.contact.contact_material import PointMaterial
 from drake_dae.systems.plants.contact.point_contact import ball_normals, point_contacts, touching
 from drake_dae.systems.plants.contact.stage_steps import stage_rates, stages_after
-from drake_dae.systems.plants.robot_ports import stage_ports
+from drake_dae.systems.plants.robot_plant import joint_outputs
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
@@ -44,9 +43,11 @@ class CompliantEquations:
         material: The contact material.
 
     Attributes:
-        advanced: x', or (x, F) after a step, as a function of state, control and parameters.
-        outputs: Name of an output port -> its function of state and parameters.
-        expressions: All of these as expressions.
+        control, force, parameters: The symbols of u, of the contact forces F, and of all
+            parameters.
+        advanced: x', or (x, F) after a step.
+        slack: A number that is negative where `advanced` does not hold.
+        outputs: Name of an output port -> its expression.
     """
 
     def __init__(
@@ -59,27 +60,14 @@ class CompliantEquations:
         self._compliance = Compliance(numbers[0], numbers[1], material.stiction_tolerance)
         friction = None if material.friction is None else numbers[2]
         self._contacts = point_contacts(model, normals, numbers[3], friction)
-        control, force = ca.SX.sym("u", dae.num_controls), ca.SX.sym("F", 3 * len(self._contacts))
-        advanced, slack = (self._step if self._h else self._rate)(control)
-        outputs = self._outputs(structure, force if self._h else self._forces())
-        self.expressions = [advanced, slack, *outputs.values()]
-        state = ca.vertcat(dae.state, force) if self._h else dae.state
-        parameters = ca.vertcat(dae.parameter_symbol, numbers, normals)
-        self.advanced = TracedFunction(
-            "the contact",
-            {"state": state, "control": control, "parameters": parameters},
-            {"value": advanced},
-            doubt=slack,
-            outside=OUTSIDE,
-            compiled=dae.compiled,
-        )
-        inputs = {"state": state, "parameters": parameters}
-        self.outputs: Mapping[str, TracedFunction] = {
-            name: TracedFunction(name, inputs, {"value": value}, compiled=dae.compiled)
-            for name, value in outputs.items()
-        }
+        self.control = ca.SX.sym("u", dae.num_controls)
+        self.force = ca.SX.sym("F", 3 * len(self._contacts))
+        self.parameters = ca.vertcat(dae.parameter_symbol, numbers, normals)
+        self.advanced, self.slack = (self._step if self._h else self._rate)(self.control)
+        self.outputs = self._outputs(structure, self.force if self._h else self._forces())
         self._normals = dae.trace("normals", {"normals": ball_normals(model)}, often=False)
         depths = ca.vertcat(*(contact.depth for contact in self._contacts))
+        inputs = {"state": dae.state, "parameters": self.parameters}
         self._depths = TracedFunction("depths", inputs, {"depths": depths}, often=False)
 
     def own_parameters(self, values: FloatArray, material: PointMaterial) -> FloatArray:
@@ -96,9 +84,7 @@ class CompliantEquations:
         state = manifold.project(dae.nominal_state, values)
         normals = self._normals(state, values)[0]
         parameters = np.concatenate([values, material.values, normals])
-        with_forces = np.zeros(self._depths.sizes[0])
-        with_forces[: state.size] = state
-        depths = self._depths(with_forces, parameters)[0]
+        depths = self._depths(state, parameters)[0]
         for constraint, depth in zip(self._model.constraints, depths.tolist(), strict=True):
             if not depth <= FITS * material.radius:
                 raise ModelError(
@@ -172,23 +158,17 @@ class CompliantEquations:
 
     def _outputs(self, structure: ConstraintStructure, contact: ca.SX) -> dict[str, ca.SX]:
         """The output ports as expressions of the state and the contact forces."""
-        model, dae = self._model, self._model.dae
-        normals = ca.horzcat(*(touch.normal for _, touch in touching(model)))
+        dae = self._model.dae
+        normals = ca.horzcat(*(touch.normal for _, touch in touching(self._model)))
         force = ca.sum1(normals * ca.reshape(contact, 3, -1)).T
-        size = model.links.q.numel() + model.links.v.numel()
-        outputs = {
+        return {
             "state": dae.state,
-            "link_state": dae.state[:size],
+            **joint_outputs(self._model),
             "contact_force": contact,
             "constraint_force": force,
             "constraint_residual": structure.manifold.residual_expression,
             "controlled_output": dae.outputs(force),
         }
-        if model.joint_force is not None:
-            outputs["joint_torque"] = model.joint_force
-        for name, part in stage_ports(model, size).items():
-            outputs[name] = dae.state[part]
-        return outputs
 
 
 def _resistance(model: RobotModel) -> ca.SX:

@@ -1,45 +1,28 @@
-"""A robot in compliant point contact, as Drake computes it, as traced functions."""
+"""A robot in compliant point contact, as Drake computes it, as traced equations."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    ContinuousState,
-    DependencyTicket,
-    EventStatus,
-    State,
-)
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import (
-    DERIVATIVE,
-    HELD,
-    PARAMETERS,
-    STATE,
-    Block,
-    Computation,
-    Update,
-)
-from drake_dae.blocks.failures import simulation_error
-from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value, weakly
-from drake_dae.blocks.trials import state_tickets
+from drake_dae.blocks.block import Block, Held, Requirement
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.model import RobotModel
-from drake_dae.systems.blocks.block import ParameterizedSystem
-from drake_dae.systems.blocks.formulas import Formula, TracedFormula
-from drake_dae.systems.plants.contact.compliance import CompliantEquations
+from drake_dae.systems.parameterized import ParameterizedSystem
+from drake_dae.systems.plants.contact.compliance import OUTSIDE, CompliantEquations
 from drake_dae.systems.plants.contact.contact_checks import changed_parameters
 from drake_dae.systems.plants.contact.contact_forces import contact_force_signals
 from drake_dae.systems.plants.contact.contact_material import FRICTION, PointMaterial
 from drake_dae.systems.plants.contact.stage_steps import check_step
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.functions import FailureKind
 
 
 @checked(ModelError)
@@ -91,7 +74,6 @@ class CompliantPlant(ParameterizedSystem, Plant):
 
     Attributes:
         material: The contact material.
-        contact_force_signals: Names and units of `contact_force`.
 
     Raises:
         ModelError: A constraint is no contact of a point with a surface, a ball does not fit its
@@ -117,35 +99,11 @@ class CompliantPlant(ParameterizedSystem, Plant):
         self.model: RobotModel = model
         self.time_step, self._stepped = material.time_step, np.zeros(0)
         self._check_step(values)
-        equations = CompliantEquations(model, structure, material)
-        forces = contact_force_signals(model)
-        state = dae.state_signals + forces if material.time_step else dae.state_signals
-        signals = {"state": state, "control": dae.control_signals}
-        defaults = equations.own_parameters(values, material)
-        super().__init__(dae, defaults, signals, sees_steps=not material.time_step)
         self.structure, self.material = structure, material
-        self.set_name(dae.name)
-        self.contact_force_signals = forces
+        equations = CompliantEquations(model, structure, material)
         self._place = equations.own_parameters
-        self._outputs, self._advanced = equations.outputs, equations.advanced
-        degrees = dae.exogenous.degrees(*equations.expressions)
-        self._control_port = self.DeclareVectorInputPort("control", dae.num_controls)
-        tickets = self._declare_exogenous(degrees) | self._declare_state()
-        for name, function in self._outputs.items():
-            size, value = function.outputs[0].size, port_value(self._output, function)
-            self.DeclareVectorOutputPort(name, size, value, tickets)
-
-    def _declare_state(self) -> set[DependencyTicket]:
-        """Declares state and steps; returns the dependencies of outputs on the state."""
-        start = BasicVector(self.structure.manifold.project(self.dae.nominal_state))
-        if not self.time_step:
-            self.DeclareContinuousState(start)
-            return state_tickets(self)
-        self.DeclareDiscreteState(start.value())
-        self.DeclareDiscreteState(np.zeros(len(self.contact_force_signals)))
-        # Unrestricted, as the step of a discrete MultibodyPlant, so that both see the same instant.
-        self.DeclarePeriodicUnrestrictedUpdateEvent(self.time_step, 0.0, weakly(self._advance))
-        return {self.xd_ticket()}
+        block = compliant_block(model, equations, structure, material, values)
+        super().__init__(dae, block)
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
@@ -166,10 +124,6 @@ class CompliantPlant(ParameterizedSystem, Plant):
         place = self.further_parameters[FRICTION.name][1]
         value = float(context.get_numeric_parameter(0).GetAtIndex(place))
         return {constraint.name: value for constraint in self.robot("friction").constraints}
-
-    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        along = super().parameters_along(context, times)
-        return along[:, : self.dae.parameter_symbol.numel()]
 
     def state(self, context: Context) -> FloatArray:
         if not self.time_step:
@@ -227,62 +181,44 @@ class CompliantPlant(ParameterizedSystem, Plant):
             check_step(self.model, self.time_step, values)
             self._stepped = values.copy()
 
-    def _held(self, context: Context) -> FloatArray:
-        """The state of functions: x, and for a discrete plant (x, F)."""
-        if not self.time_step:
-            return context.get_continuous_state_vector().value()
-        return np.concatenate([context.get_discrete_state(i).value() for i in range(2)])
+    @property
+    def contact_force_signals(self) -> Sequence[Signal]:
+        """Names and units of `contact_force`."""
+        return self.block.signals["contact_force"]
 
-    def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        if self.time_step:
-            return
-        control = self._control_port.Eval(context)
-        rate = self._checked(self._advanced, context, self._held(context), control)[0]
-        derivatives.SetFromVector(rate)
 
-    def _advance(self, context: Context, state: State) -> EventStatus:
-        control, held = self._control_port.Eval(context), self._held(context)
-        function = self._advanced
-        after = function.evaluate(held, control, self._values(context))[0]
-        if not function.is_valid:
-            x = held[: self.dae.num_states].copy()
-            raise simulation_error(function.failure(), context.get_time(), x, self._signals)
-        values = state.get_mutable_discrete_state()
-        values.set_value(0, after[: self.dae.num_states])
-        values.set_value(1, after[self.dae.num_states :])
-        return EventStatus.Succeeded()
-
-    def _output(self, function: TracedFunction, context: Context) -> FloatArray:
-        return self._checked(function, context, self._held(context))[0]
-
-    def _formulas(self) -> dict[str, Formula]:
-        if self.time_step:
-            raise ModelError(
-                f"{self.dae.name}: a discrete CompliantPlant does not convert to AutoDiffXd; take "
-                "a time_step of 0"
-            )
-        functions = {"derivative": self._advanced, **self._outputs}
-        return {
-            name: TracedFormula(function, signals=self._signals)
-            for name, function in functions.items()
-        }
-
-    def traced(self) -> Block:
-        is_discrete = bool(self.time_step)
-        source, result = (HELD, HELD) if is_discrete else (STATE, DERIVATIVE)
-        computations = [
-            Computation.of(function, (source, PARAMETERS), (name,))
-            for name, function in self._outputs.items()
-        ]
-        advanced = Computation.of(self._advanced, (source, "control", PARAMETERS), (result,))
-        updates = [Update(advanced, self.time_step, 0.0, True)] if is_discrete else []
-        computations += [] if is_discrete else [advanced]
-        return Block(
-            self,
-            tuple(computations),
-            tuple(updates),
-            scale=None if is_discrete else self.dae.scale,
-            moving=tuple(self.exogenous_places),
-            signals=self._signals,
-            ports={**self.port_signals, "contact_force": self.contact_force_signals},
-        )
+def compliant_block(
+    model: RobotModel,
+    equations: CompliantEquations,
+    structure: ConstraintStructure,
+    material: PointMaterial,
+    values: FloatArray,
+) -> Block:
+    """The block of a robot in compliant contact, continuous or discrete; see `CompliantPlant`."""
+    dae, forces = model.dae, contact_force_signals(model)
+    fits = Requirement(equations.slack, OUTSIDE, FailureKind.OUTSIDE)
+    state, advanced = structure.manifold.project(dae.nominal_state), fits.of(equations.advanced)
+    block = Block(
+        dae.name,
+        inputs={"control": equations.control},
+        outputs=equations.outputs,
+        parameters=equations.parameters,
+        start={"state": state, "parameters": equations.own_parameters(values, material)},
+        requirements=(fits,),
+        signals={
+            "state": dae.state_signals,
+            "control": dae.control_signals,
+            "constraint_force": dae.force_signals,
+            "constraint_residual": structure.manifold.residual_signals,
+            "controlled_output": dae.output_signals,
+            "contact_force": forces,
+        },
+    )
+    if not material.time_step:
+        return replace(block, state=dae.state, derivative=advanced, scale=dae.scale)
+    n, rate = dae.num_states, material.time_step
+    held = {
+        "state": Held(dae.state, advanced[:n, 0], state, rate),
+        "contact_force": Held(equations.force, advanced[n:, 0], np.zeros(len(forces)), rate),
+    }
+    return replace(block, held=held)

@@ -481,5 +481,3 @@ def test_the_continuous_plant_has_the_linear_model_of_differences():
     steps = 1e-7 * np.eye(4)
     wanted = np.array([(rate(start + step) - rate(start - step)) / 2e-7 for step in steps]).T
     assert_allclose(found.A(), wanted, rtol=0.0, atol=1e-5 * np.abs(wanted).max())
-    with pytest.raises(ModelError, match="time_step"):
-        CompliantPlant(sled(), PointMaterial()).ToAutoDiffXd()

@@ -1,0 +1,188 @@
+"""A block: one system as expressions of symbols, without Drake."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.system.signals import Signal
+from drake_dae.trace.compiled import Compiled
+from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, FailureKind, TracedFunction
+
+TIME = ca.SX.sym("time")
+"""The time in s, in every block."""
+
+NOTHING = ca.SX(0, 1)
+
+
+def stacked(values: Sequence[ca.SX]) -> ca.SX:
+    """Columns as one column."""
+    return ca.vertcat(NOTHING, *values)
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Values that change only at t_k = offset + k period, all from the values before t_k.
+
+    Attributes:
+        symbol: The values, a column of symbols.
+        next: The values after an update.
+        start: The values at the start, shape (k,); nan where `begin` gives them.
+        period, offset: In s.
+        is_unrestricted: Whether it comes before other updates of its instant, as Drake's
+            unrestricted ones, among them the step of a discrete MultibodyPlant, so that both see
+            the same instant. Otherwise it sees what these have changed.
+        begin: The values at the start of a run where `start` is nan; None if it never is.
+    """
+
+    symbol: ca.SX
+    next: ca.SX
+    start: FloatArray
+    period: float
+    offset: float = 0.0
+    is_unrestricted: bool = True
+    begin: ca.SX | None = None
+
+
+def where_finite(value: ca.SX, *checks: ca.SX) -> ca.SX:
+    """A value that is nan where some numbers are not finite."""
+    total = sum((ca.sum1(ca.vec(check)) for check in checks), ca.SX(0))
+    return ca.densify(value) + ca.if_else(ca.fabs(total) < np.inf, 0.0, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Requirement:
+    """What must hold where values of a block are valid.
+
+    Attributes:
+        margin: A number that is not negative where it holds.
+        reason: The matrix that must be regular, or why there are no values.
+        fault: SINGULAR or OUTSIDE.
+    """
+
+    margin: ca.SX
+    reason: str
+    fault: FailureKind = FailureKind.SINGULAR
+
+    @classmethod
+    def regular(cls, pivot: ca.SX, matrix: str) -> "Requirement":
+        """A matrix must be regular; see `Factorization.pivot`."""
+        return cls(pivot - SINGULAR_PIVOT, matrix)
+
+    def of(self, value: ca.SX) -> ca.SX:
+        """A value that is nan where this does not hold."""
+        return ca.densify(value) + ca.if_else(self.margin >= 0.0, 0.0, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """The projection of a block's state onto a manifold, after each accepted step.
+
+    Attributes:
+        newton: (state, start, parameters) -> a Newton step in units of the block's `scale`, with
+            the gradients at the start.
+        project: (state, parameters) -> the state on the manifold, also where plain Newton steps do
+            not converge; the state itself if it is there. Raises InconsistentStateError.
+    """
+
+    newton: ca.Function
+    project: Callable[[FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A system as expressions of its symbols: pure functions, closed under composition.
+
+    Expressions depend on TIME, `state`, `parameters`, the symbols of `held` and of `inputs`, and on
+    nothing else. What an output reads is what its expression depends on, so that feedthrough needs
+    no declaration. Values that are not valid are nan; `requirements` tell why.
+
+    Attributes:
+        name: The name of the system.
+        inputs: Name of an input port -> its column of symbols. Noise of deviation 1 is an input.
+        outputs: Name of an output port -> its column.
+        state, derivative: x and x', columns; empty without continuous state.
+        held: Name -> values that change at samples, in the order of Drake's groups.
+        parameters: The column of all numeric parameters.
+        start: "state" and "parameters" -> the default, shapes (n,) and (k,); 0 if left out.
+        defaults: Name of an input that needs no wire -> its value without one, an expression of
+            other symbols.
+        projection: The projection of the state onto a manifold; None without one.
+        scale: The sizes of the states for error norms, shape (n,); ones if None.
+        requirements: What must hold for some values; they are nan elsewhere, by `Requirement.of`.
+        signals: Name of a port, or "state" -> names and units of its entries, as far as known.
+    """
+
+    name: str
+    inputs: Mapping[str, ca.SX] = field(default_factory=dict)
+    outputs: Mapping[str, ca.SX] = field(default_factory=dict)
+    state: ca.SX = NOTHING
+    derivative: ca.SX = NOTHING
+    held: Mapping[str, Held] = field(default_factory=dict)
+    parameters: ca.SX = NOTHING
+    start: Mapping[str, FloatArray] = field(default_factory=dict)
+    defaults: Mapping[str, ca.SX] = field(default_factory=dict)
+    projection: Projection | None = None
+    scale: FloatArray | None = None
+    requirements: tuple[Requirement, ...] = ()
+    signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
+
+    def columns(self) -> dict[str, ca.SX]:
+        """Source -> its symbols: "time", "state", "parameters", "held <name>", "input <name>"."""
+        held = {f"held {name}": each.symbol for name, each in self.held.items()}
+        inputs = {f"input {name}": symbol for name, symbol in self.inputs.items()}
+        named = {"time": TIME, "state": self.state, **held, **inputs, "parameters": self.parameters}
+        return {name: column for name, column in named.items() if column.numel()}
+
+    def sources(self, *values: ca.SX) -> list[str]:
+        """The names of the columns on which some values depend, in the order of `columns`."""
+        value = stacked([ca.vec(each) for each in values])
+        return [name for name, column in self.columns().items() if ca.depends_on(value, column)]
+
+    def rates(self) -> dict[tuple[float, float, bool], list[str]]:
+        """(period, offset, is_unrestricted) -> the held values that are updated together."""
+        rates: dict[tuple[float, float, bool], list[str]] = {}
+        for name, each in self.held.items():
+            rates.setdefault((each.period, each.offset, each.is_unrestricted), []).append(name)
+        return rates
+
+    def default(self, name: str) -> FloatArray:
+        """The state or the parameters at the start."""
+        column = self.state if name == "state" else self.parameters
+        return np.array(np.broadcast_to(self.start.get(name, np.zeros(1)), column.numel()), float)
+
+
+class BlockFunction(TracedFunction):
+    """Some values of a block as a function of the columns that they depend on.
+
+    Attributes:
+        sources: The name of the column of each argument, as of `Block.columns`.
+    """
+
+    def __init__(
+        self,
+        block: Block,
+        what: str,
+        values: Mapping[str, ca.SX],
+        compiled: Compiled = False,
+        columns: Mapping[str, ca.SX] | None = None,
+    ) -> None:
+        columns = block.columns() if columns is None else columns
+        value = stacked([ca.vec(each) for each in values.values()])
+        self.sources = tuple(name for name, c in columns.items() if ca.depends_on(value, c))
+        inputs = {name.removeprefix("input "): columns[name] for name in self.sources}
+        super().__init__(f"{block.name} {what}".strip(), inputs, values, compiled=compiled)
+        self._requirements = block.requirements
+
+    def failure(self) -> Failure:
+        """The failure of the last evaluation: the first requirement that did not hold."""
+        failure = super().failure()
+        given = np.concatenate([np.zeros(0), *self._arrays.arguments])
+        for required in self._requirements if failure.fault is FailureKind.VALUE else ():
+            symbols, options = [stacked(self._symbols)], {"allow_free": True}
+            margin = ca.Function("margin", symbols, [required.margin], options)
+            if not (margin.has_free() or float(margin(given)) >= 0.0):
+                return Failure(self.name, required.fault, {}, required.reason)
+        return failure

@@ -1,0 +1,400 @@
+"""The normal form: constraint chains, output chains, and their completion.          (20)-(24)"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg.lapack import dgetrf, dgetrs
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, listed, show, vector
+from drake_dae.dae.states.margins import RankMargin, find_margin
+from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.structure.structure import Structure, structure_of
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton
+from drake_dae.trace.round_off import unit_rows
+from drake_dae.trace.smoothness import find_flaw
+
+TRANSVERSAL = 0.05
+"""Single states complete the chains if the sine of their smallest angle is above this."""
+
+
+Completion = tuple[ca.SX, tuple[Signal, ...], RankMargin]
+"""xi, its signals, and the margin of the Jacobian of Phi."""
+
+
+@checked(ModelError)
+class NormalForm:
+    """The change of coordinates Phi (20)-(22),
+
+        y    = k_i, L_f k_i, ..., L_f^(r_i - 1) k_i              (xtilde, zero on N*)
+        zeta = l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i        (xbar; outputs with mu_i >= 1)
+        xi   = Psi_2(x)                                          (the completion)
+
+    both chains in the order of the system's constraints and outputs.
+
+    Phi is a local diffeomorphism where its Jacobian is regular. By Theorem 2.1 the differentials of
+    both chains are independent wherever A(x) of Assumption (2) and B(x) of (16) are regular; if the
+    Jacobian is singular, A or B is, or xi does not complete the chains there. The paper allows any
+    completion; L_h* xi = 0 is not required.
+
+    Args:
+        system: The system (1)-(3).
+        completion: xi as expressions of the state (and parameters), shape (d, 1) with
+            d = n - sum r_i - sum mu_i. Chosen if None: states that complete the chains well at
+            all of `structure.states`; if none do, linear combinations of states.
+        structure: The structure of the system; found if None.
+
+    Attributes:
+        structure: The structure of the system.
+        completion: xi, shape (d, 1).
+        completion_signals: Names and units of xi. A chosen one is its own name: "x3", or
+            "x0 - 0.5 x1".
+        coordinate_signals: Names and units of (y, zeta, xi), n in all.
+        margin: The margin of the Jacobian of Phi over `structure.states`.
+
+    Raises:
+        ModelError: The completion does not fit, or its differentials are not independent of each
+            other and of the chains; or B(x) is singular.
+    """
+
+    def __init__(
+        self,
+        system: DaeSystem,
+        completion: ca.SX | None = None,
+        *,
+        structure: Structure | None = None,
+    ) -> None:
+        structure = structure_of("NormalForm", system, structure)
+        self.structure = structure
+        self.system = system
+        residual = structure.manifold.residual_expression
+        if structure.control_margin.is_singular:
+            raise ModelError(
+                f"{system.name}: B(x) of (16) is singular at x = "
+                f"{show(structure.control_margin.state)}, so the output chains are not independent "
+                "there and are no coordinates; choose other outputs"
+            )
+        chains = ca.vertcat(residual, structure.chain)  # (21)
+        samples = Samples(structure.manifold, structure.states)
+        if completion is None:
+            chosen = choose_completion(structure, chains, samples)
+        else:
+            chosen = check_completion(structure, chains, samples, completion)
+        self.completion, self.completion_signals, self.margin = chosen  # (22)
+        self.coordinate_signals = (
+            *structure.manifold.residual_signals,
+            *structure.layout.chain_signals(system.output_signals),
+            *self.completion_signals,
+        )
+        coordinates = ca.vertcat(chains, self.completion)  # (20)
+        self._coordinates = system.trace("normal form", {"coordinates": coordinates})
+        self._map = system.trace(
+            "normal form and Jacobian",
+            {"coordinates": coordinates, "jacobian": ca.jacobian(coordinates, system.state)},
+        )
+        # Not the scale of `samples`, in which a state that is zero on N* is round-off.
+        self._scale = structure.scale
+
+    def __repr__(self) -> str:
+        names = listed(signal.name for signal in self.coordinate_signals)
+        return f"NormalForm('{self.system.name}', coordinates={names})"
+
+    def coordinates(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """Returns Phi(x) = (y, zeta, xi) of (20)-(22).
+
+        Args:
+            state: x, shape (n,), on N* or not.
+            parameters: Values of all parameters; the defaults if None.
+
+        Returns:
+            (y, zeta, xi), shape (n,), named by `coordinate_signals`.
+        """
+        x = self.system.state_vector(state)
+        return self._coordinates(x, self.system.parameter_vector(parameters))[0]
+
+    def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """Returns dPhi/dx, shape (n, n); it is singular where Phi is no change of coordinates.
+
+        Args:
+            state: x, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+        """
+        return self._at(self.system.state_vector(state), self.system.parameter_vector(parameters))[
+            1
+        ]
+
+    def rates(
+        self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """Returns the state realization (26)-(27), the rates of (zeta, xi) at a state on N*:
+
+            zeta_i,j' = zeta_i,j+1,    zeta_i,mu_i' = a_i(x) + B_i(x) u,
+            xi' = L_f* xi + L_h* xi u.
+
+        With `state`, which is Phi^-1(0, zeta, xi), these are n - sum r_i ordinary differential
+        equations without constraints.
+
+        Args:
+            state: x, shape (n,).
+            control: u, shape (p,).
+            parameters: Values of all parameters; the defaults if None.
+
+        Raises:
+            ModelError: An argument has a wrong shape.
+        """
+        structure, dae, layout = self.structure, self.system, self.structure.layout
+        u = structure.derivatives.control
+        highest = structure.drift + ca.mtimes(structure.control_matrix, u)  # (26)
+        chain = ca.SX(structure.chain)
+        if layout.chain_size:
+            chain = ca.vertcat(chain[1:, 0], 0)
+        chain[layout.ends.tolist()] = highest[layout.dynamic.tolist(), :]
+        moving = structure.derivatives.expand(structure.derivatives.rate)
+        rate = ca.jtimes(self.completion, dae.state, moving) + dae.exogenous.rate(self.completion)
+        values = ca.vertcat(chain, rate if self.completion.numel() else ca.SX(0, 1))  # (27)
+        function = structure.trace("state realization", values, True)
+        p = dae.parameter_vector(parameters)
+        return function(dae.state_vector(state), vector("control", control, dae.num_controls), p)[0]
+
+    def state(
+        self,
+        coordinates: ArrayLike,
+        guess: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Returns x = Phi^-1(y, zeta, xi) of (24), to round-off; with y = 0 that of (27), on N*.
+
+        The inverse is local: other states may have the same coordinates (elbow up, elbow down; an
+        angle and the same angle plus 2 pi, as states are not wrapped). The one that continues the
+        guess is found by damped Newton's method or, if that fails, by continuation along the
+        straight line from the coordinates of the guess to the given ones.
+
+        Args:
+            coordinates: (y, zeta, xi), shape (n,).
+            guess: A state near the solution, shape (n,); the nominal consistent state if None.
+            parameters: Values of all parameters; the defaults if None.
+
+        Returns:
+            x, shape (n,).
+
+        Raises:
+            InconsistentStateError: There is no such state, or it is not reached from the guess. Its
+                residual is the remaining error of the coordinates, shape (n,).
+            ModelError: Shapes do not fit, or numbers are not finite.
+        """
+        target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
+        x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
+        p = self.system.parameter_vector(parameters)
+        solution = self._newton(x, target, p)  # (24)
+        if solution is not None:
+            return solution
+        start, first = self._at(x, p)
+        if not np.all(np.isfinite(start)):
+            raise ModelError(
+                f"{self.system.name}: the coordinates (20)-(22) are not finite at the guess "
+                f"{show(x)}; start inside the domain of the functions"
+            )
+        reached, stride = 0.0, 0.5
+        while reached < 1.0:
+            share = min(1.0, reached + stride)
+            solution = self._newton(x, start + share * (target - start), p)
+            if solution is not None:
+                x, reached, stride = solution, share, 2.0 * stride
+            elif stride > 1e-4:
+                stride /= 2.0
+            else:
+                raise self._out_of_reach(x, start, target, first, p)
+        return x
+
+    def _newton(
+        self, state: FloatArray, target: FloatArray, parameters: FloatArray
+    ) -> FloatArray | None:
+        """The state with given coordinates, sought from another one in units of its size."""
+        # Powers of 2, so that nothing is rounded.
+        scale = np.exp2(np.ceil(np.log2(np.maximum(self._scale, np.abs(state)))))
+
+        def distance(z: FloatArray) -> FloatArray:
+            return target - self._coordinates.evaluate(scale * z, parameters)[0]
+
+        def linearize(z: FloatArray) -> NewtonModel | None:
+            solve = _solver(self._at(scale * z, parameters)[1] * scale)
+            if solve is None:
+                return None
+            return NewtonModel(lambda z: solve(distance(z)), True)
+
+        solution, converged = newton(state / scale, linearize)
+        return scale * solution if converged else None
+
+    def _out_of_reach(
+        self,
+        state: FloatArray,
+        start: FloatArray,
+        target: FloatArray,
+        first: FloatArray,
+        parameters: FloatArray,
+    ) -> InconsistentStateError:
+        """Returns the error that names the coordinate which does not reach its target."""
+        values, jacobian = self._at(state, parameters)
+        missing = target - values
+        rows, columns = np.linalg.norm(first * self._scale, axis=1), self._scale
+        rows[rows == 0.0] = 1.0
+        weak, sizes, _ = np.linalg.svd(jacobian * columns / rows[:, None])
+        weakest = weak[:, sizes <= 10.0 * sizes[-1] + ROUND_OFF * sizes[0]]
+        blocked = weakest @ (weakest.T @ (missing / rows))
+        worst = int(np.argmax(np.abs(blocked * missing / rows)))
+        message = (
+            f"{self.system.name}: no way from the guess to the given coordinates: "
+            f"{self.coordinate_signals[worst].name} can be brought from {start[worst]:.6g} to "
+            f"{values[worst]:.6g}, but not to {target[worst]:.6g}; the search ended at x = "
+            f"{show(state)}. "
+        )
+        before = np.linalg.svd(first * columns / rows[:, None], compute_uv=False)
+        if sizes[-1] < 0.1 * before[-1]:
+            message += (
+                "The coordinates (20)-(22) become dependent there: A(x) of Assumption (2) or B(x) "
+                "of (16) loses its rank (Theorem 2.1)"
+            )
+            if self.completion_signals:
+                message += (
+                    f", or {', '.join(s.name for s in self.completion_signals)} does not complete "
+                    "the chains any more"
+                )
+        else:
+            message += "Start from a guess that is nearer, in the domain of the functions"
+        return InconsistentStateError(message, missing)
+
+    def _at(self, state: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Phi and its Jacobian at a state."""
+        values, jacobian = self._map(state, parameters)
+        return values, jacobian.reshape(values.size, -1)
+
+
+def _solver(matrix: FloatArray) -> Callable[[FloatArray], FloatArray] | None:
+    """b -> M^-1 b; None if M is singular, or not finite."""
+    rows = np.abs(matrix).max(axis=1)
+    if not (rows.min() > 0.0 and rows.max() < np.inf):
+        return None
+    factors, pivots, info = dgetrf(matrix / rows[:, None])
+    return None if info else lambda right: dgetrs(factors, pivots, right / rows)[0]
+
+
+def check_completion(
+    structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX
+) -> Completion:
+    """The user's completion, with its signals and its margin."""
+    system, count = structure.system, structure.zero_dynamics_dimension
+    if not isinstance(xi, ca.SX) or xi.shape != (count, 1):
+        got = f"shape {xi.shape}" if isinstance(xi, ca.SX) else type(xi).__name__
+        raise ModelError(
+            f"{system.name}: the completion must be a CasADi SX column of {count} expressions, "
+            f"n - sum r_i - sum mu_i; got {got}"
+        )
+    allowed = ca.vertcat(system.state, system.parameter_symbol)
+    unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(allowed, s)]
+    if unknown:
+        raise ModelError(
+            f"{system.name}: the completion xi of the coordinates depends on "
+            f"{', '.join(unknown)}, which is neither a state nor a parameter"
+        )
+    flaw = find_flaw(xi, system.state, system.parameter_symbol)
+    if flaw:
+        raise ModelError(f"{system.name}: the completion {flaw.describe('the state')}")
+    signals = tuple(
+        next(
+            (
+                signal
+                for j, signal in enumerate(system.state_signals)
+                if ca.is_equal(xi[i], system.state[j])
+            ),
+            Signal(f"xi{i}"),
+        )
+        for i in range(count)
+    )
+    gradient = ca.jacobian(ca.vertcat(chains, xi), system.state)
+    margin = find_margin(samples, gradient)
+    if not margin.is_singular:
+        return xi, signals, margin
+    if not count:
+        raise ModelError(
+            f"{system.name}: the differentials of the chains are dependent to round-off at x = "
+            f"{show(margin.state)}: A(x) of Assumption (2) or B(x) of (16) is close to singular "
+            "there"
+        )
+    # A row that vanishes at a state has no direction there; the others are compared by direction.
+    worst = -1 if margin.vanishing_row is None else margin.vanishing_row - chains.numel()
+    if worst < 0:
+        # The distance of each differential from the span of those before it.
+        rows = unit_rows(margin.matrix * samples.scale)
+        worst = int(np.argmin(np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]))
+    raise ModelError(
+        f"{system.name}: the completion '{signals[worst].name}' = "
+        f"{str(xi[worst])[:60]} is not independent of the chains and of the rest of the "
+        f"completion at x = {show(margin.state)}; choose a function whose differential is not in "
+        "their span at this state and around it"
+    )
+
+
+def choose_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
+    """Single states whose differentials complete those of the chains, or else linear combinations.
+
+    They complete them if they are regular on the null spaces of the chains' differentials. The
+    arguments are those of `check_completion`.
+    """
+    system, count = structure.system, structure.zero_dynamics_dimension
+    if not count:
+        return check_completion(structure, chains, samples, ca.SX(0, 1))
+    gradients = samples.values(gradient=ca.jacobian(chains, system.state))
+    spaces = np.array(
+        [np.linalg.svd(unit_rows(g * samples.scale))[2][-count:].T for (g,) in gradients]
+    )
+    for matrix in _candidates(spaces):
+        matrix = matrix / samples.scale
+        # Rounded, so that ties go to the first state on every machine.
+        largest = np.argmax(np.round(unit_rows(np.abs(matrix)), 6), axis=1)
+        leading = matrix[np.arange(count), largest]
+        factors = np.vectorize(lambda c: float(f"{c:.3g}"))(matrix / leading[:, None])
+        xi = ca.mtimes(ca.sparsify(ca.SX(factors)), system.state)
+        margin = find_margin(samples, ca.jacobian(ca.vertcat(chains, xi), system.state))
+        if not margin.is_singular:
+            return xi, tuple(_combination(row, system.state_signals) for row in factors), margin
+    raise ModelError(
+        f"{system.name}: no linear combinations of states complete the chains (20) at all states "
+        f"around the nominal one; give a completion of {count} expressions"
+    )
+
+
+def _candidates(spaces: FloatArray) -> Iterator[FloatArray]:
+    """Combinations of states, shape (d, n), that are regular on all spaces, shape (k, n, d)."""
+    count = spaces.shape[2]
+    single = _pivots(spaces)
+    if np.linalg.svd(spaces[:, single], compute_uv=False).min() > TRANSVERSAL:
+        yield np.eye(spaces.shape[1])[single]
+    # The space that is nearest to all of them, in the basis that is the identity on its pivots.
+    mean = np.linalg.eigh(np.einsum("kid,kjd->ij", spaces, spaces))[1][:, -count:]
+    basis = np.linalg.solve(mean[_pivots(mean[None])].T, mean.T)
+    yield np.where(np.abs(basis) > 0.02, basis, 0.0)
+
+
+def _pivots(spaces: FloatArray) -> list[int]:
+    """States whose rows are far from dependent in all spaces: one QR with pivoting for all."""
+    rest, chosen = spaces.copy(), []
+    for _ in range(spaces.shape[2]):
+        # Rounded, as above.
+        chosen.append(int(np.argmax(np.round(np.linalg.norm(rest, axis=2).min(axis=0), 6))))
+        direction = unit_rows(rest[:, chosen[-1]])
+        rest -= np.einsum("kid,kd,ke->kie", rest, direction, direction)
+    return sorted(chosen)
+
+
+def _combination(factors: FloatArray, signals: Sequence[Signal]) -> Signal:
+    """A signal named like the combination, such as "x0 - 0.5 x1"."""
+    terms = [(c, signal) for c, signal in zip(factors, signals, strict=True) if c]
+    units = {signal.unit for _, signal in terms}
+    sign = {1.0: "", -1.0: "-"}
+    name = " + ".join(sign.get(c, f"{c:.3g} ") + signal.name for c, signal in terms)
+    return Signal(name.replace("+ -", "- "), units.pop() if len(units) == 1 else "")

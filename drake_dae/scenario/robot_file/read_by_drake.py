@@ -1,0 +1,172 @@
+"""The elements and attributes of robot files that Drake's parser reads, one table per format.
+
+A part of a file that Drake does not read and that changes masses, forces, constraints or limits is
+lost, and a run without it is one of another robot. So whatever is not in the table is an error,
+until the scenario names it under `robot.leave_out`, as "<parent>/<name>": "joint/stiffness",
+"gazebo/joint". The tables follow Drake's page "Parsing Models for Multibody Dynamics", and those of
+the formats; a test feeds them through Drake.
+"""
+
+from collections.abc import Callable, Collection, Iterator
+from xml.etree.ElementTree import Element
+
+from drake_dae.arrays import number_in
+
+# "owner: parts that Drake reads | parts that change no equation". "a=0" is as read only with that
+# value, "a=never" with none, "*" is all others. Owners without a line hold geometry, or text.
+_URDF = """
+robot: name material link joint drake:joint transmission frame gazebo drake:linear_bushing_rpy
+robot: drake:linear_spring_damper drake:ball_constraint drake:distance_constraint
+robot: drake:tendon_constraint drake:collision_filter_group
+robot: | version sensor ros2_control disable_collisions link_group group verbose plugin mujoco
+gazebo: reference | * joint=never constraint=never gravity=1 turnGravityOff=0 springStiffness=0
+gazebo: | dampingFactor=0 kinematic=0
+link: name inertial visual collision contact drake:surface_velocity_axis | gravity=1 kinematic=0
+link: | type origin self_filter collision_checking surface self_collide sensor
+contact: | * inertia_scaling=1
+inertial: origin mass inertia | name
+mass: value
+inertia: ixx iyy izz ixy ixz iyz
+joint drake:joint: name type origin parent child axis limit dynamics mimic
+drake:joint: drake:screw_thread_pitch drake:curves drake:initial_tangent drake:plane_normal
+drake:joint: drake:is_periodic
+joint: | calibration safety_controller dont_collapse hardwareInterface role mechanicalReduction
+joint: | mechanical_reduction offset sensor disable_collision
+origin: xyz rpy
+axis: xyz | rpy
+limit: lower upper velocity effort drake:acceleration
+dynamics: damping friction=0 | coulomb_window
+mimic: joint multiplier offset
+transmission: type=simple joint actuator | name mechanicalReduction plugin param
+transmission: | use_simulated_gripper_joint
+actuator: name drake:rotor_inertia drake:gear_ratio drake:controller_gains
+actuator: | hardwareInterface mechanicalReduction mechanical_reduction role
+"""
+
+_SDF = """
+sdf: version model world | light actor
+world: name model frame include joint gravity=earth | light scene physics gui plugin atmosphere wind
+world: | magnetic_field spherical_coordinates audio state population road actor
+include: uri name pose placement_frame static | plugin
+model: name canonical_link placement_frame pose static link joint frame include model
+model: drake:joint drake:linear_bushing_rpy drake:linear_spring_damper drake:ball_constraint
+model: drake:distance_constraint drake:tendon_constraint drake:collision_filter_group
+model: enable_wind=0 | self_collide allow_auto_disable plugin gripper
+link: name pose inertial visual collision drake:visual drake:surface_velocity_axis gravity=1
+link: kinematic=0 enable_wind=0 velocity_decay | self_collide must_be_base_link sensor light
+link: | audio_source audio_sink battery projector particle_emitter
+velocity_decay: linear=0 angular=0
+inertial: pose mass inertia auto=0 | density auto_inertia_params
+inertia: ixx iyy izz ixy ixz iyz
+joint: name type parent child pose axis axis2 screw_thread_pitch thread_pitch drake:rotor_inertia
+joint: drake:gear_ratio drake:controller_gains drake:mimic
+joint: | sensor plugin physics gearbox_ratio gearbox_reference_body
+axis axis2: xyz limit dynamics use_parent_model_frame | initial_position
+limit: lower upper effort velocity drake:acceleration | stiffness dissipation
+dynamics: damping spring_reference spring_stiffness friction=0
+"""
+
+_MJCF = """
+mujoco: model compiler option asset worldbody body actuator contact equality
+mujoco: | size statistic sensor keyframe visual custom extension
+compiler: coordinate angle assetdir meshdir eulerseq inertiafromgeom autolimits boundmass=0
+compiler: boundinertia=0 settotalmass=-1 balanceinertia=0 inertiagrouprange=0_5 strippath=0
+compiler: | usethread texturedir discardvisual fusestatic fitaabb saveinertial alignfree convexhull
+compiler: | exactmeshinertia conflictcheck lengthrange
+option: gravity flag density=0 viscosity=0 wind=0
+option: | timestep apirate impratio magnetic o_margin o_solref o_solimp o_friction integrator cone
+option: | jacobian solver iterations tolerance ls_iterations ls_tolerance noslip_iterations
+option: | noslip_tolerance ccd_iterations ccd_tolerance mpr_iterations mpr_tolerance sdf_iterations
+option: | sdf_tolerance sdf_initpoints actuatorgroupdisable collision sleep_tolerance
+flag: | * constraint=enable equality=enable frictionloss=enable limit=enable passive=enable
+flag: | spring=enable damper=enable gravity=enable clampctrl=enable actuation=enable
+worldbody body: name pos quat axisangle euler xyaxes zaxis body geom joint freejoint inertial
+worldbody body: mocap=0 gravcomp=0 | user site light camera childclass sleep class
+inertial: pos quat axisangle euler xyaxes zaxis mass diaginertia fullinertia
+joint: name type pos axis range limited damping ref armature stiffness=0 springdamper=0
+joint: frictionloss=0 actuatorfrclimited=0 | class group user margin solreflimit solimplimit
+joint: | solreffriction solimpfriction springref actuatorgravcomp
+freejoint: name | group align class user
+geom: name type pos quat axisangle euler xyaxes zaxis size fromto mesh mass density contype
+geom: conaffinity group material rgba friction shellinertia=0 fluidshape=none | class condim
+geom: | priority solmix solref solimp margin gap fitscale user hfield fluidcoef
+actuator: motor
+motor: name joint gear ctrlrange=+- ctrllimited forcerange=+- forcelimited
+motor: | group lengthrange user kp kv dampratio timeconst inheritrange cranklength actearly actdim
+motor: | actlimited actrange nsample interp delay
+equality: connect
+connect: name body1 body2 anchor | class solref solimp
+asset: mesh material | texture hfield skin
+mesh: name file scale inertia | *
+"""
+
+DRIVES = ("transmission/", "actuator/", "motor/")
+"""Parts that only drive joints: nothing of them is lost if the scenario names the driven joints."""
+
+
+def _is_symmetric(value: str) -> bool:
+    low, high = [*(number_in(word) for word in value.split()), None, None][:2]
+    return low is None or high is None or low == -high
+
+
+_RULES: dict[str, Callable[[str], bool]] = {
+    "": lambda _: True,
+    "never": lambda _: False,
+    "0": lambda value: (
+        value.lower() in ("false", "auto") or all(number_in(word) == 0.0 for word in value.split())
+    ),
+    "1": lambda value: value.lower() in ("", "true") or number_in(value) == 1.0,
+    "+-": _is_symmetric,
+    "-1": lambda value: (number_in(value) or 0.0) <= 0.0,
+    "0_5": lambda value: value.split() == ["0", "5"],
+    "simple": lambda value: "SimpleTransmission" in value,
+    "earth": lambda value: value.split() in (["0", "0", "-9.8"], ["0", "0", "-9.81"]),
+    "enable": lambda value: value == "enable",
+    "none": lambda value: value == "none",
+}
+"""A value in the tables -> whether one in a file means the same."""
+
+
+def _table(text: str) -> dict[str, dict[str, tuple[bool, str]]]:
+    """Owner -> its parts -> whether Drake reads it, and the value that is meant."""
+    table: dict[str, dict[str, tuple[bool, str]]] = {}
+    for line in text.strip().splitlines():
+        owners, _, parts = line.partition(": ")
+        read, _, idle = parts.partition("|")
+        for owner in owners.split():
+            for names, is_read in ((read, True), (idle, False)):
+                for part in names.split():
+                    name, _, value = part.partition("=")
+                    table.setdefault(owner, {})[name] = (is_read, value)
+    return table
+
+
+READ_BY_DRAKE = {".urdf": _table(_URDF), ".sdf": _table(_SDF), ".xml": _table(_MJCF)}
+
+
+def take_lost(
+    element: Element, kind: str, leave_out: Collection[str]
+) -> Iterator[tuple[str, Element]]:
+    """Removes what Drake does not read of an element, and yields what is lost: part and owner."""
+    table = READ_BY_DRAKE[kind].get(element.tag)
+    if table is None:
+        return
+    parts: list[tuple[str, str, Element | None]]
+    parts = [(name, value, None) for name, value in element.items()]
+    for child in element:
+        parts.append((child.tag, (child.text or "").strip() or child.get("value", ""), child))
+    for name, value, node in parts:
+        is_foreign = ":" in name and not name.startswith("drake:")
+        other = (name.startswith("xmlns"), "") if is_foreign else table.get("*", (True, "never"))
+        is_read, meant = table.get(name, other)
+        part = f"{element.tag}/{name}"
+        is_meant = _RULES[meant](value)
+        if not is_meant and part not in leave_out:
+            yield part, element
+        if is_read and is_meant and part not in leave_out:
+            if node is not None:
+                yield from take_lost(node, kind, leave_out)
+        elif node is not None:
+            element.remove(node)
+        else:
+            del element.attrib[name]

@@ -1,0 +1,305 @@
+"""The coordinates (20)-(22) and their inverse, against hand calculation and MultibodyPlant."""
+
+from dataclasses import replace
+from functools import cache
+
+import casadi as ca
+import numpy as np
+import pytest
+from actuated import actuated, states
+from arms import arm, consistent_states, numbers
+from problems import PROBLEMS, knife_edge
+from runs import some
+from two_arms import two_arms
+
+from drake_dae.dae.normal_form import NormalForm
+from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.newton import NewtonModel, newton
+
+ROBOTS = {
+    "two_link": lambda: arm("two_link").structure,
+    "seven_joint": lambda: arm("seven_joint").structure,
+    "two_arms": lambda: find_structure(two_arms().dae),
+    **{
+        f"two_link {kind}": lambda kind=kind: actuated("two_link", kind).structure
+        for kind in ("flexible", "damped", "motor", "hydraulic", "flexible motor")
+    },
+    "seven_joint damped": lambda: actuated("seven_joint", "damped").structure,
+}
+
+
+@cache
+def form(name: str) -> NormalForm:
+    structure = ROBOTS[name]() if name in ROBOTS else find_structure(PROBLEMS[name]().system)
+    return NormalForm(structure.system, structure=structure)
+
+
+def chain_ends(structure: Structure) -> tuple[np.ndarray, np.ndarray]:
+    """Where the chains of constraints and of outputs end in (y, zeta, xi)."""
+    ends = np.cumsum([*structure.constraint_degrees, *structure.output_degrees]) - 1
+    m = len(structure.constraint_degrees)
+    dynamic = np.flatnonzero(structure.output_degrees)
+    return ends[:m], ends[m:][dynamic]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", some([*PROBLEMS, *ROBOTS], of=3))
+@pytest.mark.equation(20, 24)
+def test_phi_and_its_inverse_compose_to_the_identity(name):
+    """Both ways, on N* and off it, from the nominal state as the guess."""
+    normal_form = form(name)
+    system, structure = normal_form.system, normal_form.structure
+    random = np.random.default_rng(1)
+    if name in PROBLEMS:
+        found = [PROBLEMS[name]().consistent(random) for _ in range(4)]
+    elif len(name.split()) > 1 and name.startswith("two_link"):
+        found = list(states("two_link", name.removeprefix("two_link "), 4))
+    else:
+        found = list(structure.states[1:5])
+    size = np.abs([*structure.states, *found]).max(axis=0)
+    found += [x + 1e-2 * size * random.standard_normal(size.size) for x in found]
+    for x in found:
+        coordinates = normal_form.coordinates(x)
+        back = normal_form.state(coordinates)
+        scale = np.maximum(1.0, np.abs(x).max())
+        # Round-off times the condition, which is highest (1e3) behind flexible joints and motors.
+        np.testing.assert_allclose(back, x, rtol=0, atol=1e-12 * scale)
+        again = normal_form.coordinates(back)
+        np.testing.assert_allclose(
+            again, coordinates, rtol=0, atol=1e-12 * max(1.0, np.abs(coordinates).max())
+        )
+    assert len(normal_form.coordinate_signals) == system.num_states
+
+
+@pytest.mark.slow
+@pytest.mark.equation(23)
+def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
+    """dPhi/dx (f + g v + h u): integrators, then a + B u by hand; y stays; v by hand."""
+    system = problem.system
+    normal_form = NormalForm(system)
+    fields = ca.Function(
+        "fields",
+        [system.state, system.parameter_symbol],
+        [ca.densify(e) for e in (system.f, system.g, system.h)],
+    )
+    random = np.random.default_rng(2)
+    constraint_ends, output_ends = chain_ends(normal_form.structure)
+    for _ in range(3):
+        x, u = problem.consistent(random), random.standard_normal(system.num_controls)
+        f, g, h = (np.array(e) for e in fields(x, system.parameter_values))
+        known = problem.known(x)
+        rate = f[:, 0] + g @ (known.alpha + known.beta @ u) + h @ u
+        coordinates = normal_form.coordinates(x)
+        moving = normal_form.jacobian(x) @ rate
+        expected = np.roll(coordinates, -1)
+        expected[constraint_ends] = 0.0
+        highest = known.drift + known.control_matrix @ u
+        expected[output_ends] = highest[np.flatnonzero(problem.output_degrees)]
+        first_xi = system.num_states - problem.zero_dynamics
+        scale = max(1.0, np.abs(moving).max())
+        np.testing.assert_allclose(
+            moving[:first_xi], expected[:first_xi], rtol=0, atol=1e-12 * scale
+        )
+        residual = problem.derivatives(x)
+        np.testing.assert_allclose(coordinates[: residual.size], residual, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
+@pytest.mark.equation(21, 50, 51, 52, 53)
+def test_robot_coordinates_are_those_of_50_to_53(name):
+    """phi, J qd, h_1, P qd from MultibodyPlant alone."""
+    normal_form, wall = form(name), {"two_link": 1.2, "seven_joint": 0.7}[name]
+    random = np.random.default_rng(4)
+    for x in consistent_states(name, 3):
+        x = x + 0.05 * random.standard_normal(x.size)  # Off N*, so that y is not zero.
+        q, v = np.split(x, 2)
+        n = numbers(name, q, v)
+        tip = arm(name).plant.CreateDefaultContext()
+        arm(name).plant.SetPositions(tip, q)
+        pose = arm(name).plant.GetFrameByName("tool").CalcPoseInWorld(tip)
+        y = [wall - pose.translation()[0], *(n.constraint_jacobian @ v)]
+        zeta = np.column_stack([n.outputs, n.output_jacobian @ v]).reshape(-1)
+        # A few hundred operations on numbers of order 1.
+        np.testing.assert_allclose(
+            normal_form.coordinates(x), [*y, *zeta], rtol=0, atol=1e-13 * max(1, *np.abs(x))
+        )
+
+
+@pytest.mark.equation(58)
+def test_robot_inverse_is_58():
+    """q = psi(xbar_1) by the model's own search; qd = Q xbar_2 with Q from MultibodyPlant."""
+    for name in ("two_link", "seven_joint"):
+        normal_form, model = form(name), arm(name).model
+        for x in consistent_states(name, 3, seed=5):
+            coordinates = normal_form.coordinates(x)
+            zeta = coordinates[2:].reshape(-1, 2)
+            state = normal_form.state(np.concatenate([[0.0, 0.0], zeta.reshape(-1)]))
+            q = model.configuration(zeta[:, 0], np.split(model.dae.nominal_state, 2)[0])
+            n = numbers(name, q, np.zeros_like(q))
+            both = np.vstack([n.constraint_jacobian, n.output_jacobian])
+            v = np.linalg.solve(both, [0.0, *zeta[:, 1]])
+            # The configuration is found to 1e-10 or better.
+            np.testing.assert_allclose(state, [*q, *v], rtol=0, atol=1e-9)
+
+
+@pytest.mark.equation(22)
+def test_chosen_completions_are_named_states():
+    """The shafts' velocities behind damped joints, the knife edge's position."""
+    expected = {
+        "two_link damped": ["joint1_motor.velocity", "joint2_motor.velocity"],
+        "knife_edge": ["x", "y"],
+        "two_link": [],
+    }
+    for name, names in expected.items():
+        normal_form = form(name)
+        assert [s.name for s in normal_form.completion_signals] == names
+        assert not normal_form.margin.is_singular
+    signals = form("two_link damped").coordinate_signals
+    assert [(s.name, s.unit) for s in signals[-2:]] == [
+        ("joint1_motor.velocity", "rad/s"),
+        ("joint2_motor.velocity", "rad/s"),
+    ]
+
+
+def radius() -> DaeSystem:
+    """z = (x0^2 + x1^2)/2 is pushed radially; its level curves turn by more than 90 degrees."""
+    return DaeSystem.from_functions(
+        2,
+        f=lambda x: [x[1], -x[0]],
+        h=lambda x: [x[0], x[1]],
+        l=lambda x: (x[0] ** 2 + x[1] ** 2) / 2,
+        nominal_state=[1.0, 1.0],
+        name="radius",
+    )
+
+
+@pytest.mark.parametrize("small", [-0.1, 0.02])
+def test_combinations_of_states_where_no_single_state_will_do(small):
+    """dz = (x0, x1): x0 completes it where x1 is not 0, x1 where x0 is not, x0 - x1 at both."""
+    states = np.array([[1.0, 1.0], [1.0, small], [small, 1.0]])
+    structure = replace(find_structure(radius()), states=states)
+    normal_form = NormalForm(structure.system, structure=structure)
+    (signal,) = normal_form.completion_signals
+    assert signal.name == "x0 - x1"
+    for x in states:
+        coordinates = normal_form.coordinates(x)
+        np.testing.assert_allclose(coordinates, [x @ x / 2, x[0] - x[1]], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(normal_form.state(coordinates), x, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("completion", "message"),
+    [
+        (lambda x: x[:1], r"\(1, 1\)"),
+        (lambda x: x[:2].T, r"\(1, 2\)"),
+        (lambda x: [x[0], x[1]], "completion"),
+        (lambda x: ca.vertcat(x[0], ca.SX.sym("w")), r"\bw\b"),
+        (lambda x: ca.vertcat(x[0], ca.sin(x[2])), r"'xi1' = sin\(heading\)"),
+        (lambda x: ca.vertcat(x[2], x[1]), "heading"),
+        (lambda x: ca.vertcat(x[1], 1.0), "'xi1' = 1"),
+        # Regular at all samples, but on both sides of a zero.
+        (lambda x: ca.vertcat((x[0] + 0.003) ** 2, x[1]), r"'xi0' = .*-(0\.00)?3"),
+    ],
+)
+def test_completions_that_do_not_complete_are_refused(completion, message):
+    system = knife_edge().system
+    structure = find_structure(system)
+    with pytest.raises(ModelError, match=message):
+        NormalForm(structure.system, completion(system.state), structure=structure)
+
+
+def outputs_of_a_state(outputs, nominal_state):
+    """x' = u and z = l(x): zeta is l(x), and there is nothing else."""
+    size = len(nominal_state)
+    return NormalForm(
+        DaeSystem.from_functions(
+            size,
+            f=lambda x: size * [0],
+            h=lambda x: np.eye(size),
+            l=outputs,
+            nominal_state=nominal_state,
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("outputs", "guess", "x"),
+    [
+        (lambda x: x[0] / (1 + x[0] ** 2), [0.9], [0.0]),
+        (lambda x: x[0] / (1 + x[0] ** 2), [-0.85], [0.0]),
+        (lambda x: x[0] / (1 + x[0] ** 2) ** 0.75, [1.3], [0.0]),
+        (lambda x: [x[0] / (1 + x[0] ** 2), x[1] + 0.1 * x[0]], [0.9, 0.0], [0.0, 0.5]),
+    ],
+    ids=["fold", "from below", "slow", "two states"],
+)
+def test_continuation_arrives_where_newtons_method_alone_does_not(outputs, guess, x):
+    """The guess is near a fold, where l(x) is flat: one Newton step leads far beyond the state.
+
+    Out there l(x) decays, so every further step leads farther away, by more than its own length, on
+    any processor. On the straight way through l(x) each state is near the one before.
+    """
+    normal_form = outputs_of_a_state(outputs, x)
+    coordinates = normal_form.coordinates(x)
+
+    def linearize(state):
+        inverse = np.linalg.inv(normal_form.jacobian(state))
+        return NewtonModel(
+            lambda z: inverse @ (coordinates - normal_form.coordinates(z)), is_regular=True
+        )
+
+    found, converged = newton(np.array(guess), linearize)
+    assert not converged
+    assert np.max(np.abs(found)) > 5.0
+    np.testing.assert_allclose(normal_form.state(coordinates, guess), x, rtol=0, atol=1e-14)
+
+
+def test_coordinates_out_of_reach_are_named():
+    normal_form = form("pendulum")
+    with pytest.raises(InconsistentStateError) as info:
+        normal_form.state([0.0, 0.0, 0.9, 0.0])
+    assert info.value.residual[2] == pytest.approx(0.1, abs=1e-4)
+    # Two links of 1 m reach at most sqrt(4 - 1.2^2) = 1.6 m high on the wall.
+    with pytest.raises(InconsistentStateError, match=r"tool\.z.*1\.7"):
+        form("two_link").state([0.0, 0.0, 1.7, 0.0])
+    tension = form("pendulum_tension")
+    with pytest.raises(InconsistentStateError, match="x, vx"):
+        tension.state([0.0, 0.0, 0.9, 0.0])
+
+
+def test_wrong_inputs():
+    normal_form = form("pendulum")
+    with pytest.raises(ModelError, match="coordinates"):
+        normal_form.state([0.0, 0.0, 0.5])
+    with pytest.raises(ModelError, match="coordinates"):
+        normal_form.state([0.0, 0.0, np.nan, 0.0])
+    with pytest.raises(ModelError, match="state"):
+        normal_form.state([0.0, 0.0, 0.5, 0.0], [1.0, 2.0])
+    with pytest.raises(ModelError, match="state"):
+        normal_form.coordinates([0.0, 0.0, 0.5])
+    logarithm = DaeSystem.from_functions(
+        1, f=lambda x: 0, h=lambda x: 1, l=lambda x: ca.log(x), nominal_state=[1.0]
+    )
+    with pytest.raises(ModelError, match=r"\[-1\.\]"):
+        NormalForm(logarithm).state([0.0], [-1.0])
+
+
+def leaning() -> DaeSystem:
+    """A cart on a rail that a constraint force holds at y = 0, in coordinates that mix them."""
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+
+    def height(x: ca.SX) -> ca.SX:
+        return ca.sinh(3 * x[0]) + 0.3 * ca.sin(x[0]) * x[1]
+
+    return DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[2], x[3], -x[0] - 0.2 * x[2], -x[1]],
+        g=lambda x: [0, 0, *turn[:, 0]],
+        h=lambda x: [0, 0, *turn[:, 1]],
+        k=height,
+        l=lambda x: [ca.sin(x[1])],
+        m=lambda x: [0],
+        nominal_state=[0.02, 0.4, 0.0, 0.1],
+        name="leaning",
+    )
