@@ -450,7 +450,6 @@ class DaeSystem:
         """
         return vector(f"{self.name}: a state", state, self.num_states)
 
-    @checked(ModelError)
     def parameter_slice(self, name: str) -> slice:
         """Returns the slice of a parameter in the parameter vector.
 
