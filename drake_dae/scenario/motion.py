@@ -83,7 +83,11 @@ def reference_and_start(
     """R(t) of the law's model, and a state where the motion along it begins."""
     names = [signal.name for signal in model.dae.output_signals]
     degrees = structure.layout.reference_degrees
-    reference = stack_references(references_of(scenario, names, degrees), degrees)
+    stacked = stack_references(references_of(scenario, names, degrees), degrees)
+
+    def reference(time: float) -> FloatArray:
+        return stacked(time).copy()
+
     outputs = reference(scenario.integrator.start_time)[structure.layout.lowest]
     parameters = model.dae.parameter_values
     with at("start"):
