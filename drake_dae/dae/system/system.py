@@ -416,7 +416,6 @@ class DaeSystem:
         """Checks a state and returns it as a new array of shape (n,)."""
         return vector(f"{self.name}: a state", state, self.num_states)
 
-    @checked(ModelError)
     def parameter_slice(self, name: str) -> slice:
         """Returns the slice of a parameter in the parameter vector."""
         return parameter_slice(self.name, self.parameters, name)
