@@ -1,11 +1,14 @@
-"""Limits along references: which is exceeded most, and how much slower the references must be."""
+"""Limits of signals: their ranges, which is exceeded most, and what slower references change."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from drake_dae.analysis.tables import digits
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.system.signals import Signal
@@ -14,7 +17,76 @@ from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 
 SLACK, CLOSE = 1e-9, 1e-6
-"""The share by which a limit may be passed, and the relative accuracy of the rate."""
+"""The share by which a limit may be passed, since a start may be on it; and the relative accuracy
+of the rate."""
+
+
+class LimitKind(StrEnum):
+    """What a limit is on."""
+
+    CONTROL = "control"
+    EFFORT = "joint force"
+    POSITION = "position"
+    SPEED = "speed"
+    FORCE = "constraint force"
+    CONE = "friction cone"
+
+
+@dataclass(frozen=True, eq=False)
+class SignalRange:
+    """One signal along a motion, beside its limits.
+
+    Attributes:
+        signal: Name and unit.
+        kind: What the limit is on.
+        least, least_time: The lowest value, and when in s.
+        largest, largest_time: The highest value, and when in s.
+        low, high: The limits; infinite without a limit.
+        beyond_time: The first time beyond a limit, in s; None if there is none.
+    """
+
+    signal: Signal
+    kind: LimitKind
+    least: float
+    least_time: float
+    largest: float
+    largest_time: float
+    low: float
+    high: float
+    beyond_time: float | None
+
+    @property
+    def room(self) -> float:
+        """The least distance from a limit; negative beyond it, infinite without one."""
+        room = min(self.least - self.low, self.high - self.largest)
+        return 0.0 if room < 0.0 and self.beyond_time is None else room
+
+    @property
+    def share(self) -> float:
+        """How much of the half range between its limits is used; nan without both limits."""
+        with np.errstate(invalid="ignore"):
+            return float(1.0 - np.float64(2.0 * self.room) / (self.high - self.low))
+
+    @property
+    def excess(self) -> "Excess | None":
+        """Where it is beyond its limits most; None if it keeps them."""
+        if self.beyond_time is None:
+            return None
+        if self.low - self.least > self.largest - self.high:
+            return Excess(self.signal, self.kind, self.least, self.least_time, self.low)
+        return Excess(self.signal, self.kind, self.largest, self.largest_time, self.high)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The range as plain numbers; None for an infinite limit."""
+        return {
+            "name": self.signal.name,
+            "unit": self.signal.unit,
+            "least": {"value": self.least, "time": self.least_time},
+            "largest": {"value": self.largest, "time": self.largest_time},
+            "low": self.low if np.isfinite(self.low) else None,
+            "high": self.high if np.isfinite(self.high) else None,
+            "beyond_time": self.beyond_time,
+        }
 
 
 @dataclass(frozen=True)
@@ -26,17 +98,23 @@ class Excess:
     """
 
     signal: Signal
+    kind: LimitKind
     value: float
     time: float
     limit: float
 
     def __str__(self) -> str:
         name, unit = self.signal.name, f" {self.signal.unit}".rstrip()
+        value, limit = f"{abs(self.value):.4g}{unit}", f"{abs(self.limit):.4g}{unit}"
+        if self.kind is LimitKind.POSITION:
+            value, limit = f"{digits(self.value)}{unit}", f"{digits(self.limit)}{unit}"
+            return f"{name} comes to {value} at {self.time:.4g} s, beyond its limit of {limit}"
+        if self.kind is LimitKind.CONE:
+            return f"{name} is left by {value} at {self.time:.4g} s"
         if not self.limit:
-            what = "is left by" if self.value > 0.0 else "would pull with"
-            return f"{name} {what} {abs(self.value):.4g}{unit} at {self.time:.4g} s"
-        share = f"{self.value / self.limit:.3g} times its limit of {abs(self.limit):.4g}{unit}"
-        return f"{name} has {abs(self.value):.4g}{unit} at {self.time:.4g} s, {share}"
+            return f"{name} would pull with {value} at {self.time:.4g} s: a real contact opens"
+        share = f"{self.value / self.limit:.3g} times its limit of {limit}"
+        return f"{name} has {value} at {self.time:.4g} s, {share}"
 
 
 class SignalLimits:
@@ -45,6 +123,7 @@ class SignalLimits:
     Args:
         system: The system.
         signals: Names and units of s, k of them.
+        kinds: What each limit is on.
         values: s, shape (k, 1), in `system.state` and the symbols.
         bounds: low and high, shape (2, k), infinite without a limit.
         symbols: Those of u and lambda.
@@ -54,28 +133,65 @@ class SignalLimits:
         self,
         system: DaeSystem,
         signals: Sequence[Signal],
+        kinds: Sequence[LimitKind],
         values: ca.SX,
         bounds: FloatArray,
         symbols: tuple[ca.SX, ca.SX],
     ) -> None:
-        self.signals, self.bounds, values = tuple(signals), bounds, ca.densify(values)
-        (u, force), v = symbols, ca.SX.sym("v", system.num_constraints)
+        self.system, self.bounds = system, bounds
+        self.signals, self.kinds = tuple(signals), tuple(kinds)
+        (u, force), v, values = symbols, ca.SX.sym("v", system.num_constraints), ca.densify(values)
         self.values = system.trace("limited", {"s": values}, {"u": u, "force": force})
         pinned = {"s": ca.substitute(values, force, system.forces(v))}
         self.pinned_values = system.trace("limited", pinned, {"u": u, "v": v})
 
+    def ranges(self, times: FloatArray, values: FloatArray) -> tuple[SignalRange, ...]:
+        """The range of each signal along rows of s, with times."""
+        if not times.size:
+            return ()
+        found = []
+        for i, (signal, kind) in enumerate(zip(self.signals, self.kinds, strict=True)):
+            column, (low, high) = values[:, i], self.bounds[:, i]
+            size = np.max(np.abs(column))
+            # The first of those that differ by round-off.
+            least = int(np.argmax(column <= column.min() + SLACK * size))
+            largest = int(np.argmax(column >= column.max() - SLACK * size))
+            slack = SLACK * max(1.0, size)
+            beyond = (column < low - slack) | (column > high + slack)
+            found.append(
+                SignalRange(
+                    signal,
+                    kind,
+                    least=float(column[least]),
+                    least_time=float(times[least]),
+                    largest=float(column[largest]),
+                    largest_time=float(times[largest]),
+                    low=float(low),
+                    high=float(high),
+                    beyond_time=float(times[np.argmax(beyond)]) if beyond.any() else None,
+                )
+            )
+        return tuple(found)
+
     def worst(self, values: FloatArray, times: FloatArray, sizes: FloatArray) -> Excess | None:
-        """Returns the largest excess of rows of s, as a share of its limit, or of `sizes` for 0."""
+        """The largest excess of rows of s, as a share of its limit, or of `sizes` for 0.
+
+        Positions are left out, which do not depend on the pace.
+        """
+        paced = np.array([kind is not LimitKind.POSITION for kind in self.kinds])
         sizes = np.where(self.bounds == 0.0, sizes, np.abs(self.bounds))
         over = np.array([self.bounds[0] - values, values - self.bounds[1]])
         with np.errstate(invalid="ignore", divide="ignore"):  # -inf / inf without a limit.
             shares = np.nan_to_num(over / sizes[:, None, :], nan=-np.inf)
-        most = shares.max()  # The first of those that differ by round-off.
-        side, row, i = np.argwhere(shares >= most - SLACK * abs(most))[0]
+        shares[over <= SLACK] = -np.inf
+        shares[:, :, ~paced] = -np.inf
+        most = shares.max(initial=-np.inf)
         if not most > SLACK:
             return None
-        limit = float(self.bounds[side, i])
-        return Excess(self.signals[i], float(values[row, i]), float(times[row]), limit)
+        # The first of those that differ by round-off.
+        side, row, i = np.argwhere(shares >= most - SLACK * abs(most))[0]
+        limit, value = float(self.bounds[side, i]), float(values[row, i])
+        return Excess(self.signals[i], self.kinds[i], value, float(times[row]), limit)
 
 
 @dataclass(frozen=True)
@@ -130,7 +246,8 @@ def limits_along(
     def slowed(i: int, rate: float, force: float = 1.0) -> FloatArray:
         goal = goals[i] * rate**powers
         goal[commanded] *= force
-        point = pinned.point(pinned.state(goal, motion.states[i], p[i]), goal, p[i])
+        at = pinned.at(goal, p[i])
+        point = at.point(at.state(motion.states[i]))
         return limits.pinned_values(point.state, point.control, point.constraint_input, p[i])[0]
 
     def worst(rate: float, chosen: Sequence[int] = range(times.size)) -> Excess | None:

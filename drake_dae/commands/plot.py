@@ -8,7 +8,6 @@ from pydrake.systems.framework import Context
 
 from drake_dae.commands.run.files import RunFiles
 from drake_dae.commands.run.folder import FILM, SCENARIO, load_run, runs_by_name, stage
-from drake_dae.commands.run.report import report_run
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.files import check_unwritten
@@ -17,6 +16,7 @@ from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.parts.parts import Write
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.records.record import Record
@@ -67,7 +67,7 @@ def _plot_all(options: argparse.Namespace) -> int:
     for folder in folders:
         scenario, loop, context, record = _run_again(folder)
         files, wanted = RunFiles(folder), Write(plots=True, animation=False)
-        files.write_pictures(report_run(scenario, loop, context, record), loop, context, wanted)
+        files.write_pictures(judge_run(scenario, loop, context, record), loop, context, wanted)
         problems += files.problems
         if files.problems:  # Pictures there may be of an earlier time.
             continue

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from textwrap import fill
 from typing import Any, TextIO
 
 from pydrake.systems.framework import Context
@@ -30,24 +29,24 @@ from drake_dae.commands.run.folder import (
     new_folder,
     run_folder,
 )
-from drake_dae.commands.run.report import RunReport, report_run
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
+from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.job import JobOutcome, JobVerdict
+from drake_dae.simulation.judgement import Outcome
 from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.simulation.records.record import Record, RecordAfter
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.simulate import RunStatistics, simulate
-from drake_dae.simulation.summary import WIDTH
+from drake_dae.simulation.summary import RunSummary
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -228,9 +227,9 @@ def _write(run: _CommandRun, files: RunFiles, failure: str, title: str) -> dict[
         record = run.record or run.loop.record(run.context)
         if record.time.size == 0:
             return {}
-        report = report_run(scenario, run.loop, run.context, record, run.statistics, failure)
+        report = judge_run(scenario, run.loop, run.context, record, run.statistics, failure)
         if wanted.record:
-            files.write_record(report, run.writer, run.context)
+            files.write_record(record, run.loop, run.writer, run.context)
         files.write_summary(report, *run.completed.notes)
     try:
         if ending.signal is not None:
@@ -242,14 +241,13 @@ def _write(run: _CommandRun, files: RunFiles, failure: str, title: str) -> dict[
     return {**report.data, "files": written}
 
 
-def _print_report(report: RunReport, files: RunFiles) -> list[str]:
+def _print_report(report: RunSummary, files: RunFiles) -> list[str]:
     """Prints the verdict, the summary and the problems; returns the names of the files."""
     folder = files.folder
     written = [name for name in (*FILES, PART) if (folder / name).exists()]
     with files.collected():
-        verdict = _colored(report.job)
         where = f"written to {folder}/: {', '.join(written)}"
-        _print(f"{verdict}\n\n{report.text}\n{where}", sys.stdout)
+        _print(f"{_colored(report)}\n{where}", sys.stdout)
         if ANIMATION in written:
             named = shlex.quote(str(folder))
             drawn = "" if PLOTS[0] in written else f"; plots: {program()} plot {named} --all"
@@ -259,12 +257,12 @@ def _print_report(report: RunReport, files: RunFiles) -> list[str]:
     return written
 
 
-def _colored(job: JobVerdict) -> str:
-    """A verdict for the screen: its first word green, red or yellow on a terminal."""
-    text, word = fill(str(job), WIDTH), job.outcome.value
+def _colored(report: RunSummary) -> str:
+    """A summary for the screen: its first word green, red or yellow on a terminal."""
+    text, outcome = report.text, report.judgement.outcome
     if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):
         return text
-    color = {JobOutcome.GOOD: 32, JobOutcome.BAD: 31, JobOutcome.UNDECIDED: 33}[job.outcome]
+    color, word = {Outcome.GOOD: 32, Outcome.BAD: 31, Outcome.UNDECIDED: 33}[outcome], outcome.name
     return f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
 
 

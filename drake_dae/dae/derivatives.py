@@ -23,12 +23,13 @@ import numpy as np
 
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
-from drake_dae.trace.blocks import block_stages, saddle_point_solver
 from drake_dae.trace.factorization import (
     Factorization,
     Factors,
     PositiveDefiniteFactorization,
+    block_stages,
     nonzeros,
+    saddle_point_solver,
 )
 from drake_dae.trace.functions import count_operations
 
@@ -341,3 +342,13 @@ def _factors_of(system: DaeSystem, rows: list[int]) -> Factors:
             chosen = other
     _CHOSEN[factorize] = rows, mass, chosen
     return chosen
+
+
+def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:
+    """Returns L_f k = (dk/dx) f, by one forward sweep."""
+    return ca.jtimes(expression, state, ca.densify(field))
+
+
+def lie_derivative_along(expression: ca.SX, fields: ca.SX, state: ca.SX) -> ca.SX:
+    """Returns [L_g1 k, ..., L_gm k] with structural zeros."""
+    return ca.sparsify(ca.mtimes(ca.jacobian(expression, state), fields))

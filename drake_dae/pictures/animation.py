@@ -51,9 +51,9 @@ from drake_dae.pictures.scene.view import (
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.surfaces.surface import axes_along
+from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.records.phases import PhaseSpan, phase_spans
 from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.summary import Limits
 
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
 _CONE = Rgba(0.95, 0.6, 0.15, 0.35)
@@ -99,7 +99,7 @@ def make_animation(
         ModelError: The plant is not a robot.
     """
     course = follow(loop, record, context)
-    events = [*events_of(record, Limits.of(course.model)), *slips(course)]
+    events = [*events_of(record, robot_limits(course.model)), *slips(course)]
     phases = phase_spans(record)
     return animate(course, loop.scene_graph, title, phases, sorted_events(record, events))
 

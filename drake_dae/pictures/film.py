@@ -52,9 +52,9 @@ from drake_dae.pictures.scene.run_motion import (
 from drake_dae.pictures.scene.surroundings import surroundings
 from drake_dae.pictures.scene.view import ARROW, PIECE
 from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.records.phases import phase_spans, phases_at
 from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.summary import Limits
 
 if TYPE_CHECKING:  # Loaded with the first film.
     from matplotlib.axes import Axes
@@ -127,7 +127,7 @@ def save_film(loop: ShownLoop, record: Record, context: Context, path: str | Pat
         )
     rate, sharpness = (MP4_RATE, 2) if kind == ".mp4" else (GIF_RATE, 1)
     course = follow(loop, record, context, rate)
-    events = [*events_of(record, Limits.of(course.model)), *slips(course)]
+    events = [*events_of(record, robot_limits(course.model)), *slips(course)]
     phases = [span.begin for span in phase_spans(record)]
     scene = _Scene(course, loop.scene_graph, sharpness, sorted_events(record, events), phases)
     last = len(course.times) - 1

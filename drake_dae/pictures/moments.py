@@ -6,9 +6,9 @@ from enum import Enum
 
 import numpy as np
 
-from drake_dae.arrays import Booleans
+from drake_dae.analysis.limits import LimitKind, SignalLimits
+from drake_dae.simulation.limits import limited_values
 from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.summary import Limits
 
 APART = 0.01
 """Events with the same text that follow each other within this fraction of the run are shown as
@@ -43,14 +43,15 @@ class RunEvent:
     text: str
 
 
-def events_of(record: Record, limits: Limits | None = None) -> list[RunEvent]:
+def events_of(record: Record, limits: SignalLimits | None = None) -> list[RunEvent]:
     """Returns the events of a recorded run, sorted by time.
 
     Args:
         record: A record with control, state and constraint_force.
-        limits: The limits of the robot.
+        limits: The limits of the robot, `robot_limits`.
     """
-    return sorted_events(record, [*_contacts(record), *_limits(record, limits or Limits())])
+    at_limits = [] if limits is None else _limits(record, limits)
+    return sorted_events(record, [*_contacts(record), *at_limits])
 
 
 def sorted_events(record: Record, events: Sequence[RunEvent]) -> list[RunEvent]:
@@ -89,22 +90,20 @@ def _contacts(record: Record) -> Iterator[RunEvent]:
                 yield RunEvent(float(time), kind, f"{name}: {kind.label}")
 
 
-def _limits(record: Record, limits: Limits) -> Iterator[RunEvent]:
+def _limits(record: Record, limits: SignalLimits) -> Iterator[RunEvent]:
     """Yields when a control or a joint reaches its limit."""
-    at_limits: list[tuple[str, Booleans]] = []
-    controls = record.signals["control"]
-    if limits.control is not None:
-        at_limit = np.abs(controls.values) >= limits.control * (1.0 - 1e-9)
-        if "excess" in record.signals:
-            at_limit |= record["excess"] != 0.0
-        at_limits += [(signal.name, at_limit[:, i]) for i, signal in enumerate(controls.signals)]
-    for key, bounds in (("state", limits.state), ("loop_state", limits.loops)):
-        if bounds is not None and key in record.signals:
-            states = record.signals[key]
-            columns = zip(states.signals, states.values.T, *bounds, strict=False)
-            for signal, values, low, high in columns:
-                at_limits.append((signal.name, (values <= low) | (values >= high)))
-    for name, reached in at_limits:
+    controls = [signal.name for signal in record.signals["control"].signals]
+    columns = zip(
+        limits.kinds, limits.signals, limited_values(limits, record).T, limits.bounds.T, strict=True
+    )
+    for kind, signal, values, (low, high) in columns:
+        if kind in (LimitKind.FORCE, LimitKind.CONE):
+            continue
+        # A control that is cut off keeps its limit by round-off.
+        is_low = np.isfinite(low) & (values <= low + 1e-9 * abs(low))
+        reached = is_low | (np.isfinite(high) & (values >= high - 1e-9 * abs(high)))
+        if kind is LimitKind.CONTROL and "excess" in record:
+            reached |= record["excess"][:, controls.index(signal.name)] != 0.0
         begins = reached & ~np.concatenate([[False], reached[:-1]])
         for time in record.time[begins]:
-            yield RunEvent(float(time), RunEventKind.LIMIT, f"{name} is at its limit")
+            yield RunEvent(float(time), RunEventKind.LIMIT, f"{signal.name} is at its limit")

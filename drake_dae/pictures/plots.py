@@ -22,8 +22,8 @@ from drake_dae.pictures.axes import (
 )
 from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
 from drake_dae.pictures.moments import RunEvent
+from drake_dae.simulation.judgement import ROUND_OFF, output_sizes
 from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.verdict import ROUND_OFF, output_sizes
 
 if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.figure import Figure

@@ -18,7 +18,7 @@ from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, run_loop
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.divergence import RecordWatch
+from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.record import Record, RecordAfter
 
 ROWS = 1000
@@ -111,7 +111,7 @@ def roll_scenario(
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    watched = _DivergenceWatch(scenario, loop, look)
+    watched = _RolloutWatch(scenario, loop, look)
     (rollout,) = run_loop(
         loop,
         start,
@@ -135,7 +135,7 @@ def _seeds(scenario: Scenario) -> dict[str, int]:
     return seeds
 
 
-class _DivergenceWatch:
+class _RolloutWatch:
     """Ends a rollout that diverges."""
 
     def __init__(
@@ -144,7 +144,7 @@ class _DivergenceWatch:
         loop: ClosedLoop,
         look: Callable[[RecordAfter], bool] = lambda record: False,
     ) -> None:
-        self._watch = RecordWatch(loop.plant, scenario.duration)
+        self._watch = DivergenceWatch(loop.plant, scenario.duration)
         self._look, self._may_diverge = look, scenario.judgement.may_diverge
         self._time: float | None = None
         self._next = time.perf_counter() + PERIOD

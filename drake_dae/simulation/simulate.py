@@ -29,7 +29,7 @@ from drake_dae.arguments import checked
 from drake_dae.blocks.failures import cannot_go_on
 from drake_dae.compiler.stepped import NO_EVENTS
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
-from drake_dae.simulation.divergence import DivergenceWatch
+from drake_dae.simulation.divergence import DiagramWatch
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
 from drake_dae.simulation.sampled import SampledRun
 
@@ -78,7 +78,7 @@ def simulate(
 ) -> RunStatistics:
     """Runs a diagram from a context; afterwards the context has the final state, on the manifold.
 
-    If the states or errors of a `Plant` diverge, an exception ends the run: see `DivergenceWatch`.
+    If the states or errors of a `Plant` diverge, an exception ends the run: see `DiagramWatch`.
 
     If Drake steps the plant and other blocks are sampled and traced, as on a `ContactPlant`, one
     call computes these blocks at a sample, in runs of 500 steps or more. `after_step`, a view or a
@@ -123,7 +123,7 @@ def simulate(
     followers = [function for function in (after_step, look) if function is not None]
     ending = Interruption()
     began: float | None = None
-    watch: DivergenceWatch | None = None
+    watch: DiagramWatch | None = None
 
     def stop(number: signal.Signals) -> None:
         ending(number)
@@ -150,7 +150,7 @@ def simulate(
             simulator.Initialize()
             began = time.perf_counter()
             if not may_diverge:
-                watch = DivergenceWatch(diagram, context, duration)
+                watch = DiagramWatch(diagram, context, duration)
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
             is_needed = progress or followers or (watch is not None and watch.sees)
             if is_needed or ending.signal is not None:
@@ -168,12 +168,12 @@ def simulate(
             steps += 0 if sampled is None else sampled.steps
             elapsed = time.perf_counter() - began
             if watch is not None:
-                watch.look(context, always=True)
+                watch.look(context, is_last=True)
         except (DrakeDaeError, RuntimeError) as error:
             if began is None and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.
             if watch is not None:
-                watch.look_at_states(context)  # They may diverge within a few steps.
+                watch.look(context, states_only=True)  # They may diverge within a few steps.
             if not isinstance(error, InconsistentStateError | RuntimeError):
                 raise
             state = context.get_continuous_state_vector().CopyToVector()

@@ -1,238 +1,212 @@
-"""The figures of a run as a table."""
+"""A judged run as text of at most a page, as data, and as figures for tables of many runs."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from math import isfinite
 from textwrap import fill
-from typing import Self
+from typing import Any
 
 import numpy as np
 
+from drake_dae.analysis.limits import LimitKind, SignalRange
 from drake_dae.analysis.tables import Table
-from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
-from drake_dae.robots.model import RobotModel
-from drake_dae.simulation.job import late_rms
-from drake_dae.simulation.records.phases import phase_spans
+from drake_dae.simulation.judgement import (
+    ROUND_OFF,
+    FindingKind,
+    Judgement,
+    Outcome,
+    qualities,
+    record_sizes,
+)
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
-from drake_dae.simulation.verdict import ROUND_OFF, in_words, judge, unit_sizes
+from drake_dae.systems.control.phase_change import PhaseChange
 
 WIDTH = 100
 """The width of a paragraph, in characters."""
 
-SLACK = 1e-9
-"""A smaller excess over a joint limit, in its unit, is ignored: a start may be on the limit."""
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """The limits of a robot; None without limits.
-
-    Attributes:
-        control: The largest |u|, shape (p,).
-        state: The lowest and the highest (q, v), shape (nq + nv,) each.
-        loops: The same for the joints that close loops, (c, c').
-        pushing: Names of the unilateral constraint forces; None if all are unilateral.
-    """
-
-    control: FloatArray | None = None
-    state: tuple[FloatArray, FloatArray] | None = None
-    pushing: frozenset[str] | None = None
-    loops: tuple[FloatArray, FloatArray] | None = None
-
-    def can_pull(self, force: Signal) -> bool:
-        """Whether a constraint force may be negative."""
-        return self.pushing is not None and force.name not in self.pushing
-
-    @classmethod
-    def of(cls, model: RobotModel) -> Self:
-        """The limits of a robot: of its drives, joints and contacts."""
-        pairs = zip(model.links.position_limits, model.links.velocity_limits, strict=True)
-        lower, upper = (np.concatenate(pair) for pair in pairs)
-        state = (lower, upper) if np.any(np.isfinite([lower, upper])) else None
-        pushing = frozenset(
-            signal.name
-            for constraint in model.constraints
-            for signal, pushes in zip(
-                constraint.force_signals, constraint.is_unilateral, strict=True
-            )
-            if pushes
-        )
-        loops = model.loop_joints.limits if model.loop_joints.signals else None
-        return cls(model.control_limits, state, pushing, loops)
-
-
-def summary(
-    record: Record,
-    predicted: FloatArray,
-    limits: Limits | None = None,
-    run: RunStatistics | None = None,
-    failure: str = "",
-    accuracy: float | None = None,
-    reasons: Sequence[str] = (),
-) -> str:
-    """A summary of a run in plain text: its figures, compared with the prediction.
-
-    Numbers that are round-off relative to others of the same unit are shown as 0.
-
-    Args:
-        record: A record with state, desired_output, tracking_error, constraint_residual,
-            constraint_force and control.
-        predicted: The tracking error by theory, shape (k, p).
-        limits: The limits of the robot.
-        run: The statistics of the run; None for a failed run.
-        failure: The reason of the failure.
-        accuracy: The accuracy of error control; None with fixed steps.
-        reasons: Reasons for a deviation from the prediction, such as "the law is sampled".
-    """
-    limits = limits or Limits()
-    sections = [
-        _errors(record, predicted),
-        _phases(record),
-        _forces(record, limits),
-        _controls(record, limits),
-    ]
-    residual = np.max(np.abs(record["constraint_residual"]), initial=0.0)
-    # In compliant contact the state is not projected.
-    is_compliant = "contact_force" in record
-    kind = "in compliant contact" if is_compliant else "before each step's projection"
-    notes = [f"constraint residual  {residual:.2g} at most, {kind}"]
-    notes += _identified(record)
-    notes += [f"joint limits         {text}" for text in _beyond(record, limits)]
-    ended = ""
-    if run is not None:
-        notes.append(
-            f"simulated            {run.simulated_time:g} s in {run.steps} steps, "
-            f"{run.wall_time:.2f} s, {run.times_real_time:.1f} times real time"
-        )
-        if run.interrupted:
-            notes.append("interrupted          the record ends there")
-            ended = f"Interrupted at {record.time[-1]:.4g} s"
-    if failure:
-        notes.append(f"failed               the record ends at {record.time[-1]:.6g} s: {failure}")
-        ended = f"The run ended early, at {record.time[-1]:.4g} s"
-        reasons = ["of what ended it, see above"]
-    words = in_words(judge(record, predicted, accuracy), accuracy, reasons, ended)
-    verdict = [fill(words, WIDTH)]
-    return "\n\n".join("\n".join(lines) for lines in [*sections, notes, verdict] if lines)
-
-
-def _errors(record: Record, predicted: FloatArray) -> list[str]:
-    signals = record.signals["tracking_error"].signals
-    if not signals:
-        return []
-    sizes = unit_sizes(record)
-    errors = record["tracking_error"].T
-    late = late_rms(record.time, record["tracking_error"])
-    head = ["tracking error", "unit", "start", "largest", "final", "late rms", "off prediction by"]
-    rows = []
-    for signal, error, theory, rms in zip(signals, errors, predicted.T, late, strict=True):
-        size, off = sizes[signal.unit], np.max(np.abs(error - theory))
-        courses = (error[0], np.max(np.abs(error)), error[-1])
-        numbers = [*(_number(e, size, 3) for e in courses), _number(rms, size, 2)]
-        rows.append([signal.name, signal.unit or "1", *numbers, _number(off, size, 2)])
-    notes = [
-        "late rms: the root mean square in the second half of the run",
-        "off prediction by: the largest deviation from the predicted error, which decays",
-        "from its initial value by the gains alone",
-    ]
-    return [*Table(head, rows, left=2).lines(), *notes]
-
-
-def _phases(record: Record) -> list[str]:
-    """The errors of each phase of a task, after transients."""
-    spans, signals = phase_spans(record), record.signals["tracking_error"].signals
-    if not spans or not signals:
-        return []
-    units = list(dict.fromkeys(signal.unit for signal in signals))
-    columns_of = [[i for i, signal in enumerate(signals) if signal.unit == unit] for unit in units]
-    sizes, rows, last = unit_sizes(record), [], 0
-    for span in spans:
-        # At the time of a change a row has the values before it.
-        first, last = last, int(np.searchsorted(record.time, span.end, side="right"))
-        rms = late_rms(record.time[first:last], record["tracking_error"][first:last])
-        sums = [float(np.linalg.norm(rms[columns])) for columns in columns_of]
-        numbers = [_number(total, sizes[unit], 2) for total, unit in zip(sums, units, strict=True)]
-        rows.append([span.name, f"{span.begin:.4g}", f"{span.end:.4g}", *numbers])
-    heads = [f"late rms [{unit or '1'}]" for unit in units]
-    return [
-        *Table(["phase", "from [s]", "to [s]", *heads], rows).lines(),
-        "late rms: of all errors in a unit together, in the second half of the phase",
-    ]
-
-
-def _extremes(record: Record, name: str) -> list[list[str]]:
-    """Name, unit, least and largest value of each entry of a signal."""
-    recorded, sizes = record.signals[name], unit_sizes(record)
-    return [
-        [s.name, s.unit or "1", *(_number(f(v), sizes[s.unit], 4) for f in (np.min, np.max))]
-        for s, v in zip(recorded.signals, recorded.values.T, strict=True)
-    ]
-
-
-def _forces(record: Record, limits: Limits) -> list[str]:
-    forces = record.signals["constraint_force"]
-    if not forces.signals:
-        return []
-    pulls = [
-        "pulls: a real contact would open" if _pulls(record, signal, values, limits) else ""
-        for signal, values in zip(forces.signals, forces.values.T, strict=True)
-    ]
-    rows = zip(_extremes(record, "constraint_force"), pulls, strict=True)
-    head = ["constraint force", "unit", "least", "largest", ""]
-    return Table(head, [[*row, text] for row, text in rows], left=2).lines()
-
-
-def _controls(record: Record, limits: Limits) -> list[str]:
-    controls = record.signals["control"]
-    if not controls.signals:
-        return []
-    largest = _largest_controls(record, limits)
-    # A sample describes the step before it.
-    excess = record["excess"] if "excess" in record else np.zeros_like(controls.values)
-    cut_off = np.diff(record.time, prepend=record.time[:1]) @ (excess != 0.0)
-    rows = []
-    columns = zip(controls.values.T, largest, cut_off, strict=True)
-    for row, (values, limit, time) in zip(_extremes(record, "control"), columns, strict=True):
-        remark = "over its limit" if np.max(np.abs(values)) > limit else ""
-        remark = f"cut off for {time:.3g} s" if time else remark
-        rows.append([*row, f"{limit:.4g}" if np.isfinite(limit) else "none", remark])
-    return Table(["control", "unit", "least", "largest", "limit", ""], rows, left=2).lines()
-
-
 UNEXCITED = 0.5
 """A parameter is not excited if its deviation stays above this share of that of its bounds."""
 
-
-def _identified(record: Record) -> list[str]:
-    """The friction, or all parameters, identified by an observer at the end."""
-    if "identified" in record.signals:
-        return _estimated(record)
-    if "friction" not in record.signals:
-        return []
-    friction = record.signals["friction"]
-    pairs = zip(friction.signals, friction.values[-1], strict=True)
-    text = ", ".join(f"{signal.name} = {value:.3g}" for signal, value in pairs)
-    return [f"identified           {text} at the end"]
+_FORCES = (LimitKind.FORCE, LimitKind.CONTROL, LimitKind.EFFORT)
 
 
-def _estimated(record: Record) -> list[str]:
-    """Estimated parameters with their standard deviations, and those that remain unknown."""
+@dataclass(frozen=True, eq=False)
+class RunSummary:
+    """What is told about a run: `text` and `data` say the same.
+
+    Attributes:
+        judgement: Whether it succeeded.
+        record: Its record.
+        changes: The starts of phases of a task.
+        statistics: How it ran; None for a failed run, or one of an earlier time.
+        remedies: What to look at next, beside the causes of the findings.
+        notes: What is approximate in it, a sentence each.
+        accuracy: The accuracy of error control; None with fixed steps.
+    """
+
+    judgement: Judgement
+    record: Record
+    changes: Sequence[PhaseChange] = ()
+    statistics: RunStatistics | None = None
+    remedies: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    accuracy: float | None = None
+
+    @property
+    def missed(self) -> bool:
+        """Whether the run is bad, or off the prediction for no known reason."""
+        return self.judgement.outcome is Outcome.BAD or any(
+            f.kind is FindingKind.PREDICTION and f.decides for f in self.judgement.findings
+        )
+
+    @property
+    def look_next(self) -> list[str]:
+        """What to change, or to look at."""
+        causes = [f.cause for f in self.judgement.findings if f.decides and f.cause]
+        return list(dict.fromkeys([*self.remedies, *causes]))
+
+    @property
+    def residual(self) -> dict[str, float]:
+        """Unit -> the largest constraint residual in it."""
+        recorded, found = self.record.signals["constraint_residual"], dict[str, float]()
+        largest = np.max(np.abs(recorded.values), axis=0, initial=0.0).tolist()
+        for signal, value in zip(recorded.signals, largest, strict=True):
+            found[signal.unit] = max(found.get(signal.unit, 0.0), value)
+        return found
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """The summary as plain data."""
+        judgement, ran = self.judgement, self.statistics
+        names = ("simulated_time", "steps", "wall_time")
+        return {
+            "outcome": str(judgement.outcome),
+            "reason": str(judgement),
+            "missed": self.missed,
+            "findings": [_named(asdict(finding)) for finding in judgement.findings],
+            "outputs": [_named(asdict(output)) for output in judgement.outputs],
+            "forces_and_controls": [
+                {"kind": str(r.kind), **r.to_dict(), "cut_off": self._cut_off(r)}
+                for r in self._limited
+            ],
+            "phases": [asdict(change) for change in self.changes],
+            "residual": self.residual,
+            "look_next": self.look_next,
+            "notes": list(self.notes),
+            "interrupted": ran is not None and ran.interrupted is not None,
+            **{name: getattr(ran, name, None) for name in names},
+        }
+
+    @property
+    def text(self) -> str:
+        """The summary in lines of at most 100 characters; the first says good, bad, undecided."""
+        head = [fill(str(self.judgement), WIDTH)]
+        for finding in self.judgement.findings[1:]:
+            if finding.kind is not FindingKind.PREDICTION or finding.decides:
+                head.append(fill(f"- {finding.text}", WIDTH, subsequent_indent="  "))
+        phases = [fill(str(change), WIDTH, subsequent_indent="  ") for change in self.changes]
+        parts = [head, self._outputs(), self._forces(), phases, [*self._ending()]]
+        return "\n\n".join("\n".join(part) for part in parts if part)
+
+    def _outputs(self) -> list[str]:
+        sizes, rows = record_sizes(self.record), []
+        for q in self.judgement.outputs:
+            numbers = (q.start, 3), (q.largest, 3), (q.late_rms, 2), (q.off_prediction, 2)
+            texts = [_number(value, sizes[q.signal.unit], digits) for value, digits in numbers]
+            rows.append([q.signal.name, q.signal.unit or "1", *texts, f"{q.tolerance:.2g}"])
+        off = [f.cause for f in self.judgement.findings if f.kind is FindingKind.PREDICTION]
+        why = f"; as {off[0]}" if off and not self.missed else ""
+        note = "late: in the second half; off prediction: from the error that the gains alone leave"
+        head = ["tracking error", "unit", "start", "largest", "late rms", "off prediction"]
+        table = Table([*head, "tolerated"], rows, left=2).lines()
+        return [*table, fill(f"{note}{why}", WIDTH, subsequent_indent="  ")] if rows else []
+
+    @property
+    def _limited(self) -> list[SignalRange]:
+        """Forces of constraints, controls, and forces of joints behind their actuation."""
+        found = [r for r in self.judgement.ranges if r.kind in _FORCES]
+        return sorted(found, key=lambda r: _FORCES.index(r.kind))
+
+    def _forces(self) -> list[str]:
+        sizes, rows = record_sizes(self.record), []
+        for r in self._limited:
+            size = sizes.get(r.signal.unit, 0.0)
+            texts = [_number(value, size, 4) for value in (r.least, r.largest)]
+            limit = "none" if r.high == np.inf else f"{r.high:.4g}"
+            limit = "pushes only" if r.low == 0.0 else limit
+            cut = self._cut_off(r)
+            remark = f"cut off for {cut:.3g} s" if cut else ""
+            rows.append([r.signal.name, r.signal.unit or "1", *texts, limit, remark])
+        head = ["force or control", "unit", "least", "largest", "limit", ""]
+        return Table(head, rows, left=2).lines() if rows else []
+
+    def _cut_off(self, limited: SignalRange) -> float:
+        """The time for which a control was cut off at its limit, in s."""
+        if limited.kind is not LimitKind.CONTROL or "excess" not in self.record:
+            return 0.0
+        recorded, times = self.record.signals["excess"], self.record.time
+        column = [s.name for s in self.record.signals["control"].signals].index(limited.signal.name)
+        # A sample describes the step before it.
+        return float(np.diff(times, prepend=times[:1]) @ (recorded.values[:, column] != 0.0))
+
+    def _ending(self) -> Iterator[str]:
+        """Residual and speed, what is identified and approximate, and what to look at next."""
+        if any(self.residual.values()):
+            numbers = ", ".join(f"{v:.2g} {unit}".rstrip() for unit, v in self.residual.items())
+            # In compliant contact the state is not projected.
+            when = "" if "contact_force" in self.record else ", before the projection of each step"
+            yield f"constraint residual  {numbers} at most{when}"
+        if (ran := self.statistics) is not None:
+            yield (
+                f"simulated            {ran.simulated_time:g} s in {ran.steps} steps, "
+                f"{ran.wall_time:.2f} s, {ran.times_real_time:.1f} times real time"
+            )
+        if nearest := _nearest(self.judgement.ranges):
+            yield f"nearest to a limit   {nearest}"
+        lines = [*_identified(self.record), *(("note", note) for note in self.notes)]
+        for title, text in (*lines, *(("look next", text) for text in self.look_next)):
+            yield fill(f"{title:21}{text}", WIDTH, subsequent_indent=" " * 21)
+
+
+def _nearest(ranges: Sequence[SignalRange]) -> str:
+    """The drive and the joint that come closest to their limits."""
+    texts = []
+    for kinds in ((LimitKind.CONTROL, LimitKind.EFFORT), (LimitKind.POSITION,)):
+        if limited := [r for r in ranges if r.kind in kinds and isfinite(r.share)]:
+            r = max(limited, key=lambda r: r.share)
+            left, unit = f"{r.share:.0%} of {r.high:.4g}", f" {r.signal.unit}".rstrip()
+            left = f"{r.room:.3g}{unit} left" if r.kind is LimitKind.POSITION else f"{left}{unit}"
+            texts.append(f"{r.signal.name}, {left}")
+    return "; ".join(texts)
+
+
+def _identified(record: Record) -> Iterator[tuple[str, str]]:
+    """What an estimator found at the end, with standard deviations, and what it could not find."""
+    if "identified" not in record.signals:
+        if "friction" in record.signals:
+            recorded = record.signals["friction"]
+            pairs = zip(recorded.signals, recorded.values[-1], strict=True)
+            yield "identified", ", ".join(f"{signal.name} = {value:.3g}" for signal, value in pairs)
+        return
     recorded, deviations = record.signals["identified"], record["identified_deviation"]
-    found, unknown = list[str](), list[str]()
     # The first row has the deviations of values that are equally likely within their bounds.
-    for signal, value, own, prior in zip(
-        recorded.signals, recorded.values[-1], deviations[-1], deviations[0], strict=True
-    ):
-        text = f"{signal.name} = {value:.3g} +- {own:.1g} {signal.unit}".rstrip()
-        if own < UNEXCITED * prior:
-            found.append(f"identified           {text}")
-        else:
-            unknown.append(signal.name)
-    if unknown:
-        names = ", ".join(unknown)
-        found.append(f"not identified       {names}: this motion does not excite them")
-    return found
+    is_excited = deviations[-1] < UNEXCITED * deviations[0]
+    for i in np.flatnonzero(is_excited):
+        signal, value, own = recorded.signals[i], recorded.values[-1, i], deviations[-1, i]
+        yield "identified", f"{signal.name} = {value:.3g} +- {own:.1g} {signal.unit}".rstrip()
+    if not is_excited.all():
+        names = ", ".join(recorded.signals[i].name for i in np.flatnonzero(~is_excited))
+        yield "not identified", f"{names}: this motion does not excite them"
+
+
+def _named(values: dict[str, Any]) -> dict[str, Any]:
+    """Plain data of a finding or an output: the signal by name and unit, None for no number."""
+    signal = values.pop("signal") or {"name": "", "unit": ""}
+    values = {"name": signal["name"], "unit": signal["unit"], **values}
+    is_number = {key: isinstance(value, float) for key, value in values.items()}
+    return {k: None if is_number[k] and not isfinite(v) else v for k, v in values.items()}
 
 
 def _number(value: float, size: float, digits: int) -> str:
@@ -240,53 +214,41 @@ def _number(value: float, size: float, digits: int) -> str:
     return "0" if abs(value) <= ROUND_OFF * size else f"{value:.{digits}g}"
 
 
-def _largest_controls(record: Record, limits: Limits) -> FloatArray:
-    count = len(record.signals["control"].signals)
-    return np.full(count, np.inf) if limits.control is None else limits.control
+def figures_of(record: Record, ranges: Sequence[SignalRange]) -> dict[str, float]:
+    """The figures of a run: name with unit, such as "largest error of tool.z [m]" -> number.
 
-
-def _pulls(record: Record, signal: Signal, values: FloatArray, limits: Limits) -> bool:
-    """Whether an ideal contact would have to pull.
-
-    A compliant one, whose whole force is recorded, cannot.
-    """
-    is_ideal = "contact_force" not in record
-    return is_ideal and bool(np.min(values) < 0.0) and not limits.can_pull(signal)
-
-
-def shortfalls(record: Record, limits: Limits) -> list[str]:
-    """The violations of limits in a run, a phrase each.
+    For each output: the largest |z - r|, the last z - r, and the "late" error, the root mean square
+    of z - r over the second half of the time. For each constraint force: its least and largest
+    value. For each control: the largest |u|. Then the "margin" of each limited signal, its least
+    distance from its limits, which is negative beyond them; the largest constraint residual before
+    a projection, and the time at which the record ends. An empty record has none.
 
     Args:
-        record: A record with constraint_force and control.
-        limits: The limits of the robot.
+        record: The record of a closed loop.
+        ranges: Its signals with limits, along the record.
     """
-    forces, controls = record.signals["constraint_force"], record.signals["control"]
-    texts = [
-        f"{signal.name} would open at t = {record.time[np.argmax(values < 0.0)]:.4g} s, where its "
-        f"force begins to pull, with up to {-np.min(values):.3g} {signal.unit}"
-        for signal, values in zip(forces.signals, forces.values.T, strict=True)
-        if _pulls(record, signal, values, limits)
-    ]
-    over = np.max(np.abs(controls.values), axis=0, initial=0.0) > _largest_controls(record, limits)
-    beyond = [signal.name for signal, over in zip(controls.signals, over, strict=True) if over]
-    if beyond:
-        texts.append(f"{', '.join(beyond)} would exceed the limits")
-    if joints := [text.split(" goes from ")[0] for text in _beyond(record, limits)]:
-        texts.append(f"{', '.join(joints)} would leave the joint limits")
-    return texts
+    if not record.time.size:
+        return {}
+    figures = dict[str, float]()
+    for q in qualities(record, np.zeros_like(record["tracking_error"]), {}):
+        figures[_label("largest error of", q.signal)] = q.largest
+        figures[_label("final error of", q.signal)] = q.final
+        figures[_label("late error of", q.signal)] = q.late_rms
+    for name, what in (("constraint_force", "least"), ("control", "")):
+        recorded = record.signals[name]
+        for signal, values in zip(recorded.signals, recorded.values.T, strict=True):
+            if what:
+                figures[_label(what, signal)] = float(np.min(values))
+            figures[_label("largest", signal)] = float(np.max(values if what else np.abs(values)))
+    for r in ranges:
+        # The margin of a force that may not pull is its least value.
+        if isfinite(r.room) and r.kind is not LimitKind.FORCE:
+            figures[_label("margin of", r.signal)] = r.room
+    residuals = np.abs(record["constraint_residual"])
+    figures["largest residual"] = float(np.max(residuals, initial=0.0))
+    figures["end [s]"] = float(record.time[-1])
+    return figures
 
 
-def _beyond(record: Record, limits: Limits) -> list[str]:
-    """Positions and velocities beyond their limits."""
-    rows: list[tuple[Signal, FloatArray, float, float]] = []
-    for key, bounds in (("state", limits.state), ("loop_state", limits.loops)):
-        if bounds is not None and key in record.signals:
-            recorded = record.signals[key]
-            rows += zip(recorded.signals, recorded.values.T, *bounds, strict=False)
-    return [
-        f"{signal.name} goes from {np.min(values):.4g} to {np.max(values):.4g} {signal.unit}, "
-        f"its limits are {lower:.4g} and {upper:.4g}"
-        for signal, values, lower, upper in rows
-        if np.min(values) < lower - SLACK or np.max(values) > upper + SLACK
-    ]
+def _label(what: str, signal: Signal) -> str:
+    return f"{what} {signal.name} [{signal.unit}]" if signal.unit else f"{what} {signal.name}"

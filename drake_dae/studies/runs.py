@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
+from drake_dae.analysis.limits import SignalLimits
 from drake_dae.arrays import brief
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import (
@@ -30,10 +31,10 @@ from drake_dae.scenario.parts.parts import Matrices
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.figures import figures_of, margins
+from drake_dae.simulation.limits import ranges_of, robot_limits
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import simulate
-from drake_dae.simulation.summary import Limits
+from drake_dae.simulation.summary import figures_of
 from drake_dae.studies.variations import Variation
 
 
@@ -155,11 +156,14 @@ class Runner:
             return RunResult(Outcome.REFUSED, str(error))
         except Exception as error:  # A sweep of thousands of runs goes on.
             return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
-        rooms = margins(record, Limits.of(loop.plant.robot("a sweep")))
-        figures = figures_of(record, rooms)
+        ranges = ranges_of(_limits(loop), record)
+        figures, exceeded = (
+            figures_of(record, ranges),
+            tuple(r.signal.name for r in ranges if r.excess),
+        )
         if failure is not None:
-            return RunResult(Outcome.FAILED, str(failure), figures, rooms.exceeded)
-        return RunResult(Outcome.FINISHED, "", {**figures, "steps": float(steps)}, rooms.exceeded)
+            return RunResult(Outcome.FAILED, str(failure), figures, exceeded)
+        return RunResult(Outcome.FINISHED, "", {**figures, "steps": float(steps)}, exceeded)
 
     def check(self, variation: Variation) -> None:
         """Checks keys and values of a variation; that it starts is no question here.
@@ -221,6 +225,11 @@ class Runner:
         except SimulationError as error:
             failure = error
         return loop.record(context), steps, failure
+
+
+@lru_cache(maxsize=1)
+def _limits(loop: ClosedLoop) -> SignalLimits:
+    return robot_limits(loop.plant.robot("a sweep"))
 
 
 def _is_about_states(error: BaseException | None) -> bool:

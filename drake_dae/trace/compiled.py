@@ -15,7 +15,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import casadi as ca
 
@@ -49,23 +49,16 @@ SLOWEST = 10.0
 """Under True a compiler that takes this many times longer than expected counts as hanging."""
 
 
-class CompilationAttempt(NamedTuple):
-    """When to try to get machine code, and whether to compile."""
-
-    calls: int
-    make: bool
-
-
-def attempts(compiled: Compiled, operations: int) -> list[CompilationAttempt]:
-    """Returns the attempts to get machine code for a function."""
+def attempts(compiled: Compiled, operations: int) -> list[tuple[int, bool]]:
+    """Returns after how many calls each to look for machine code, and whether to compile then."""
     if compiled != "auto":
-        return [CompilationAttempt(1, True)] if compiled else []
+        return [(1, True)] if compiled else []
     if not operations:
         return []
-    result = [CompilationAttempt(LOOK, False)]
+    result = [(LOOK, False)]
     if level := _level(compiled, operations):
         seconds = STARTING + COMPILING[level] * operations
-        result.append(CompilationAttempt(int(seconds / (INTERPRETED * operations)), True))
+        result.append((int(seconds / (INTERPRETED * operations)), True))
     return result
 
 
@@ -89,9 +82,11 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     if path is None:
         return None
     try:
-        return _load(function.name(), str(path))
-    except MachineCodeError as error:
-        _warn(error, make)
+        return ca.external(function.name(), str(path))
+    except RuntimeError as error:
+        lines = [line for line in str(error).splitlines() if line.strip()] or [""]
+        why = f"compiled code cannot be loaded: {brief(lines[-1])}"
+        _warn(MachineCodeError(why), make)
         return None
 
 
@@ -195,11 +190,3 @@ def _key(source: str, compiler: Compiler, level: str, options: tuple[str, ...]) 
     options_of_build = *FLAGS, *compiler.target, level, *options
     parts = (source, *compiler.command, compiler.identity, *options_of_build)
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
-
-
-def _load(name: str, path: str) -> ca.Function:
-    try:
-        return ca.external(name, path)
-    except RuntimeError as error:
-        lines = [line for line in str(error).splitlines() if line.strip()] or [""]
-        raise MachineCodeError(f"compiled code cannot be loaded: {brief(lines[-1])}") from None

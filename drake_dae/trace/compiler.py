@@ -71,25 +71,13 @@ class Compiler(NamedTuple):
     def compile(
         self, source: str, file: Path, level: str, seconds: float, more: tuple[str, ...] = ()
     ) -> None:
-        """Writes C source to file.c and compiles it to file.so."""
-        code = file.with_suffix(".c")
+        """Writes C source to file.c and compiles it to file.so, by default for this processor."""
+        code, library = file.with_suffix(".c"), file.with_suffix(".so")
         code.write_text(source)
-        target = (*self.target, *more)
-        self.link([code], file.with_suffix(".so"), level, seconds, target)
-
-    def link(
-        self,
-        sources: Sequence[Path],
-        library: Path,
-        level: str,
-        seconds: float,
-        target: Sequence[str] = (),
-    ) -> None:
-        """Compiles sources to one shared library, by default for any processor of this kind."""
-        options = [*FLAGS, *target, level, *map(str, sources), "-o", str(library), "-lm"]
+        options = [*FLAGS, *self.target, *more, level, str(code), "-o", str(library), "-lm"]
         done = _run([*self.command, *options], seconds)
         if done.returncode or not library.exists():
-            raise MachineCodeError(_failure(self.command, done, sources[0].parent))
+            raise MachineCodeError(_failure(self.command, done, file.parent))
 
 
 def _failure(command: Sequence[str], done: "subprocess.CompletedProcess[str]", folder: Path) -> str:
@@ -151,22 +139,17 @@ def _looked_up(named: str) -> Compiler:
         )
     version = _run([*command, "--version"], ANSWERS)
     library = "CS_GNU_LIBC_VERSION" in os.confstr_names and os.confstr("CS_GNU_LIBC_VERSION")
-    target, processor = _native(command)
+    # The option for this processor, and the target that the compiler derives from it. The target is
+    # part of the identity, so that machines with a shared cache each have their own code.
+    target: tuple[str, ...] = ()
+    processor = ""
+    if not any(word.startswith(("-march", "-mcpu")) for word in command):
+        answer = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull], ANSWERS)
+        if answer.returncode == 0:
+            target, processor = (NATIVE,), answer.stdout
     machine = (library, platform.system(), platform.machine(), processor)
     words = (shutil.which(command[0]), version.stdout, version.stderr, *machine)
     return Compiler(tuple(command), repr(words), target)
-
-
-def _native(command: list[str]) -> tuple[tuple[str, ...], str]:
-    """Returns the option for this processor, and the target that the compiler derives from it.
-
-    None if the command chooses a processor, or if the compiler does not know this one. The target
-    is part of the identity, so that machines with a shared cache each have their own code.
-    """
-    if any(word.startswith(("-march", "-mcpu")) for word in command):
-        return (), ""
-    answer = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull], ANSWERS)
-    return ((NATIVE,), answer.stdout) if answer.returncode == 0 else ((), "")
 
 
 def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str]":

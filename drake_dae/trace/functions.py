@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import ModelError
-from drake_dae.trace.compiled import CompilationAttempt, Compiled, attempts, machine_code
+from drake_dae.trace.compiled import Compiled, attempts, machine_code
 
 HUGE = 1e30
 """A number above this, in any unit, means that something grew without bound. Its powers cancel and
@@ -96,7 +96,7 @@ class TracedFunction:
         self._local, self._lock = local(), RLock()
         self._current: ca.Function | None = None  # What calls evaluate; None before the first.
         self._compiled = compiled
-        self._attempts: list[CompilationAttempt] | None = None  # None before the first call.
+        self._attempts: list[tuple[int, bool]] | None = None  # None before the first call.
         self._calls_left = 0
         self.is_machine_code = False
 
@@ -109,7 +109,8 @@ class TracedFunction:
         expressions = self._expressions
         if self._often and not self._lean:
             expressions = ca.cse(expressions)
-        return ca.Function(_identifier(self.name), self._symbols, expressions, {"cse": False})
+        name = re.sub("[^A-Za-z0-9]+", "_", f"f_{self.name}")  # As CasADi accepts them.
+        return ca.Function(name, self._symbols, expressions, {"cse": False})
 
     @property
     def num_operations(self) -> int:
@@ -123,16 +124,16 @@ class TracedFunction:
                 self._attempts = (
                     attempts(self._compiled, self.num_operations) if self._often else []
                 )
-                self._calls_left = self._attempts[0].calls if self._attempts else 0
+                self._calls_left = self._attempts[0][0] if self._attempts else 0
                 self._current = self.function
             if not self._attempts:
                 return
             self._calls_left -= 1
             if self._calls_left > 0:
                 return
-            attempt = self._attempts.pop(0)
-            self._calls_left = self._attempts[0].calls if self._attempts else 0
-            code = machine_code(self.function, self._compiled, attempt.make)
+            _, make = self._attempts.pop(0)
+            self._calls_left = self._attempts[0][0] if self._attempts else 0
+            code = machine_code(self.function, self._compiled, make)
             if code is not None:
                 self._attempts.clear()
                 self._current, self.is_machine_code = code, True
@@ -278,8 +279,3 @@ def _fits(argument: Any, size: int) -> bool:
     """Whether an argument is an array of floats of the shape of an input, as most are."""
     is_array = type(argument) is np.ndarray
     return is_array and argument.dtype == np.float64 and argument.shape == (size,)
-
-
-def _identifier(name: str) -> str:
-    """Returns a name that CasADi accepts: letters, digits and single underscores."""
-    return re.sub("[^A-Za-z0-9]+", "_", f"f_{name}")

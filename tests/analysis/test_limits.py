@@ -8,13 +8,14 @@ from numpy.testing import assert_allclose
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from drake_dae import ConstantReference, DaeSystem, SinusoidReference, ZeroDynamics, load_scenario
-from drake_dae.analysis.limits import SignalLimits, limits_along
+from drake_dae.analysis.limits import LimitKind, SignalLimits, limits_along
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import build_scenario
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
-from drake_dae.scenario.feasibility.limits import limits_of_run, robot_limits
+from drake_dae.scenario.judging import find_feasibility, judge_run
+from drake_dae.simulation.judgement import FindingKind
+from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.simulate import simulate
 from drake_dae.systems.control.references import ReferenceGenerator
 
@@ -126,7 +127,8 @@ def test_a_force_that_would_pull_on_a_hump():
         nominal_state=np.array([0.1, 0.49, 0.0, 0.0]),
     )
     symbols, bounds = (ca.SX.sym("u"), force), np.array([[0.0], [np.inf]])
-    limits = SignalLimits(system, [Signal("force", "N")], force, bounds, symbols)
+    kinds = [LimitKind.FORCE]
+    limits = SignalLimits(system, [Signal("force", "N")], kinds, force, bounds, symbols)
     references = [SinusoidReference(0.0, amplitude, frequency)]
     found, _ = judged(find_structure(system), limits, references, [0.0, radius, 0.0, 0.0])
     angle = amplitude * np.sin(frequency * TIMES)
@@ -184,9 +186,10 @@ def test_a_friction_cone_of_a_scenario(tray):
 
     loop, context = build_scenario(scenario)
     simulate(loop.diagram, context, 2.0)
-    (said,) = limits_of_run(loop, loop.record(context), scenario.judgement.friction_cones)
-    assert "grip.fz" in said
-    assert f"{1.0 / found.rate:.4g} times slower" in said
+    run = judge_run(scenario, loop, context, loop.record(context))
+    said = [one for one in run.judgement.findings if one.kind is FindingKind.LIMIT]
+    assert [one.signal.name for one in said] == ["the friction cone of grip.fz"]
+    assert f"{1.0 / found.rate:.4g} times slower" in run.look_next[0]
 
 
 def test_a_cone_of_a_force_that_is_not_there_is_refused(tray):
@@ -207,7 +210,8 @@ def test_slower_references_are_not_examined_beside_zero_dynamics():
         m=ca.SX(1, 0),
     )
     symbols, bounds = (ca.SX.sym("u"), force), np.array([[-1.0], [1.0]])
-    limits = SignalLimits(system, [Signal("speed", "m/s")], x[2], bounds, symbols)
+    kinds = [LimitKind.SPEED]
+    limits = SignalLimits(system, [Signal("speed", "m/s")], kinds, x[2], bounds, symbols)
     references = [SinusoidReference(0.0, 1.0, 2.0)]
     found, _ = judged(find_structure(system), limits, references, np.zeros(4))
     assert_allclose(found.excess.value, 2.0, rtol=1e-3)

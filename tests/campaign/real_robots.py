@@ -155,7 +155,7 @@ def outcome(file: Path, surface: str, settings: list[str], limit: float) -> tupl
             process.join()
             return "hang", f"no end within {limit:g} s"
         text = out.read_text(errors="replace")
-        verdict = re.search(r"^(Tracked as predicted|Not .*|The run .*)", text, re.MULTILINE)
+        verdict = re.search(r"^(GOOD|BAD|UNDECIDED).*", text, re.MULTILINE)
         if process.exitcode == 0:
             return "ran", verdict[0] if verdict else text[-200:]
         return ("refused" if "Traceback" not in text else "raw"), " ".join(text.split())[-600:]
@@ -168,7 +168,7 @@ def main() -> int:
     parser.add_argument("--set", dest="settings", action="append", default=[])
     parser.add_argument("--limit", type=float, default=300.0, help="s for one run")
     given = parser.parse_args()
-    import drake_dae.scenario.new.new_scenario  # noqa: F401  Once, before the forks.
+    import drake_dae.scenario.new  # noqa: F401  Once, before the forks.
 
     counts, raw = {surface: 0 for surface in given.surfaces}, 0
     robots = whole = 0

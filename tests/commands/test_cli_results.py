@@ -54,8 +54,9 @@ def test_a_run_that_missed_its_task_is_reported_by_code_and_json(reason, tmp_pat
     run = ["simulate", "two_link_wall", "--json", *BARE, *MISSED[reason]]
     code, found = told([*run, "--check", f"--out={tmp_path / 'one'}"], capsys)
     assert (code, found["missed"]) == (2, True)
-    assert found["tracking"] == ("as_predicted" if reason == "a contact that pulls" else "off")
-    assert found["job"]["outcome"] == "bad"
+    assert found["outcome"] == "bad"
+    kinds = {one["kind"] for one in found["findings"]}
+    assert ("prediction" in kinds) is (reason != "a contact that pulls")
     # Whoever does not ask gets 0 for a run that came to its end.
     code, again = told([*run, f"--out={tmp_path / 'two'}"], capsys)
     assert (code, again["missed"]) == (0, True)
@@ -66,13 +67,13 @@ def test_a_good_run_is_reported_with_figures_and_files(tmp_path, capsys):
     code, found = told(arguments, capsys)
     assert code == 0
     assert found["folder"] == str(tmp_path)
-    assert (found["missed"], found["tracking"]) == (False, "as_predicted")
-    assert found["job"]["problems"] == []
+    assert (found["missed"], found["outcome"]) == (False, "good")
     assert sorted(found["files"]) == sorted(path.name for path in tmp_path.iterdir())
     record = Record.load(tmp_path / "record.npz")
     assert found["simulated_time"] == pytest.approx(record.time[-1])
-    assert found["worst_output"] in [s.name for s in record.signals["tracking_error"].signals]
-    assert 0.0 <= found["off_prediction"] < 1e-6
+    outputs = {one["name"]: one for one in found["outputs"]}
+    assert [*outputs] == [s.name for s in record.signals["tracking_error"].signals]
+    assert 0.0 <= max(one["off_prediction"] for one in outputs.values()) < 1e-6
 
 
 @pytest.mark.slow

@@ -4,12 +4,11 @@ import pytest
 from problems import PROBLEMS, changed
 from runs import some
 
-from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.derivatives import Derivatives, lie_derivative
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.lie import lie_derivative
 
 
 def motion_of(system: DaeSystem) -> Derivatives:

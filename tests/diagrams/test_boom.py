@@ -11,7 +11,7 @@ from drake_dae import (
     build_scenario,
 )
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 
 NAME = "boom"
 HINGE, FOOT, LUG, DAMPING = np.array([0.0, 0.8]), np.array([0.3, 0.0]), 0.7, 40.0

@@ -8,7 +8,7 @@ from recordings import animation
 
 from drake_dae import build_scenario, load_scenario, make_animation, simulate
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.shipped import find_scenario
 
 NAME = "seven_joint_moving_plate"

@@ -12,9 +12,9 @@ from drake_dae import complete_scenario, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation.remarks import surface_remarks
 from drake_dae.trace.functions import TracedFunction
 
 SHORT = ["duration=0.3", "integrator.max_step_size=0.005", "integrator.use_error_control=false"]
@@ -109,8 +109,9 @@ def test_where_the_robot_leaves_the_data_is_reported(tmp_path):
     file = json.dumps(str(tmp_path / "bump.csv"))
     place = PLACE.replace("[0.8, 0.8]", "[0.8, 0.08]")
     surface = f"constraints.0.surface=!MeasuredSurface {{file: {file}, {place}, scale: 0.01}}"
-    loop, _, record = run_scenario(scenario("two_link_wall", surface, *SHORT, "duration=0.02"))
-    _, told = surface_remarks(loop.plant.model, record)
+    case = scenario("two_link_wall", surface, *SHORT, "duration=0.02")
+    loop, context, record = run_scenario(case)
+    _, told = judge_run(case, loop, context, record).notes
     assert "wall: the robot is beyond the edge of the data by up to 1" in told
     assert "1 mm, first at 0 s; there the surface continues as a plane" in told
 

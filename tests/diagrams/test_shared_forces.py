@@ -5,8 +5,9 @@ import pytest
 from runs import run_scenario, scenario
 
 from drake_dae import build_scenario, load_scenario
+from drake_dae.analysis.limits import LimitKind
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.shipped import find_scenario
 
 WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"
@@ -48,8 +49,8 @@ def test_walls_with_friction_share_their_force_and_their_friction():
 
 def test_what_is_foreseen_is_what_all_constraints_bear():
     foreseen = find_feasibility(scenario("two_link_wall", *TWICE, "compliances={}"))
-    assert [r.signal.name for r in foreseen.constraint_forces] == ["wall.force", "board.force"]
-    wall, board = foreseen.constraint_forces
+    assert [r.signal.name for r in foreseen.of(LimitKind.FORCE)] == ["wall.force", "board.force"]
+    wall, board = foreseen.of(LimitKind.FORCE)
     assert wall.least == pytest.approx(board.least, rel=1e-12)
     assert 7.0 < wall.least < 13.0
 

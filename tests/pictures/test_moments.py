@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from arms import arm
 from runs import scenario
 
 from drake_dae.dae.system.signals import Signal
@@ -13,9 +14,9 @@ from drake_dae.pictures.plots import plot_controls
 from drake_dae.pictures.scene.friction import friction_cones, slips
 from drake_dae.pictures.scene.run_motion import follow
 from drake_dae.scenario.build import build_scenario
+from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.records.record import Record, Recorded
 from drake_dae.simulation.simulate import simulate
-from drake_dae.simulation.summary import Limits
 
 TIMES = np.linspace(0.0, 10.0, 101)
 
@@ -32,18 +33,19 @@ def record(**signals):
 
 
 def test_a_control_and_a_joint_at_their_limits_are_marked_where_they_come_there():
-    control = np.clip(20.0 * np.sin(TIMES), -15.0, 15.0)  # At 15 first from asin(0.75) on.
-    joint = np.minimum(TIMES, 4.0)
-    limits = Limits(np.array([15.0]), (np.array([-1.0]), np.array([4.0])))
-    found = events_of(record(control=control, state=joint), limits)
+    model = arm("two_link").model  # Its drives have 300 and 120 N m, its first joint 3.1416 rad.
+    control, state = np.zeros((101, 2)), np.zeros((101, 4))
+    control[:, 0] = np.clip(400.0 * np.sin(TIMES), -300.0, 300.0)  # First from asin(0.75) on.
+    state[:, 0] = np.minimum(TIMES, 3.1416)
+    found = events_of(record(control=control, state=state), robot_limits(model))
     assert {one.kind for one in found} == {RunEventKind.LIMIT}
-    drive = [one.time for one in found if "control0" in one.text]
+    drive = [one.time for one in found if "joint1_motor" in one.text]
     wanted = [np.arcsin(0.75) + k * np.pi for k in range(4)]
     np.testing.assert_allclose(drive, wanted[: len(drive)], atol=0.1)  # The rows are 0.1 s apart.
     assert len(drive) >= 3
-    (stop,) = [one for one in found if "state0" in one.text]
-    assert stop.time == pytest.approx(4.0)
-    assert events_of(record(control=control, state=joint)) == []
+    (stop,) = [one for one in found if "joint1 " in one.text]
+    assert stop.time == pytest.approx(3.2)
+    assert events_of(record(control=control, state=state)) == []
 
 
 def test_compliant_contact_touches_and_opens_where_its_force_begins_and_ends():

@@ -18,7 +18,7 @@ from drake_dae import (
 )
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.links_behind import links_behind
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 
 BASE, LENGTH, RADIUS, JOINTS = 0.3, 0.5, 0.06, 4
 TABLE = Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])

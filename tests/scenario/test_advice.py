@@ -20,8 +20,8 @@ from drake_dae.scenario import plants
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sensed import sensed_contact
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.scenario import Scenario

@@ -6,9 +6,10 @@ from pydrake.geometry import SceneGraph
 from runs import run_scenario, scenario_validator, untagged
 
 from drake_dae import build_scenario, load_scenario
+from drake_dae.analysis.limits import LimitKind
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
 from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import find_scenario
 
@@ -286,7 +287,7 @@ def test_a_cart_can_be_analyzed(tmp_path):
     scenario = load_scenario(scenario_file(tmp_path, ROLL, CART))
     report = find_feasibility(scenario)
     assert report.analysis.structure.constraint_degrees == (1, 1, 1)
-    assert len(report.constraint_forces) == 3
+    assert len(report.of(LimitKind.FORCE)) == 3
 
 
 @pytest.mark.slow

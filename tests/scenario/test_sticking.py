@@ -12,7 +12,7 @@ from runs import run, scenario
 from drake_dae import shipped_model
 from drake_dae.scenario.advice.sticking import sticking_before, sticking_note
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario

@@ -13,8 +13,8 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
-from drake_dae.simulation.divergence import RecordWatch
-from drake_dae.simulation.growth import ErrorGrowth
+from drake_dae.simulation.divergence import DivergenceWatch
+from drake_dae.simulation.records.record import Record, Recorded
 from drake_dae.simulation.simulate import simulate
 from tests.support.runs import scenario
 
@@ -211,33 +211,36 @@ def test_a_control_that_leaves_all_measure_ends_a_run_whose_errors_are_small():
     record = loop.record(context)
     assert np.max(np.abs(record["tracking_error"])) < 10.0
     with pytest.raises(SimulationError, match="u0") as caught:
-        RecordWatch(loop.plant, duration).look(record, is_last=True)
+        DivergenceWatch(loop.plant, duration).look(record, is_last=True)
     first = np.argmax(np.abs(record["control"]) > 1e9)
     assert caught.value.time == record.time[first]
     # Before, a run ends by itself, and tells why.
-    RecordWatch(loop.plant, duration).look(record)
+    DivergenceWatch(loop.plant, duration).look(record)
 
 
-def test_many_rows_at_once_leave_the_means_of_rows_one_by_one():
+def test_many_rows_at_once_end_where_rows_one_by_one_do():
     """Errors up to 50 sizes, which are no divergence, and then a part that diverges."""
     random, signals = np.random.default_rng(0), [Signal("tool.z", "m"), Signal("wall.force", "N")]
     times = np.cumsum(random.uniform(0.001, 0.01, 400))
     errors = np.exp(random.uniform(-2.0, np.log(50.0), (400, 2)))
     errors[:, 1] *= times < 1.0
     errors[300:] *= 40.0
-
-    def growth():
-        return ErrorGrowth(signals, 0.0, 0.05, {"m": 1.0, "N": 1.0}, {})
+    errors[0] = 1.0
+    plant = DaePlant(DaeSystem.from_functions(["a"], f=lambda x: [0], h=lambda x: [1]))
 
     def ends(parts):
-        watch, states = growth(), np.zeros((400, 1))
+        watch = DivergenceWatch(plant, 5.0)
         for part in parts:
-            error = watch.look(times[part], errors[part], np.zeros_like(errors)[part], states[part])
-            if error is not None:
-                return str(error)
-        return ""
+            rows = {"controlled_output": errors[part], "desired_output": 0.0 * errors[part]}
+            rows = {name: Recorded(values, tuple(signals)) for name, values in rows.items()}
+            rows["state"] = Recorded(0.0 * errors[part][:, :1], plant.dae.state_signals)
+            try:
+                watch.look(Record(times[part], rows))
+            except SimulationError as error:
+                return error
+        return None
 
-    rows = [slice(i, i + 1) for i in range(400)]
     together = ends([slice(0, 300), slice(300, 400)])
-    assert "tool.z" in together
-    assert ends(rows) == together
+    assert "tool.z" in str(together)
+    assert times[300] <= together.time
+    assert str(ends([slice(i, i + 1) for i in range(400)])) == str(together)

@@ -10,8 +10,8 @@ from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import read_scenario, scenario_data
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.figures import figures_of, margins
-from drake_dae.simulation.summary import Limits
+from drake_dae.simulation.limits import ranges_of, robot_limits
+from drake_dae.simulation.summary import figures_of
 from drake_dae.studies.runs import Outcome, Runner, structure_of
 
 SHORT = ("duration=0.3", "compiled=false", "integrator.accuracy=1e-6")
@@ -36,7 +36,7 @@ def alone(base, changes):
     """The figures of a variation in a closed loop of its own."""
     chosen = read_scenario(varied_data(base, changes))
     loop, _, record = run_scenario(chosen)
-    return figures_of(record, margins(record, Limits.of(loop.plant.model)))
+    return figures_of(record, ranges_of(robot_limits(loop.plant.model), record))
 
 
 def check(base, changes, result, tolerance=0.0):
@@ -234,7 +234,7 @@ def test_a_rollout_is_that_of_the_scenario_alone():
     rolled = for_rollout(read_scenario(varied_data(scenario_data(chosen), {"plant.friction": 0.2})))
     loop, _ = build_scenario(rolled[0])
     rollout = roll_scenario(rolled[0], loop, start_scenario(rolled[0], loop))
-    wanted = figures_of(rollout.record, margins(rollout.record, Limits.of(loop.plant.model)))
+    wanted = figures_of(rollout.record, ranges_of(robot_limits(loop.plant.model), rollout.record))
     assert result.figures == {**wanted, "steps": float(rollout.steps)}
 
 

@@ -5,12 +5,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from textwrap import fill
 
 from pydrake.systems.framework import Context
 
 from drake_dae.commands.run.folder import ANIMATION, PART, RECORD, stage
-from drake_dae.commands.run.report import RunReport
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, describe_os_error
 from drake_dae.pictures.animation import animate
@@ -19,10 +17,11 @@ from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.scene.friction import slips
 from drake_dae.pictures.scene.run_motion import contact_paths, follow
 from drake_dae.scenario.parts.parts import Write
+from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record, Recorded
 from drake_dae.simulation.records.record_writer import RecordWriter
-from drake_dae.simulation.summary import WIDTH
+from drake_dae.simulation.summary import RunSummary
 
 
 class RunFiles:
@@ -39,14 +38,16 @@ class RunFiles:
         self.folder = folder
         self.problems: list[str] = []
 
-    def write_record(self, report: RunReport, writer: RecordWriter, context: Context) -> None:
+    def write_record(
+        self, record: Record, loop: ClosedLoop, writer: RecordWriter, context: Context
+    ) -> None:
         """Writes the record with the predicted error, in place of the one written in the run."""
-        signals = report.record.signals["tracking_error"].signals
-        more = {**report.record.signals, "predicted_error": Recorded(report.predicted, signals)}
+        predicted = loop.predicted_error(record), record.signals["tracking_error"].signals
+        more = {**record.signals, "predicted_error": Recorded(*predicted)}
         with self.collected():
             try:
                 with stage(self.folder, RECORD) as temporary:
-                    whole = replace(report.record, signals=more, about=writer.about)
+                    whole = replace(record, signals=more, about=writer.about)
                     whole.save(temporary / RECORD)
             except OSError as error:
                 with suppress(OSError):
@@ -58,31 +59,30 @@ class RunFiles:
                 raise
             writer.path.unlink(missing_ok=True)
 
-    def write_summary(self, report: RunReport, *notes: str) -> None:
-        """Writes the verdict, the summary and some notes into summary.txt."""
-        name, verdict = "summary.txt", fill(str(report.job), WIDTH)
+    def write_summary(self, summary: RunSummary, *notes: str) -> None:
+        """Writes the summary and some notes into summary.txt."""
+        name = "summary.txt"
         with self.collected(), stage(self.folder, name) as temporary:
-            text = "\n".join([verdict, "", report.text, *notes, ""])
+            text = "\n".join([summary.text, *notes, ""])
             (temporary / name).write_text(text, encoding="utf-8")
 
     def write_pictures(
-        self, report: RunReport, loop: ClosedLoop, context: Context, wanted: Write, title: str = ""
+        self, run: RunSummary, loop: ClosedLoop, context: Context, wanted: Write, title: str = ""
     ) -> None:
         """Writes the plots and the animation."""
-        record, limits = report.record, report.limits
+        record = run.record
         if not (wanted.plots or wanted.animation):
             return
-        motion = None if loop.plant.model is None else follow(loop, record, context)
-        events = events_of(record, limits)
-        if motion is not None:
-            events = sorted_events(record, [*events, *slips(motion)])
+        model, motion = loop.plant.robot("pictures"), follow(loop, record, context)
+        events = [*events_of(record, robot_limits(model)), *slips(motion)]
+        events = sorted_events(record, events)
         if wanted.plots:
-            paths = [] if motion is None else contact_paths(motion)
+            paths = contact_paths(motion)
             plots = [name for name in PLOTS if paths or name != PATHS]
             with self.collected(), stage(self.folder, *plots) as temporary, _frozen():
-                plotted = record, report.predicted, limits.control
-                save_plots(*plotted, temporary, paths, report.accuracy, events)
-        if wanted.animation and motion is not None:
+                plotted = record, loop.predicted_error(record), model.control_limits
+                save_plots(*plotted, temporary, paths, run.accuracy, events)
+        if wanted.animation:
             with self.collected(), stage(self.folder, ANIMATION) as temporary:
                 page = animate(motion, loop.scene_graph, title, phase_spans(record), events)
                 (temporary / ANIMATION).write_text(page, encoding="utf-8")

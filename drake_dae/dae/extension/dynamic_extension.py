@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
+from drake_dae.dae.derivatives import lie_derivative
 from drake_dae.dae.extension.extension import Extension, integrated, nominal_controls, refuse_metric
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples, spread_of
@@ -29,7 +30,6 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import Factorization
-from drake_dae.trace.lie import lie_derivative
 from drake_dae.trace.round_off import multiply, positive
 
 

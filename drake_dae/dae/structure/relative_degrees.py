@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
-from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.family import VISIBLE, Deciding, Family
@@ -27,7 +27,6 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import NegligibleWarning
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.lie import lie_derivative, lie_derivative_along
 from drake_dae.trace.round_off import Sized, multiply
 
 MANY = 10

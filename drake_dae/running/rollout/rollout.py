@@ -193,7 +193,7 @@ def _calls_per_second(program: RolloutProgram, settings: Settings) -> float:
 def _pays(program: RolloutProgram, choice: Compiled, calls: float) -> bool:
     """Whether machine code pays that saves so many interpreted evaluations."""
     tries = attempts("auto", program.num_operations)
-    return choice is True or any(each.make and calls >= each.calls for each in tries)
+    return choice is True or any(makes and calls >= least for least, makes in tries)
 
 
 def _machine_code(

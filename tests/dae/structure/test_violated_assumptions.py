@@ -15,14 +15,13 @@ from problems import (
 )
 from problems.found import degrees, untidy_one, violation
 
-from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.derivatives import Derivatives, lie_derivative
 from drake_dae.dae.structure import relative_degrees
 from drake_dae.dae.structure.assumptions import ViolationKind
 from drake_dae.dae.structure.structure import examine_structure, find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.lie import lie_derivative
 
 
 def test_1_a_degree_that_is_not_defined_at_the_nominal_state():

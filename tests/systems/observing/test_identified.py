@@ -33,7 +33,7 @@ from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.feasibility.feasibility import find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import FOLDER
 

@@ -1,7 +1,7 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.trace.lie import lie_derivative, lie_derivative_along
+from drake_dae.dae.derivatives import lie_derivative, lie_derivative_along
 
 N = 4
 X = ca.SX.sym("x", N)

@@ -1,0 +1,460 @@
+"""Judges a scenario: before its run, along its references; and after it, by its record."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.systems.framework import Context
+
+from drake_dae.analysis.analyze import along, analyze, examine
+from drake_dae.analysis.limits import (
+    LimitKind,
+    LimitsAlong,
+    SignalLimits,
+    SignalRange,
+    limits_along,
+)
+from drake_dae.analysis.report import Analysis
+from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system.signals import Signal
+from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import AssumptionError, ScenarioError
+from drake_dae.references import Reference
+from drake_dae.references.reference import common_period, stack_references
+from drake_dae.robots.constraints import Constraint
+from drake_dae.robots.links_behind import LinkBehind, links_behind
+from drake_dae.robots.model import RobotModel
+from drake_dae.scenario.advice.advice import advised
+from drake_dae.scenario.advice.sticking import sticking_note
+from drake_dae.scenario.build import tracking_law
+from drake_dae.scenario.controllers.task_controller import check_task
+from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
+from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
+from drake_dae.scenario.robot_file.links import RobotLinks
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.simulation.judgement import FindingKind, Outcome, RunFinding, judge
+from drake_dae.simulation.limits import ranges_of, robot_limits
+from drake_dae.simulation.records.record import Record
+from drake_dae.simulation.simulate import RunStatistics
+from drake_dae.simulation.summary import RunSummary
+from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.trace.functions import TracedFunction
+
+SAMPLES, MOST_SAMPLES = 1001, 20_000
+"""The smallest number of examined times along a reference, and the largest along a fast one."""
+
+STRAIGHT, SHORTEST = 0.01, 1e-6
+"""The allowed deviation of a reference from linear interpolation between two times, relative to its
+range; and the shortest interval that is divided, relative to the whole."""
+
+MOST_TIMES = 2000
+"""The most times of a record at which its references are examined."""
+
+WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
+"""The remedy for a link behind a surface."""
+
+AT_ONCE, AWAY = 0.1, 1e-3
+"""A touch within this time of the start of its phase, in s, and as far before the surface, in m, is
+none: a tool does not come that far."""
+
+
+@dataclass(frozen=True, eq=False)
+class Feasibility:
+    """The analysis of a scenario's robot, and the requirements of its reference.
+
+    All numbers are those of the law's model without errors: the minimum requirements.
+
+    Attributes:
+        analysis: The result of `analyze`, around the start and along the reference.
+        duration: The duration of the scenario, in s.
+        ranges: Controls, joint forces, positions and speeds of joints, and constraint forces.
+        is_resolved: Whether the times resolve the reference; otherwise values between them are not
+            known.
+        behind: Links that move behind a contact surface.
+        sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
+        gains: Why no gains can be computed where they are left out, else empty.
+        slowing: How much slower the references keep all limits; None where they keep them.
+    """
+
+    analysis: Analysis
+    duration: float
+    ranges: tuple[SignalRange, ...] = ()
+    is_resolved: bool = True
+    behind: tuple[LinkBehind, ...] = ()
+    sticking: str = ""
+    gains: str = ""
+    slowing: LimitsAlong | None = None
+
+    def of(self, *kinds: LimitKind) -> tuple[SignalRange, ...]:
+        """The ranges of some kinds; of joints only those with limits."""
+        joints = (LimitKind.POSITION, LimitKind.SPEED)
+        return tuple(
+            r
+            for r in self.ranges
+            if r.kind in kinds and (r.kind not in joints or np.isfinite([r.low, r.high]).any())
+        )
+
+    @property
+    def wrong_sides(self) -> tuple[str, ...]:
+        """The problems with links behind a surface."""
+        return tuple(f"{link}: {WRONG_SIDE}" for link in self.behind)
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """The problems, one text each; empty if there are none."""
+        found = [*self.analysis.problems, *(str(r.excess) for r in self.ranges if r.excess)]
+        found += [*self.wrong_sides, *filter(None, [self.gains])]
+        if self.slowing is not None:
+            found.append(f"most of all {self.slowing.excess}; {self.slowing.remedy}")
+        return tuple(found)
+
+    def __repr__(self) -> str:
+        text = count_of(len(self.problems), "problem") if self.problems else "no problem found"
+        return f"Feasibility('{self.analysis.system.name}': {text})"
+
+    def __str__(self) -> str:
+        return to_text(self._parts())
+
+    def to_markdown(self) -> str:
+        """The report with Markdown tables."""
+        return to_markdown(self._parts())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as plain numbers, lists and texts."""
+        groups = {
+            "controls": self.of(LimitKind.CONTROL),
+            "joint_forces": self.of(LimitKind.EFFORT),
+            "constraint_forces": self.of(LimitKind.FORCE),
+            "joints": self.of(LimitKind.POSITION, LimitKind.SPEED),
+        }
+        return {
+            "analysis": self.analysis.to_dict(),
+            "duration": self.duration,
+            "resolved": self.is_resolved,
+            **{key: [r.to_dict() for r in ranges] for key, ranges in groups.items()},
+            "behind": [asdict(link) for link in self.behind],
+            "sticking": self.sticking,
+            "slowing": None if self.slowing is None else asdict(self.slowing),
+            "problems": list(self.problems),
+        }
+
+    def _parts(self) -> list[Part]:
+        rows = []
+        for r in self.of(*LimitKind):
+            limits = f"{r.low:.4g} to {r.high:.4g}" if r.low != -r.high else f"{r.high:.4g}"
+            limits = "pushes only" if r.kind is LimitKind.FORCE and r.low == 0.0 else limits
+            limits = "none" if np.isinf([r.low, r.high]).all() else limits
+            # The extremes of a constant are round-off, and have no times.
+            moves = r.largest - r.least > 1e-9 * max(abs(r.least), abs(r.largest))
+            times = (f"{t:.4g} s" if moves else "" for t in (r.least_time, r.largest_time))
+            (low, high), left = times, r.beyond_time
+            remark = "" if left is None else f"left at {left:.4g} s"
+            row = [digits(r.least), low, digits(r.largest), high, limits, remark]
+            rows.append([r.signal.name, r.signal.unit or "1", *row])
+        parts = list(self.analysis.parts())
+        if rows:
+            head = ["needed along the reference", "unit", "least", "at", "largest", "at", "limit"]
+            parts.append(Table([*head, ""], rows, left=2))
+        motion = self.analysis.motion
+        if motion is not None and motion.times.size:
+            text = f"Started without errors, and examined at {motion.times.size} times."
+            if not self.is_resolved:
+                text += (
+                    " The reference varies too fast for these: what lies between them is not "
+                    "known. A shorter duration takes them closer together."
+                )
+            parts.append([text])
+        if self.sticking:
+            parts.append([self.sticking])
+        parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])
+        return parts
+
+
+def find_feasibility(scenario: Scenario) -> Feasibility:
+    """Analyzes the robot of a scenario, and what its reference requires of drives and joints.
+
+    All numbers are those of the law's model without errors: the minimum requirements.
+
+    Args:
+        scenario: A scenario, as `load_scenario` returns it.
+
+    Raises:
+        ScenarioError: The scenario is not valid; the message names the key. A violated assumption
+            is no error: the analysis reports it.
+    """
+    return complete_and_examine(scenario, SceneGraph())[1]
+
+
+def complete_and_examine(
+    scenario: Scenario, scene_graph: SceneGraph, robot: RobotLinks | None = None
+) -> tuple[Scenario, Feasibility]:
+    """Returns a scenario with what `complete_scenario` adds, and what `find_feasibility` finds.
+
+    Args:
+        scenario: The scenario.
+        scene_graph: The scene graph of the robot's geometry.
+        robot: What `robot_links` made of the robot with this scene graph; None to read it.
+
+    Raises:
+        ScenarioError: As for `find_feasibility`.
+    """
+    if scenario.task is not None:
+        check_task(scenario)
+    completed, model, _ = completed_model(scenario, scene_graph, drawn=False, robot=robot)
+    return completed.scenario, _feasibility(completed.scenario, model)
+
+
+def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
+    """The feasibility of a completed scenario with its model."""
+    examined = None
+    try:
+        if scenario.task is None:
+            examined = examine_scenario(model)
+        if examined is None or examined.structure is None or examined.problems:
+            structure = scenario_structure(model)
+        else:
+            structure = examined.structure
+    except AssumptionError:
+        return Feasibility(analyze(model.dae), scenario.duration)
+    gains, law = "", None
+    try:
+        law = tracking_law(advised(scenario, model, structure).scenario, model, structure)
+    except ScenarioError as error:
+        if not scenario.is_advised:
+            raise
+        gains = str(error)
+    if scenario.task is not None:
+        return Feasibility(analyze(model.dae), scenario.duration, gains=gains)
+    reference, start = reference_and_start(scenario, model, structure)
+    degrees = None if law is None or scenario.estimator is not None else law.exogenous_degrees
+    exogenous = exogenous_references(scenario, model.dae, degrees)
+    names = [signal.name for signal in model.dae.output_signals]
+    outputs = references_of(scenario, names, structure.layout.reference_degrees)
+    period = common_period([r.repeats for r in (*outputs, *exogenous)])
+    moving = stack_references(exogenous, [1] * sum(r.size for r in exogenous))
+
+    def signals(time: float) -> FloatArray:
+        return np.concatenate([reference(time), moving(time)] if exogenous else [reference(time)])
+
+    begin = scenario.integrator.start_time
+    times, is_resolved = sample_times(signals, begin, begin + scenario.duration)
+    analysis = along(
+        examined or examine(model.dae), reference, times, start, period or None, exogenous
+    )
+    motion = analysis.motion
+    if motion is None or not motion.times.size:
+        return Feasibility(analysis, scenario.duration, is_resolved=is_resolved, gains=gains)
+    with at("judgement.friction_cones"):
+        limits = robot_limits(model, scenario.judgement.friction_cones)
+    rows = zip(
+        motion.states, motion.controls, _forces(model.dae, motion), motion.parameters, strict=True
+    )
+    values = np.array([limits.values(*row)[0].copy() for row in rows])
+    slowing = None
+    if analysis.structure is not None:
+        slowing = limits_along(analysis.structure, limits, reference, motion)
+    return Feasibility(
+        analysis,
+        scenario.duration,
+        limits.ranges(motion.times, values),
+        is_resolved,
+        links_behind(model, motion.times, motion.states, motion.parameters),
+        sticking_note(scenario, model, motion.states, motion.constraint_inputs),
+        gains,
+        slowing,
+    )
+
+
+def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
+    """All constraint forces at each state, shape (k, M), as `constraint_force` of a plant."""
+    if dae.sharing is None:
+        return motion.constraint_inputs
+    v = ca.SX.sym("v", dae.num_constraints)
+    function = dae.trace("shared forces", {"forces": dae.forces(v)}, {"v": v})
+    pairs = zip(motion.states, motion.constraint_inputs, strict=True)
+    return np.array([function(x, v_at, dae.parameter_values)[0] for x, v_at in pairs])
+
+
+def sample_times(
+    reference: Callable[[float], FloatArray], begin: float, end: float
+) -> tuple[FloatArray, bool]:
+    """Sample times between which a reference is nearly linear.
+
+    Equidistant times would miss a sinusoid whose period is the interval. Each interval is tested at
+    a random time and divided if the reference is not linear there, until no interval is divided.
+
+    Args:
+        reference: The function t -> R(t).
+        begin, end: The first and the last time, in s.
+
+    Returns:
+        From SAMPLES to MOST_SAMPLES increasing times in s, and whether these suffice.
+    """
+    random = np.random.default_rng(0)
+    times = np.linspace(begin, end, SAMPLES)
+    values = np.array([reference(time) for time in times])
+    while True:
+        share = random.uniform(0.3, 0.7, times.size - 1)
+        tried = times[:-1] + share * np.diff(times)
+        new_values = np.array([reference(time) for time in tried])
+        all_values = np.concatenate([values, new_values])
+        # A constant varies by round-off.
+        allowed = STRAIGHT * np.ptp(all_values, axis=0) + 1e-9 * np.abs(all_values).max(axis=0)
+        off = np.abs(new_values - values[:-1] - share[:, None] * np.diff(values, axis=0))
+        # At a jump of the derivative no division suffices.
+        is_long = np.diff(times) > SHORTEST * (end - begin)
+        new = np.flatnonzero(np.any(off > allowed, axis=1) & is_long)
+        room = MOST_SAMPLES - times.size
+        is_resolved = new.size <= room
+        if not is_resolved:
+            new = np.sort(random.choice(new, room, replace=False))
+        times = np.insert(times, new + 1, tried[new])
+        values = np.insert(values, new + 1, new_values[new], axis=0)
+        if not (new.size and is_resolved):
+            return times, is_resolved
+
+
+def judge_run(
+    scenario: Scenario,
+    loop: ClosedLoop,
+    context: Context,
+    record: Record,
+    statistics: RunStatistics | None = None,
+    failure: str = "",
+) -> RunSummary:
+    """Judges a run by its record.
+
+    Args:
+        scenario: The completed scenario.
+        loop: The loop that ran.
+        context: The context of the loop at the end of the run.
+        record: The record of the run, of at least one time.
+        statistics: The statistics of the run; None for a failed run, or one of an earlier time.
+        failure: Why it ended early; empty if it did not.
+    """
+    model, changes = loop.plant.robot("a scenario"), loop.changes(context)
+    limits = robot_limits(model, scenario.judgement.friction_cones)
+    ranges, own = ranges_of(limits, record), loop.plant_parameters(record, context)
+    behind = []
+    for link in links_behind(model, record.time, record["state"], own):
+        numbers = Signal(link.link, "m"), link.depth, 0.0, link.time
+        behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
+    is_paced = any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
+    remedies = _slower(loop, model, limits, record) if is_paced else []
+    notes = [constraint.remark for constraint in model.constraints]
+    notes += [_beyond_edge(constraint, model, record) for constraint in model.constraints]
+    notes += _remarks([scenario.references, scenario.exogenous, scenario.task])
+    notes += _early_touches(changes)
+    ended = failure
+    if statistics is not None:
+        ended = ended or "interrupted" * (statistics.interrupted is not None)
+        left = scenario.duration - statistics.simulated_time
+        early = left > 1e-9 * scenario.duration and not ended
+        notes += [f"the task stopped the run {left:.4g} s early"] * early
+    config = scenario.integrator
+    fixed = loop.plant.time_step or not config.use_error_control
+    accuracy = None if fixed else config.accuracy
+    judgement = judge(
+        record,
+        loop.predicted_error(record),
+        ranges,
+        tolerances=scenario.judgement.tolerated,
+        changes=changes,
+        ended=ended,
+        accuracy=accuracy,
+        reasons=_reasons(scenario, loop, record),
+        more=behind,
+    )
+    told = tuple(dict.fromkeys(filter(None, notes)))
+    return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy)
+
+
+def _slower(loop: ClosedLoop, model: RobotModel, limits: SignalLimits, record: Record) -> list[str]:
+    """How much slower the references of a run must be to keep its limits."""
+    dae, law = model.dae, loop.controller.law
+    if loop.generator is None or dae.exogenous.moving:
+        return []
+    reference = loop.generator.reference
+    structure = law.structure if law.system is dae else find_structure(dae)
+    times, start = record.time[:: record.time.size // MOST_TIMES + 1], record["state"][0]
+    motion = ZeroDynamics(dae, structure=structure).motion(reference, times, start)
+    found = limits_along(structure, limits, reference, motion)
+    return ["the references alone keep all limits" if found is None else found.remedy]
+
+
+def _beyond_edge(constraint: Constraint, model: RobotModel, record: Record) -> str:
+    """When a point is beyond the edge of its surface's data first; "" if it is not."""
+    extent, dae = constraint.extent, model.dae
+    if extent is None:
+        return ""
+    coordinates = constraint.coordinates(model.links)
+    if any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):
+        return ""  # The record does not contain the position of a moving surface.
+    inputs = {"q": model.links.q, "parameters": dae.parameter_symbol}
+    function = TracedFunction("coordinates", inputs, {"coordinates": coordinates})
+    positions = record["state"][:, : model.links.q.numel()]
+    places = np.array([function(q, dae.parameter_values)[0] for q in positions])
+    beyond = np.max(np.maximum(extent[0] - places, places - extent[1]), axis=1)
+    if not np.any(beyond > 0.0):
+        return ""
+    first, most = record.time[int(np.argmax(beyond > 0.0))], 1e3 * float(np.max(beyond))
+    return (
+        f"{constraint.name}: the robot is beyond the edge of the data by up to {most:.2g} mm, "
+        f"first at {first:.3g} s; there the surface continues as a plane"
+    )
+
+
+def _remarks(value: Any) -> Iterator[str]:
+    """The approximations of references in lists, mappings and dataclasses."""
+    if isinstance(value, Reference):
+        yield value.remark
+    elif isinstance(value, (list, tuple, dict)):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _remarks(inner)
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from _remarks(getattr(value, field.name))
+
+
+def _early_touches(changes: Sequence[PhaseChange]) -> Iterator[str]:
+    """Touches that a task felt as soon as a phase began, away from the surface."""
+    for before, after in pairwise(changes):
+        lasted, away = after.time - before.time, after.distance
+        touched = after.in_contact > before.in_contact
+        if touched and not after.failed and lasted < AT_ONCE and away > AWAY:
+            yield (
+                f"{before.phase} felt {after.force:.3g} N {1e3 * lasted:.3g} ms after its start, "
+                f"{1e3 * away:.3g} mm before the surface of the model: a bias of the force sensor "
+                "feels like a touch; task.tare_time finds it"
+            )
+
+
+def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
+    """Why errors may deviate from the prediction, which is that of an ideal run."""
+    material, model = scenario.plant.material, loop.plant.robot("a scenario")
+    of_plant_alone = [
+        any(c.is_unilateral) and c.friction_parameter is None for c in model.constraints
+    ]
+    rubs = material is not None and bool(material.friction) and any(of_plant_alone)
+    reasons = {
+        "the drives were saturated": "excess" in record and bool(record["excess"].any()),
+        "parameters of the plant differ from those of the law": bool(scenario.plant.parameters),
+        "the plant carries payloads that the law does not know": bool(scenario.plant.payloads),
+        "disturbances act on the plant, unknown to the law": bool(scenario.plant.disturbances),
+        "the contact has friction that the law does not know": rubs,
+        "the contact is compliant": not loop.plant.is_ideal,
+        "the force is measured by a sensor": scenario.sensors.force is not None,
+        "the state is measured by encoders": scenario.sensors.encoders is not None,
+        "the law is sampled": scenario.sampling is not None,
+    }
+    return [reason for reason, holds in reasons.items() if holds]
