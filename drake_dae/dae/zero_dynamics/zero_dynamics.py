@@ -134,7 +134,6 @@ class ZeroDynamics:
         Raises:
             InconsistentStateError: No state near the guess has these outputs; or there are such
                 states, but no equilibrium: `residual` is then x', shape (n,).
-            ModelError: A shape is wrong, or a number is not finite.
         """
         start, p = self._guess(guess), self.system.parameter_vector(parameters)
         return self._equilibria.find(self._resting(start, outputs, p), start)
@@ -146,7 +145,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> ComplexArray:
-        """Returns the eigenvalues of the zero dynamics, linearized at an equilibrium.
+        """Returns the eigenvalues at an equilibrium, in 1/s, largest real part first.
 
         The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; these are its
         eigenvalues there. In closed loop they stand beside the roots of (32). Those of a linear
@@ -157,9 +156,6 @@ class ZeroDynamics:
             outputs: z, shape (p,). If None, those of the state; outputs with mu_i = 0, which the
                 state does not determine, are those with the smallest x'. Give them if this
                 choice is not unique, as for a force that does not affect the motion.
-
-        Returns:
-            The eigenvalues in 1/s, largest real part first, shape (dimension,).
 
         Raises:
             ModelError: The state is not an equilibrium on N*.
@@ -193,7 +189,6 @@ class ZeroDynamics:
 
         Raises:
             InconsistentStateError: The state is not near N*.
-            ModelError: A shape is wrong, or a number is not finite.
         """
         if self.dimension == 0:
             return without_dynamics(self.structure)
@@ -219,18 +214,14 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> FloatArray:
-        """Returns the equilibria with the same outputs that a search from several guesses finds.
+        """Returns the equilibria with the same outputs, found from guesses, shape (l, n).
 
         Args:
             guesses: States from which the search starts, shape (k, n); `structure.states` if None.
             outputs: z, shape (p,). If None those of the first guess, as in `stability`.
 
-        Returns:
-            The distinct states, in the order in which they are found, shape (l, n).
-
         Raises:
             InconsistentStateError: The first guess is not near N*.
-            ModelError: A shape is wrong, or a number is not finite.
         """
         name = self.system.name
         rows = numbers(f"{name}: guesses", self.structure.states if guesses is None else guesses)
@@ -267,10 +258,9 @@ class ZeroDynamics:
         disturbances of it, delta' = (dx'/dx) delta on Z(R(t)), through one period.
 
         Args:
-            reference: The function t -> R(t).
+            reference, exogenous: As for `motion`.
             motion: The result of `motion` for this reference.
             period: The period of R(t) and of the exogenous signals, in s.
-            exogenous: The references of the exogenous signals, as for `motion`.
 
         Raises:
             ModelError: A shape is wrong, a number is not finite, or the period is not one.
