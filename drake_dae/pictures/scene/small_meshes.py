@@ -10,7 +10,7 @@ from pydrake.geometry import GeometryId, InMemoryMesh, Mesh, Role, SceneGraph, S
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import GeometryWarning, ModelError
-from drake_dae.robots.surfaces.measured import read_mesh
+from drake_dae.files import read_mesh
 
 MOST_BYTES = 2 << 20
 """The largest size of all meshes of a page."""
