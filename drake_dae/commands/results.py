@@ -61,7 +61,7 @@ def _plot_all(options: argparse.Namespace, runs: dict[str, Path]) -> int:
     for folder in runs.values():
         with waiting(f"drawing {folder}"):
             loop, context, record = _run_again(folder)
-            save_run_plots(record, loop, context, folder)
+            save_run_plots(record, loop, context, folder, loop.predicted_error(record))
         written = [name for name in PLOTS if (folder / name).exists()]
         print(f"written to {folder}/: {', '.join(written)}")
     return 0

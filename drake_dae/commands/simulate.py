@@ -221,7 +221,8 @@ class _Run:
             is_drawn = not failure.startswith("interrupted")
             with waiting("drawing"):
                 if wanted.plots and is_drawn:
-                    self._attempt(save_run_plots, *drawn, summary.accuracy)
+                    predicted = self.loop.predicted_error(record)
+                    self._attempt(save_run_plots, *drawn, predicted, summary.accuracy)
                 if wanted.animation and is_drawn:
                     self._attempt(save_animation, *drawn, self.title)
         finally:

@@ -4,13 +4,13 @@ from pathlib import Path
 
 from pydrake.systems.framework import Context
 
-from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.arrays import FloatArray
 from drake_dae.files import complete
 from drake_dae.pictures.animation import animate
 from drake_dae.pictures.moments import RunEvent, events_of, sorted_events
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.scene.friction import slips
-from drake_dae.pictures.scene.run_motion import RunMotion, contact_paths, follow
+from drake_dae.pictures.scene.run_motion import RunMotion, ShownLoop, contact_paths, follow
 from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.records.phases import phase_spans
 from drake_dae.simulation.records.record import Record
@@ -20,12 +20,13 @@ ANIMATION = "animation.html"
 
 def save_run_plots(
     record: Record,
-    loop: ClosedLoop,
+    loop: ShownLoop,
     context: Context,
     folder: Path,
+    predicted: FloatArray,
     accuracy: float | None = None,
 ) -> None:
-    """Writes the plots of a run into a folder.
+    """Writes the plots of a run with its predicted error into a folder.
 
     Raises:
         OSError: They cannot be written.
@@ -34,11 +35,11 @@ def save_run_plots(
     paths = contact_paths(motion)
     limits = loop.plant.robot("pictures").control_limits
     with complete(folder, *(name for name in PLOTS if paths or name != PATHS)) as place:
-        save_plots(record, loop.predicted_error(record), limits, place, paths, accuracy, events)
+        save_plots(record, predicted, limits, place, paths, accuracy, events)
 
 
 def save_animation(
-    record: Record, loop: ClosedLoop, context: Context, folder: Path, title: str
+    record: Record, loop: ShownLoop, context: Context, folder: Path, title: str
 ) -> None:
     """Writes the animation of a run into a folder.
 
@@ -51,7 +52,7 @@ def save_animation(
         (place / ANIMATION).write_text(page, encoding="utf-8")
 
 
-def _motion(record: Record, loop: ClosedLoop, context: Context) -> tuple[RunMotion, list[RunEvent]]:
+def _motion(record: Record, loop: ShownLoop, context: Context) -> tuple[RunMotion, list[RunEvent]]:
     motion = follow(loop, record, context)
     limits = robot_limits(loop.plant.robot("pictures"))
     return motion, sorted_events(record, [*events_of(record, limits), *slips(motion)])
