@@ -19,7 +19,7 @@ from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_violation
 from drake_dae.dae.structure.dependence import find_dependence, redundant_constraints
 from drake_dae.dae.structure.redundancy import all_constraints_hold
-from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
+from drake_dae.dae.structure.relative_degrees import InputActions, constraint_chains
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -129,8 +129,8 @@ def find_constraint_structure(
     if violation:
         raise violation.error()
     # Rows of n* that are only round-off are no feedthrough.
-    _, n_star = eliminated_at(samples, structure.elimination)
-    acts = np.any([value for value, _ in n_star], axis=(0, 2))
+    actions = InputActions(samples, structure.elimination)
+    acts = actions.numbers(actions.feedthrough).any(axis=(0, 2))
     rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
     feedthrough = ca.sparsify(ca.mtimes(rows, structure.elimination.n_star))
     return replace(structure, elimination=replace(structure.elimination, n_star=feedthrough))
