@@ -105,7 +105,7 @@ def _rule(hint: Any) -> tuple[str, Callable[[Any], object]]:
         words = get_args(hint)
         return " or ".join(map(repr, words)), lambda v: isinstance(v, str) and v in words
     is_protocol = getattr(hint, "_is_protocol", False) and not hint._is_runtime_protocol
-    if is_protocol or not inspect.isclass(hint):
+    if is_protocol or hint is Any or not inspect.isclass(hint):  # Any is a class, too.
         return "anything", lambda v: True
     return f"a {hint.__name__}", lambda v: isinstance(v, hint)
 

@@ -5,18 +5,29 @@ import json
 import logging
 import re
 import shlex
+import sys
+import time
 import warnings
 from pathlib import Path
 
+from pydrake.systems.framework import Context
+
 from drake_dae.arrays import number_in
 from drake_dae.commands.options import program
-from drake_dae.errors import GeometryWarning, ScenarioError
+from drake_dae.errors import DrakeDaeError, GeometryWarning, ScenarioError, SimulationError
 from drake_dae.files import check_unwritten
 from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import load_scenario
-from drake_dae.scenario.judging import find_feasibility
-from drake_dae.scenario.new.new_scenario import new_scenario
+from drake_dae.scenario.judging import find_feasibility, judge_run
+from drake_dae.scenario.new import new_scenario
+from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.start import start_scenario
+from drake_dae.simulation.simulate import simulate
+
+_LONGEST = 20.0
+"""The time in s by the clock after which a new scenario is no longer checked."""
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -45,10 +56,39 @@ def _new(options: argparse.Namespace) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)
         tip, point = _tip(options.tip)
-        _, text = new_scenario(options.robot, options.surface, tip, point, out.parent)
-    out.write_text(text, encoding="utf-8")
-    print(f"written: {out}\nnow run: {program()} simulate {shlex.quote(str(out))}")
-    return 0
+        began = time.perf_counter()
+
+        def tell(text: str) -> None:
+            print(f"{time.perf_counter() - began:4.1f} s: {text}", file=sys.stderr, flush=True)
+
+        where = options.robot, options.surface, tip, point, out.parent
+        _, text = new_scenario(*where, progress=tell)
+        out.write_text(text, encoding="utf-8")
+        print(f"written: {out}", flush=True)
+        tell("checking it by a run")
+        verdict = _check(load_scenario(out), began + _LONGEST)
+    print(f"checked: {verdict}\nnow run: {program()} simulate {shlex.quote(str(out))}")
+    return 0 if verdict.startswith("GOOD") else 2
+
+
+def _check(scenario: Scenario, end: float) -> str:
+    """The verdict of a run of a new scenario, or why there is none before an end by the clock."""
+
+    def look(context: Context) -> None:
+        if time.perf_counter() > end:
+            now = context.get_time()
+            text = f"not to its end: the run takes long, and came to {now:.3g} s without a fault"
+            raise SimulationError(text, now, [])
+
+    try:
+        completed, loop = build_completed(scenario)
+        context = start_scenario(completed.scenario, loop)
+        config = completed.scenario.integrator
+        run = simulate(loop.diagram, context, scenario.duration, config, look=look)
+        summary = judge_run(completed.scenario, loop, context, loop.record(context), run)
+    except DrakeDaeError as error:
+        return str(error)
+    return str(summary.judgement)
 
 
 def _tip(text: str) -> tuple[str, Vector]:

@@ -34,7 +34,7 @@ from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.scenario import Scenario, scenario_data
