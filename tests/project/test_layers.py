@@ -7,7 +7,6 @@ from collections.abc import Collection
 from pathlib import Path
 
 import pytest
-from draw_house import draw
 from house import PAPER, ROOMS, ROOT, WITHOUT_DRAKE, imports, may_import, modules, room, violations
 
 
@@ -97,12 +96,6 @@ def test_the_guide_has_the_rules_of_this_file() -> None:
 def test_the_guide_has_the_order_of_the_paper() -> None:
     (order,) = re.findall(r"^    (system/(?:\s+\w+/?)*)$", GUIDE, flags=re.MULTILINE)
     assert tuple(name.rstrip("/") for name in order.split()) == PAPER
-
-
-@pytest.mark.slow
-def test_the_house_is_drawn(tmp_path) -> None:
-    draw(tmp_path / "house.png")
-    assert (tmp_path / "house.png").stat().st_size > 50_000
 
 
 def test_files_that_the_guide_names_exist() -> None:
