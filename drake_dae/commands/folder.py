@@ -1,5 +1,6 @@
-"""The folder of a run, and its record."""
+"""The folder of a run: its files, its record, its animation."""
 
+import webbrowser
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,3 +40,37 @@ def runs_by_name(paths: Sequence[Path]) -> dict[str, Path]:
         raise ModelError("a run is named twice; name each run once")
     names = Counter(path.name for path in paths)
     return {path.name if path.name and names[path.name] == 1 else str(path): path for path in paths}
+
+
+def show(folder: Path) -> None:
+    """Opens the animation of a run in the browser, and prints its file.
+
+    Raises:
+        ModelError: There is none, or no browser.
+    """
+    if not (folder / SCENARIO).is_file():
+        runs = sorted(path.parent for path in folder.parent.glob(f"*/{ANIMATION}"))
+        there = f"; there is {', '.join(map(str, runs))}" if runs else ""
+        raise ModelError(f"'{folder}' is no folder of a run{there}")
+    if not (folder / ANIMATION).is_file():
+        raise ModelError(
+            f"'{folder}' has no {ANIMATION}: a run writes it at its end, unless write.animation is "
+            f"false; `drake-dae simulate {folder / SCENARIO}` repeats the run"
+        )
+    open_page(folder / ANIMATION)
+
+
+def open_page(page: Path) -> None:
+    """Opens a file in the browser.
+
+    Raises:
+        ModelError: There is no browser.
+    """
+    address = page.resolve().as_uri()
+    try:
+        opened = webbrowser.open(address)
+    except webbrowser.Error:
+        opened = False
+    if not opened:
+        raise ModelError(f"found no browser here; open {address} in one")
+    print(f"opened {address}")

@@ -1,19 +1,18 @@
 """`drake-dae plot` and `play`: pictures and animations of recorded runs."""
 
 import argparse
-import webbrowser
 from pathlib import Path
 
 from pydrake.systems.framework import Context
 
-from drake_dae.commands.folder import SCENARIO, load_run, runs_by_name
+from drake_dae.commands.folder import SCENARIO, load_run, runs_by_name, show
 from drake_dae.commands.parser import Parser, waiting
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.files import check_unwritten, complete
 from drake_dae.pictures.film import save_film
 from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.run_pictures import ANIMATION, save_run_plots
+from drake_dae.pictures.run_pictures import save_run_plots
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
@@ -97,40 +96,6 @@ def _play(options: argparse.Namespace) -> int:
     """Opens the animation of a run in the browser."""
     show(options.folder)
     return 0
-
-
-def show(folder: Path) -> None:
-    """Opens the animation of a run in the browser, and prints its file.
-
-    Raises:
-        ModelError: There is none, or no browser.
-    """
-    if not (folder / SCENARIO).is_file():
-        runs = sorted(path.parent for path in folder.parent.glob(f"*/{ANIMATION}"))
-        there = f"; there is {', '.join(map(str, runs))}" if runs else ""
-        raise ModelError(f"'{folder}' is no folder of a run{there}")
-    if not (folder / ANIMATION).is_file():
-        raise ModelError(
-            f"'{folder}' has no {ANIMATION}: a run writes it at its end, unless write.animation is "
-            f"false; `drake-dae simulate {folder / SCENARIO}` repeats the run"
-        )
-    open_page(folder / ANIMATION)
-
-
-def open_page(page: Path) -> None:
-    """Opens a file in the browser.
-
-    Raises:
-        ModelError: There is no browser.
-    """
-    address = page.resolve().as_uri()
-    try:
-        opened = webbrowser.open(address)
-    except webbrowser.Error:
-        opened = False
-    if not opened:
-        raise ModelError(f"found no browser here; open {address} in one")
-    print(f"opened {address}")
 
 
 COMMANDS = {"plot": (_plot_options, _plot), "play": (_play_options, _play)}

@@ -18,9 +18,8 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 
 import drake_dae
-from drake_dae.commands.folder import FILES, PART, RECORD, SCENARIO, SUMMARY
+from drake_dae.commands.folder import FILES, PART, RECORD, SCENARIO, SUMMARY, show
 from drake_dae.commands.parser import Parser, program, waiting
-from drake_dae.commands.results import show
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ScenarioError, describe_os_error
 from drake_dae.files import check_folder, check_unwritten, complete

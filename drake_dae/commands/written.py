@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
+from drake_dae.commands.folder import open_page
 from drake_dae.commands.parser import Parser, waiting
-from drake_dae.commands.results import open_page
 from drake_dae.errors import ModelError
 from drake_dae.files import check_folder, check_unwritten, complete
 from drake_dae.running.bench.page import write_page

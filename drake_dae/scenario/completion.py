@@ -124,7 +124,8 @@ def completions(
         raise ScenarioError(_why_none(starts[0], rows, named, missing, bound))
     # Of those that are equal along the reference, the best one at the start.
     found.sort(key=lambda entry: entry[0], reverse=True)
-    for _, posture, held, added in found[:MOST]:
+    fewer = [entry for entry in found[MOST:] if entry[0][1] < found[0][0][1]]
+    for _, posture, held, added in [*found[:MOST], *fewer[:1]]:
         yield _written(scenario, rows, postures, posture, held, added)
 
 
@@ -195,21 +196,20 @@ def _added(
     added = posture.independent(named, along, room)
     axes = [row for row in rows.axes if row not in named]
     axes = posture.independent([*named, *added], axes, len(axes))
-    added += axes if len(axes) <= room - len(added) else []
-    held, room = [*named, *added], room - len(added)
-    joints = [row for row in rows.joints if row not in held]
-    if comb(len(joints), room) <= 500:
-        sets = [list(chosen) for chosen in combinations(joints, room)]
-    else:
-        greedy: list[int] = []
-        for _ in range(room):
-            rest = [joint for joint in joints if joint not in greedy]
-            greedy.append(max(rest, key=lambda j: posture.independence([*held, *greedy, j])))
-        sets = [sorted(greedy)]
-    ranked = [(posture.independence([*held, *chosen]), chosen) for chosen in sets]
-    ranked = [entry for entry in ranked if entry[0] > INDEPENDENT / 10]
-    for _, chosen in sorted(ranked, key=lambda entry: -entry[0])[:_SETS]:
-        yield [*added, *chosen]
+    axes = axes if len(axes) <= room - len(added) else []
+    # Where no start keeps the axis and all limits, it is left free.
+    for directions in [axes, []] if axes else [[]]:
+        held = [*named, *added, *directions]
+        count = room - len(added) - len(directions)
+        joints = [row for row in rows.joints if row not in held]
+        if comb(len(joints), count) <= 500:
+            sets = [list(chosen) for chosen in combinations(joints, count)]
+        else:
+            sets = [posture.most_independent(held, joints, count)]
+        ranked = [(posture.independence([*held, *chosen]), chosen) for chosen in sets]
+        ranked = [entry for entry in ranked if entry[0] > INDEPENDENT / 10]
+        for _, chosen in sorted(ranked, key=lambda entry: -entry[0])[:_SETS]:
+            yield [*added, *directions, *chosen]
 
 
 def _least(
@@ -247,7 +247,9 @@ def _written(
     chosen = list(held[rows.given :])
     if chosen:
         joints = " (joints so that B(x) is best conditioned)" * bool(set(added) & {*rows.joints})
-        notes.append(f"outputs completed by {', '.join(names[row] for row in chosen)}{joints}")
+        left = "; the tool's axis is left free" * bool(rows.axes and not {*held} & {*rows.axes})
+        listed = ", ".join(names[row] for row in chosen)
+        notes.append(f"outputs completed by {listed}{joints}{left}")
         outputs = [*scenario.outputs, *_joined(rows.forms[row] for row in chosen)]
         scenario = replace(scenario, outputs=outputs)
     if added and not rows.is_task:

@@ -40,6 +40,9 @@ from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_guess
 
+NOTHING_FOUND = "no start was found"
+"""How the note begins if no outputs and start are good along the references."""
+
 _LARGE = 30.0
 """The ratio of the size of a surface to that of the robot above which its unit is doubtful."""
 
@@ -67,7 +70,8 @@ def complete_scenario(scenario: Scenario) -> Completed:
     1. what `references` name, as tool for its position along the surface;
     2. the position of each contact point along its surface: of its world coordinates all but that
        closest to the normal;
-    3. the direction of the tool's axis, by `tool_axis`: its tilt from the normal;
+    3. the direction of the tool's axis, by `tool_axis`: its tilt from the normal; if no start keeps
+       it and all limits along the reference, it is left free;
     4. positions of the joints that are left free, the choice for which B(x) of (16) is best
        conditioned. They are held where they start, and a run is not judged by their errors.
 
@@ -116,31 +120,28 @@ def completed_model(
     links, loops = robot
     constraints = _checked_constraints(scenario, links, loops)
     guess = start_guess(scenario, links)
-    ways, problems = list[tuple[Completed, RobotModel, Structure]](), list[str]()
+    ways = list[tuple[Completed, RobotModel, Structure | None]]()
+    problems = list[str]()
     for completed in completions(scenario, links, constraints, guess):
-        model = _model(completed.scenario, links, constraints)
+        model, structure = _model(completed.scenario, links, constraints), None
         if completed.scenario is scenario or scenario.task is not None:
             return completed, model, None
         try:
             structure = scenario_structure(model)
+            problem = in_the_way(completed.scenario, model, structure)
         except (AssumptionError, ScenarioError) as error:
-            failed = completed, model, None
-            problems.append(str(error))
-            continue
-        problem = in_the_way(completed.scenario, model, structure)
+            problem = str(error)
         if not problem:
             return completed, model, structure
-        problems.append(problem)
         ways.append((completed, model, structure))
-    if not ways:
-        return failed
-    completed, model, structure = ways[0]
-    if len(ways) == 1 and ways[0][0].scenario is scenario:
-        return ways[0]
+        problems.append(problem)
+    # One that can be examined, if there is any.
+    best = next((i for i, way in enumerate(ways) if way[2] is not None), 0)
+    completed, model, structure = ways[best]
     note = (
-        f"no start was found from which the robot keeps its limits along the references; with this "
-        f"one {problems[0]}. Move the surface or the references, make them slower, or give other "
-        "outputs or start.positions"
+        f"{NOTHING_FOUND} from which the robot keeps its limits along the references; with this "
+        f"one {problems[best]}. Move the surface or the references, make them slower, or give "
+        "other outputs or start.positions"
     )
     return Completed(completed.scenario, (*completed.notes, note)), model, structure
 

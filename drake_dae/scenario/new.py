@@ -42,7 +42,7 @@ from drake_dae.robots.surfaces.surface import Surface, Vector
 from drake_dae.robots.surfaces.surfaces import Cylinder, Plane, Sphere
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.forms.typed_yaml import dump_yaml
-from drake_dae.scenario.model import completed_model
+from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
 from drake_dae.scenario.robot_file.changes import finalize
@@ -145,7 +145,7 @@ def new_scenario(
         progress(f"trying a {name} at {center} m")
         try:
             completed, _, _ = completed_model(scenario, None, robot=read)
-            problem = next((n for n in completed.notes if n.startswith("no start")), "")
+            problem = next((n for n in completed.notes if n.startswith(NOTHING_FOUND)), "")
         except DrakeDaeError as error:
             problem = str(error)
         if not problem:

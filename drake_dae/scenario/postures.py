@@ -96,6 +96,14 @@ class Posture:
                 chosen.append(row)
         return chosen
 
+    def most_independent(self, rows: Sequence[int], more: Sequence[int], count: int) -> list[int]:
+        """`count` rows of `more`, each the most independent of those before it."""
+        chosen: list[int] = []
+        for _ in range(count):
+            rest = [row for row in more if row not in chosen]
+            chosen.append(max(rest, key=lambda row: self.independence([*rows, *chosen, row])))
+        return sorted(chosen)
+
 
 class Postures:
     """The configurations of a robot with constraints.

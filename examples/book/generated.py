@@ -130,5 +130,5 @@ def equations_page() -> str:
 
     return (
         "# Equations\n\nFrom each equation of the paper to the line that computes it, and to the "
-        f"test that proves it. `make equations` prints the same.\n\n{table()}\n"
+        f"test that proves it. `make table NAME=equations` prints the same.\n\n{table()}\n"
     )

@@ -209,7 +209,7 @@ def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
     out, err = process.communicate(timeout=30)
     assert process.returncode == 130, err
     assert err == ""
-    assert "interrupted          the record ends there" in out
+    assert "interrupted" in out
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == sorted(FILES)
     record = Record.load(tmp_path / "run" / "record.npz")
     assert 0.0 < record.time[-1] < 60.0
