@@ -9,7 +9,7 @@ trial is later than the last accepted state. So a block stores the time of each 
 compares with it if a function has no value.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Any
@@ -69,8 +69,6 @@ class RunProgress:
         start: The start of the simulation, in s.
         steps: The number of accepted steps.
         mark: The time after the last `PACE_STEPS` steps, in s.
-        parameters: The numeric parameters of the block, each with the time in s after which it had
-            them.
         entry: The cache entry of this value, since looking it up takes longer.
     """
 
@@ -81,11 +79,10 @@ class RunProgress:
     start: float = 0.0
     steps: int = 0
     mark: float = 0.0
-    parameters: list[tuple[float, FloatArray]] = field(default_factory=list)
     entry: CacheEntry | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "RunProgress":
-        return replace(self, state=self.state.copy(), parameters=list(self.parameters))
+        return replace(self, state=self.state.copy())
 
 
 class StepWatch:
@@ -93,18 +90,16 @@ class StepWatch:
 
     Args:
         system: The block, which gets two events and a cache entry.
-        sees_steps: Whether it gets the events; without them no state is a trial, and parameters are
-            those of the context.
+        sees_steps: Whether it gets the events; without them no state is a trial.
     """
 
     def __init__(self, system: LeafSystem, sees_steps: bool = True) -> None:
         self._system = proxy(system)
-        # It is invalidated if parameters change, and stores them when it is evaluated; only the two
-        # events change everything else in it.
+        # Only the two events change it.
         self._index = system.DeclareCacheEntry(
             "progress",
-            ValueProducer(lambda: AbstractValue.Make(RunProgress()), _note_parameters),
-            {system.all_parameters_ticket()},
+            ValueProducer(lambda: AbstractValue.Make(RunProgress()), ValueProducer.NoopCalc),
+            {system.nothing_ticket()},
         ).cache_index()
         # An entry keeps its system alive: a context may hold one, but not the system itself.
         self._entry: Callable[[], CacheEntry | None] = lambda: None
@@ -135,10 +130,6 @@ class StepWatch:
             self._system.get_name(), progress.time, progress.state.copy(), progress.reason or error
         ) from None
 
-    def parameters_along(self, context: Context, times: FloatArray) -> FloatArray:
-        """The numeric parameters of the block at accepted times, in s, one row for each."""
-        return _along(self._progress(context).parameters or [(0.0, _parameters(context))], times)
-
     def _progress(self, context: Context) -> RunProgress:
         # The object is not replaced, and is changed in place.
         progress: RunProgress = self._system.get_cache_entry(self._index).Eval(context)
@@ -147,13 +138,9 @@ class StepWatch:
     def _begin(self, context: Context) -> EventStatus:
         time = context.get_time()
         progress = self._progress(context)
-        before = float(np.nextafter(time, -inf))
-        parameters = [entry for entry in progress.parameters if entry[0] < before]
-        if context.num_numeric_parameter_groups():
-            _add(parameters, before, _parameters(context))
         entry = self._system.get_cache_entry(self._index)
         self._entry = ref(entry)
-        begun = RunProgress(time, start=time, mark=time, parameters=parameters, entry=entry)
+        begun = RunProgress(time, start=time, mark=time, entry=entry)
         vars(progress).update(vars(begun))
         if context.num_continuous_states():
             progress.state = context.get_continuous_state_vector().CopyToVector()
@@ -183,26 +170,3 @@ class StepWatch:
         if time - before < LEAST_PROGRESS * (time - progress.start):
             name = self._system.get_name()
             raise endless_steps(name, PACE_STEPS, before, time, progress.state.copy())
-
-
-def _add(history: list[tuple[float, FloatArray]], time: float, values: FloatArray) -> None:
-    """Adds the values after a time to a history, if they differ from the last ones."""
-    if not (history and np.array_equal(history[-1][1], values, equal_nan=True)):
-        history.append((time, values))
-
-
-def _along(history: Sequence[tuple[float, FloatArray]], times: FloatArray) -> FloatArray:
-    """The values of a history at some times, one row for each."""
-    last = np.searchsorted([time for time, _ in history], times) - 1
-    return np.array([values for _, values in history])[np.maximum(last, 0)]
-
-
-def _note_parameters(context: Context, value: AbstractValue) -> None:
-    """Stores changed parameters of a context, from the last accepted state on."""
-    progress: RunProgress = value.get_value()
-    if progress.parameters:
-        _add(progress.parameters, progress.time, _parameters(context))
-
-
-def _parameters(context: Context) -> FloatArray:
-    return np.array(context.get_numeric_parameter(0).value())

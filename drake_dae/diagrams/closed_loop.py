@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context, Diagram, OutputPort
@@ -16,7 +17,6 @@ from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.simulation.records.afterwards import completed
 from drake_dae.simulation.records.record import Record, computed_record, recorded_values
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.phase_change import PhaseChange
@@ -37,10 +37,8 @@ class ClosedLoop:
             `tracking_error`, and `link_state` of a robot.
         plant, controller: The systems in it.
         generator: The generator of references; None for a controller that plans them itself.
-        log: The log, one sample per step: all logged signals, stacked.
-        logged: Names and units of each logged signal, in their order in the log. `record` computes
-            the other signals from these.
-        signals: Names and units of each signal that is logged or computed.
+        log: The log, one sample per step: all signals, stacked.
+        signals: Names and units of each logged signal, in their order in the log.
         scene_graph: The geometry of the robot, or None.
         sensor: The sensor of the constraint force, or None.
         noise: The source of the sensor's noise, or None.
@@ -56,7 +54,6 @@ class ClosedLoop:
     controller: Controller
     generator: ReferenceGenerator | None
     log: VectorLogSink
-    logged: Mapping[str, Sequence[Signal]]
     signals: Mapping[str, Sequence[Signal]]
     scene_graph: SceneGraph | None = None
     sensor: ForceSensor | None = None
@@ -127,20 +124,13 @@ class ClosedLoop:
         """The record of a run: the logged signals up to now, and signals computed from them.
 
         It includes `desired_output` r, `tracking_error` z - r (29), and further signals of the
-        controller; see its class. Each row is computed with the parameters and gains of its time.
-        At a change of phase, values are those before it.
+        controller; see its class. At a change of phase, values are those before it.
 
         Args:
             context: The diagram's context.
             after: Only later samples than this time, in s; None for all.
-
-        Raises:
-            WiringError: An input port of plant or controller has a fixed value in this context,
-                since an unknown time.
         """
-        logged = Record.from_log(self.log, self.logged, context, after)
-        if self.plant.functions:
-            logged = completed(logged, self, context)
+        logged = Record.from_log(self.log, self.signals, context, after)
         return self.with_errors(logged, context).while_finite()
 
     @checked(WiringError)
@@ -165,12 +155,15 @@ class ClosedLoop:
     def plant_parameters(self, record: Record, context: Context) -> FloatArray:
         """The parameters of the plant at the times of a record, one row each.
 
+        They are those of the context, and exogenous ones those of the record.
+
         Args:
             record: The record.
             context: The diagram's context after the run.
         """
         plant = self.plant
-        values = plant.parameters_along(plant.GetMyContextFromRoot(context), record.time)
+        own = plant.parameters(plant.GetMyContextFromRoot(context))
+        values = np.tile(own, (record.time.size, 1))
         if "exogenous" in record:
             values[:, plant.exogenous_places] = record["exogenous"]
         return values

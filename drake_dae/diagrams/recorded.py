@@ -1,6 +1,6 @@
 """The recorded signals of a closed loop, and their log."""
 
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
@@ -24,36 +24,22 @@ def log_signals(
     builder: DiagramBuilder,
     plant: Plant,
     controller: Controller,
-    control: OutputPort,
     named: Named,
-    by_time: Set[str],
-) -> tuple[VectorLogSink, dict[str, tuple[Signal, ...]]]:
-    """Exports all signals, and logs those that do not follow from what is logged, as one vector.
+) -> VectorLogSink:
+    """Exports all signals, and logs them as one vector.
 
     Args:
         builder: The builder of the diagram.
         plant, controller: The blocks.
-        control: The source of the plant's control.
         named: The signals.
-        by_time: The signals that follow from the time.
-
-    Returns:
-        The log, and the names and units of the logged signals, in their order in its vector.
     """
-    available: set[str] = set()
-    if plant.functions:
-        available = {*plant.functions, *by_time}
-        if "exogenous" in by_time and controller.follows and control.get_system() is controller:
-            available.add("control")
     for name, (port, _) in named.items():
         builder.ExportOutput(port, name)
-    logged = {name: pair for name, pair in named.items() if name not in available}
     for name in controller.shown:
         builder.ExportOutput(controller.GetOutputPort(name), name)
     if plant.model is not None:
         builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
-    log = log_steps(builder, [port for port, _ in logged.values()], plant)
-    return log, {name: tuple(signals) for name, (_, signals) in logged.items()}
+    return log_steps(builder, [port for port, _ in named.values()], plant)
 
 
 def signals_of_plant(

@@ -165,16 +165,14 @@ def wire_loop(
         ways = parts.sensor, parts.sampling, [] if observer is None else [observer]
         noise = add_force_feedback(builder, plant, controller, *ways)
 
-    # Every signal has its own name: it is exported, and logged at each step or computed afterwards.
+    # Every signal has its own name: it is exported, and logged at each step.
     named = {
         **signals_of_plant(plant, moving, reference, law, control),
         **signals_of_parts(plant, controller, measured, limits, observer, parts.sensor),
     }
     if reference is not None:
         named |= further_signals(reference)
-    sources = {"reference": reference, "exogenous": moving}
-    by_time = {name for name, block in sources.items() if block is None or block.follows_time}
-    log, logged = log_signals(builder, plant, controller, control, named, by_time)
+    log = log_signals(builder, plant, controller, named)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
     if meshcat is not None:
@@ -189,7 +187,6 @@ def wire_loop(
         controller,
         reference,
         log,
-        logged,
         {name: tuple(signals) for name, (_, signals) in named.items()},
         scene_graph,
         parts.sensor,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray, numbers, vector
-from drake_dae.blocks.block import Block, BlockFunction, Requirement
+from drake_dae.arrays import FloatArray, numbers
+from drake_dae.blocks.block import Block, Requirement
 from drake_dae.blocks.computations import Block as Computed
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae.system.layout import DerivativeLayout
@@ -66,28 +66,6 @@ class ParameterizedSystem(TracedSystem):
             values[self.exogenous_places] = self.GetInputPort("exogenous").Eval(context)
         return values
 
-    def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
-        """The values of an output port at given times, one row each; nan without a value.
-
-        Args:
-            port: The port's name.
-            given: Name of what it reads, such as "state", "parameters" and "control" -> its values,
-                one row for each time.
-
-        Raises:
-            ModelError: There is no such port, or values are missing or have a wrong size.
-        """
-        block, rows = self.block, dict(given)
-        if port not in block.outputs:
-            raise ModelError(f"{self.dae.name}: it has no output port '{port}'")
-        function = BlockFunction(block, port, {"value": block.outputs[port]}, self.compiled)
-        if "parameters" in rows:
-            rows.setdefault("exogenous", np.asarray(rows["parameters"])[:, self.exogenous_places])
-        for name, size in zip(function.input_names, function.sizes, strict=True):
-            if name not in rows or np.shape(rows[name])[1:] != (size,):
-                raise ModelError(f"{self.dae.name}: '{name}' must have shape (k, {size})")
-        return function_along(function, rows)
-
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""
         self.check_context(context)
@@ -98,21 +76,6 @@ class ParameterizedSystem(TracedSystem):
         """All parameters as `parameters`, with exogenous ones at the context's time."""
         self.check_context(context)
         return np.array(self._values(context)[: self.dae.parameter_values.size])
-
-    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        """The parameters of the block's functions at accepted times of a run.
-
-        Exogenous ones have their values in the context; see `exogenous_places`.
-
-        Args:
-            context: The context of the run.
-            times: The times, in s, shape (k,), increasing.
-
-        Returns:
-            One row for each time.
-        """
-        self.check_context(context)
-        return self._steps.parameters_along(context, vector("times", times, None))
 
     def get_parameter(self, context: Context, name: str) -> FloatArray:
         """A parameter by name, shape (k,).

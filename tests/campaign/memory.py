@@ -63,7 +63,7 @@ def main() -> int:
     config = SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=1e-5, use_error_control=False
     )
-    size = sum(map(len, loop.logged.values())) + 1
+    size = sum(map(len, loop.signals.values())) + 1
     before = resident()
     done = simulate(loop.diagram, context, given.steps * 1e-5, config)
     per_step = (resident() - before) * 1e3 / done.steps

@@ -99,8 +99,8 @@ def test_all_signals_are_in_one_log_of_which_the_record_is_cut(name):
     Simulator(loop.diagram, context).Initialize()
     record = loop.record(context)
     assert record.time.tolist() == [0.0]
-    assert {"state", "measured_force"} <= {*loop.logged}
-    for signal, names in loop.logged.items():
+    assert {"state", "measured_force"} <= {*loop.signals}
+    for signal, names in loop.signals.items():
         port = loop.diagram.GetOutputPort(signal)
         np.testing.assert_array_equal(record[signal], [port.Eval(context)], err_msg=signal)
         assert record.signals[signal].signals == names

@@ -64,11 +64,11 @@ def built(name):
 def logs(loop, context):
     """Name of a logged signal -> times and values."""
     log = loop.log.FindLog(context)
-    stops = np.cumsum([len(signals) for signals in loop.logged.values()])
+    stops = np.cumsum([len(signals) for signals in loop.signals.values()])
     columns = np.split(log.data().copy(), stops[:-1])
     return {
         name: (log.sample_times().copy(), values)
-        for name, values in zip(loop.logged, columns, strict=True)
+        for name, values in zip(loop.signals, columns, strict=True)
     }
 
 

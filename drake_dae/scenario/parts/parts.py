@@ -221,7 +221,8 @@ class Judgement:
     """What counts in the verdict of a run.
 
     Attributes:
-        tolerances: Output name -> the tolerated error in its unit. For others it is 1 % of the
+        tolerances: Output name -> the tolerated error in its unit; null if its error does not
+            count, as for joints that complete the outputs. For others it is 1 % of the
             range of the references in their unit.
         friction_cones: Contacts that must not slide, such as grips: `analyze` and the verdict say
             where their forces leave these cones.
@@ -229,9 +230,14 @@ class Judgement:
             with the reason.
     """
 
-    tolerances: dict[str, float] = field(default_factory=dict)
+    tolerances: dict[str, float | None] = field(default_factory=dict)
     friction_cones: list[FrictionCone] = field(default_factory=list)
     may_diverge: bool = False
+
+    @property
+    def tolerated(self) -> dict[str, float]:
+        """Output name -> the tolerated error; infinite if it does not count."""
+        return {name: np.inf if e is None else e for name, e in self.tolerances.items()}
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,9 @@ def change_robot(robot: Robot, plant: MultibodyPlant, mender: Mender) -> None:
     with drake_errors():
         if robot.base is not None:
             _weld_base(robot.base, plant)
-        if robot.locked:
-            _lock_joints(robot.locked, plant, couplings)
+        locked = _of_joints(plant, mender.standing) | robot.locked
+        if locked:
+            _lock_joints(locked, plant, couplings)
         _add_free_joints(robot.free, plant)
         if robot.actuators is not None:
             _drive_joints(robot.actuators, plant, couplings, mender)

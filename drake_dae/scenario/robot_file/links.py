@@ -87,8 +87,8 @@ def robot_links(
         plant_constraints(links)
     except ModelError as error:
         raise ModelError(
-            f"{error}; leave_out: [equality/connect] under robot leaves the file as it is, or "
-            "[robot/drake:ball_constraint], as the file has it"
+            f"{error}. robot.leave_out takes them out, as [equality/connect] of MJCF, or "
+            "[robot/drake:ball_constraint] of a URDF"
         ) from None
     return links, loop_constraints(cuts, plant)
 

@@ -72,6 +72,7 @@ class Mender:
         efforts: (model, joint) -> effort limit in N m or N.
         armatures: (model, joint) -> rotor inertia at the joint, kg m^2 or kg.
         followers: (model, joint) -> the joint that it follows, the ratio, and the offset.
+        standing: (model, joint) -> the position that a coupling gives it, in rad or m.
         floating: The floating joints.
         crossed: (model, link) of which visual geometry is left out.
         parent_frames: (model, joint) -> the parent that an SDFormat file names.
@@ -91,6 +92,7 @@ class Mender:
     efforts: dict[tuple[str, str], float] = field(default_factory=dict)
     armatures: dict[tuple[str, str], float] = field(default_factory=dict)
     followers: dict[tuple[str, str], tuple[str, float, float]] = field(default_factory=dict)
+    standing: dict[tuple[str, str], float] = field(default_factory=dict)
     floating: list[FloatingJoint] = field(default_factory=list)
     crossed: set[tuple[str, str]] = field(default_factory=set)
     parent_frames: dict[tuple[str, str], str] = field(default_factory=dict)
@@ -258,11 +260,18 @@ class Mender:
                     for material in shape.iterfind("material"):
                         _remove(material, owner.tag)
 
-    def _follow(self, joint: tuple[str, str], mimic: Element) -> None:
-        """Notes that a joint follows another one, unless Drake reports what is wrong."""
-        ratio, offset = number_in(mimic.get("multiplier", "1")), number_in(mimic.get("offset", "0"))
-        if ratio is not None and offset is not None:
-            self.followers[joint] = (mimic.get("joint", ""), ratio, offset)
+    def _follow(self, model: str, joint: Element, tag: str) -> None:
+        """Notes whether a joint follows another one, unless Drake reports what is wrong."""
+        name = joint.get("name", "")
+        for mimic in [part for part in joint if part.tag == tag]:
+            ratio = number_in(mimic.get("multiplier", "1"))
+            offset = number_in(mimic.get("offset", "0"))
+            if ratio == 0.0 and offset is not None:
+                self.changes["joints that follow others with multiplier 0 stand"] += [f"'{name}'"]
+                self.standing[model, name] = offset
+                joint.remove(mimic)
+            elif ratio is not None and offset is not None:
+                self.followers[model, name] = (mimic.get("joint", ""), ratio, offset)
 
     def _mend_urdf(
         self, root: Element, file: Path, model: str, placed: Collection[str]
@@ -293,8 +302,7 @@ class Mender:
                 self.floating.append(FloatingJoint(model, name, parent, child, where))
             if kind == "fixed":
                 _remove(joint, "mimic")
-            for mimic in joint.iterfind("mimic"):
-                self._follow((model, name), mimic)
+            self._follow(model, joint, "mimic")
             for limit in joint.iterfind("limit"):
                 effort = number_in(limit.get("effort", ""))
                 if effort:  # Many authors write 0 for an unknown limit.
@@ -341,8 +349,7 @@ class Mender:
                 elif parent == "world" and joint.get("type") == "fixed":
                     yield child
                 self.parent_frames[model, joint.get("name", "")] = parent
-                for mimic in (part for part in joint if part.tag == "drake:mimic"):
-                    self._follow((model, joint.get("name", "")), mimic)
+                self._follow(model, joint, "drake:mimic")
 
     def _include(self, owner: Element, main: Path, within: tuple[Path, ...]) -> None:
         """Puts the content of files that an MJCF file includes into the places of their names."""

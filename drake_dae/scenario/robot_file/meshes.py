@@ -23,8 +23,7 @@ import numpy as np
 from pydrake.geometry import Mesh
 
 from drake_dae.errors import ModelError
-from drake_dae.files import check_file
-from drake_dae.robots.surfaces.measured import read_mesh
+from drake_dae.files import check_file, read_mesh
 from drake_dae.scenario.robot_file.xml_tree import read_xml
 
 DRAWN: tuple[str, ...] = (".obj", ".gltf")

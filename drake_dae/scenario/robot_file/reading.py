@@ -29,12 +29,13 @@ from drake_dae.scenario.robot_file.robot import Robot
 
 _REMEDIES = {
     "inertia": "it takes the nearest possible moments of inertia",
-    "friction": "write friction as a !JointFriction under robot.known_forces",
-    "frictionloss": "write friction as a !JointFriction under robot.known_forces",
-    "mimic": "write it as a !JointCoupler under constraints",
-    "equality": "write it under constraints, two joints that move together as a !JointCoupler",
+    "friction": "robot.known_forces has friction as a !JointFriction",
+    "mimic": "constraints has two joints that move together as a !JointCoupler",
+    "equality/joint": "constraints has two joints that move together as a !JointCoupler",
+    "equality/weld": "constraints has it as a !WeldedFrames",
+    "equality/connect": "constraints has it as a !CoincidentPoints",
 }
-"""A word in the name of a lost part -> what to do besides."""
+"""What the name of a lost part contains -> what to do besides."""
 
 
 def read_robot(
@@ -202,8 +203,8 @@ def drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Itera
 def _lost(mender: Mender) -> str:
     """The message for what Drake does not read of the files."""
     text = "; ".join(f"{part} ({_listed(places)})" for part, places in mender.lost.items())
-    words = {word for part in mender.lost for word in part.split("/")}
-    hints = [remedy for word, remedy in _REMEDIES.items() if word in words]
+    found = {hint for part in mender.lost for word, hint in _REMEDIES.items() if word in part}
+    hints = sorted(found)
     if any(part.startswith(DRIVES) for part in mender.lost):
         hints.append("or name the driven joints under robot.actuators")
     return (

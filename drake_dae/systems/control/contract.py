@@ -3,8 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
@@ -54,10 +52,9 @@ class Controller(System):
        `all_parameters` are the parameters of its function. `set_gains` changes its gains in a
        context; a controller with fixed gains refuses.
     4. Plants. `check_plant` refuses a plant that does not fit.
-    5. Computed afterwards. With `follows` its control is `law.function` of the logged state,
-       reference, forces, integrals and parameters. Otherwise it is logged. `derived` are further
-       signals of a record, computed from the others. `compared` are outputs and their references
-       now, for the check of divergence.
+    5. Computed afterwards. `derived` are further signals of a record, computed from the others.
+       `compared` are outputs and their references now, for the check of divergence. With `follows`
+       its control is that of `law` alone.
     6. Theory. `predicted_error` is the predicted tracking error of a record.
     7. Starts. With `takes_over` its references start at the current outputs; otherwise they come
        from a generator, and a run starts at their start. A run starts on the manifold of
@@ -94,10 +91,6 @@ class Controller(System):
     def current_parameters(self, context: Context) -> FloatArray:
         """The parameters of the law's model at the context's time, shape (k,)."""
         return self.law.system.parameter_values
-
-    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        """The parameters of the law's function at the times of a run, one row for each."""
-        return np.tile(self.all_parameters(context), (np.size(times), 1))
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
         """Changes the gains of the law in a context.

@@ -1,9 +1,8 @@
 """The contract of a plant: the rules for wiring, records, pictures and starts."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiagramBuilder, System
@@ -48,17 +47,14 @@ class Plant(System):
        `projects` says whether the state is projected onto N* after each step; a record then has the
        state before the projection.
     4. Records. `further_signals` are the output ports in a record besides those of rule 1, with
-       names and units of their entries. `functions` names the output ports that `along` computes
-       afterwards from the log: "state", "control", "parameters" and the further ports that are not
-       among `functions`. For a plant without functions everything is logged at its steps.
+       names and units of their entries.
     5. Exogenous signals. Exogenous parameters come through an input port `exogenous`, stacked by
        `exogenous_layout`, in place of those at `exogenous_places`. Without a wire they keep their
        values. A plant without such a port has an empty layout and no places.
     6. Parameters. `parameters` are those of a context in the order of `dae.parameters`,
-       `current_parameters` the same with the current exogenous ones, and `parameters_along` those
-       at the times of a run. `set_parameter` changes one in a context; a plant with fixed numbers
-       refuses. `further_parameters` are those that follow them in numeric parameter 0 and may be
-       identified, each with its place there.
+       `current_parameters` the same with the current exogenous ones. `set_parameter` changes one in
+       a context; a plant with fixed numbers refuses. `further_parameters` are those that follow
+       them in numeric parameter 0, each with its place there.
     7. Starts. `set_state` sets x as given. `set_consistent_state` sets the state on N* next to a
        guess, and returns it. Both refuse wrong shapes.
     8. Contact. `is_ideal` says whether the constraints hold exactly. `friction` are the
@@ -72,7 +68,6 @@ class Plant(System):
     structure: ConstraintStructure
     model: RobotModel | None = None
     time_step: float = 0.0
-    functions: Collection[str] = ()
     exogenous_layout: DerivativeLayout = DerivativeLayout(())
     exogenous_places: list[int] = NOWHERE
     projects: bool = False
@@ -87,20 +82,6 @@ class Plant(System):
     def further_parameters(self) -> Mapping[str, tuple[Signal, int]]:
         """Name of a further parameter -> its name and unit, and its place."""
         return {}
-
-    def along(self, port: str, given: Mapping[str, FloatArray]) -> FloatArray:
-        """The values of a port of `functions` at given times, one row each; nan without a value.
-
-        Args:
-            port: The port's name.
-            given: "state", "parameters", "control" and the logged ports, one row for each time.
-
-        Raises:
-            ModelError: There is no such port.
-        """
-        raise ModelError(
-            f"{self.dae.name}: the values of its port '{port}' cannot be computed from a log"
-        )
 
     def parameters(self, context: Context) -> FloatArray:
         """All parameters in the order of `dae.parameters`, shape (k,)."""
@@ -117,10 +98,6 @@ class Plant(System):
             if (name := constraint.friction_parameter) is not None:
                 coefficients[constraint.name] = float(values[self.dae.parameter_slice(name)].item())
         return coefficients
-
-    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        """The parameters at the times of a run, in s, one row for each."""
-        return np.tile(self.parameters(context), (np.size(times), 1))
 
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter in a context.

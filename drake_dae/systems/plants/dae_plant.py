@@ -77,7 +77,6 @@ class DaePlant(ParameterizedSystem, Plant):
     Attributes:
         structure: The structure.
         projects: Whether the state is projected onto N* after each step.
-        functions: The names of the output ports that `along` computes from a log.
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
@@ -107,7 +106,6 @@ class DaePlant(ParameterizedSystem, Plant):
         self.structure, self._left_out = structure, manifold_of_left_out(structure.system)
         self.projects = block.projection is not None
         super().__init__(system, block, system.exogenous.degrees(*values))
-        self.functions = [n for n in _COMPUTED_AFTERWARDS if n in block.outputs]
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
 
     def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
@@ -177,15 +175,6 @@ class DaePlant(ParameterizedSystem, Plant):
         raise assembled_otherwise(
             self.dae.name, left_out, state, left_out.residual(state, parameters)
         )
-
-
-_COMPUTED_AFTERWARDS = (
-    "constraint_force",
-    "constraint_residual",
-    "controlled_output",
-    "loop_state",
-)
-"""The output ports that a record has without logging them."""
 
 
 def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:

@@ -14,10 +14,11 @@ from runs import run_scenario
 from vendors import joint, link, mobile_arm, panda, robot, write_panda
 
 from drake_dae import load_scenario
-from drake_dae.errors import ScenarioError
+from drake_dae.errors import RobotFileWarning, ScenarioError
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.changes import change_robot
+from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
@@ -397,3 +398,40 @@ def test_what_drake_refuses_to_change_is_reported(tmp_path):
     (tmp_path / "arm.yaml").write_text(FRICTION)
     with pytest.raises(ScenarioError, match=r"robot\.file: .*'k'"):
         scenario_model(load_scenario(tmp_path / "arm.yaml"))
+
+
+def test_a_joint_that_follows_with_multiplier_0_stands(tmp_path):
+    follow = '<mimic joint="j" multiplier="0" offset="0.3"/>'
+    joints = [joint("j", "base", "arm", "0 1 0"), joint("k", "arm", "hand", "0 1 0", rest=follow)]
+    bodies = [link(name, 1) for name in ("base", "arm", "hand")]
+    (tmp_path / "arm.urdf").write_text(robot("arm", *bodies, *joints))
+    (tmp_path / "arm.yaml").write_text(FRICTION)
+    with pytest.warns(RobotFileWarning, match="'k'"):
+        links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
+    assert [signal.name for signal in links.position_signals] == ["j"]
+    weld = links.plant.GetJointByName("k").X_FM()
+    np.testing.assert_allclose(RollPitchYaw(weld.rotation()).vector(), [0, 0.3, 0], atol=1e-15)
+
+
+MASS = "<inertial><mass>1</mass></inertial>"
+TURNS = (
+    '<joint name="{}" type="revolute"><parent>{}</parent><child>{}</child>{}<axis><xyz>0 1 0</xyz>'
+)
+TURNS += "</axis></joint>"
+OPEN = f"""<sdf version="1.9"><model name="m"><link name="a">{MASS}</link>
+<link name="b"><pose>0 0 1 0 0 0</pose>{MASS}</link><link name="c"><pose>1 0 0 0 0 0</pose>{MASS}
+</link><frame name="tip" attached_to="a"><pose>1.28 0 0 0 0 0</pose></frame>
+<joint name="hold" type="fixed"><parent>world</parent><child>a</child></joint>
+{TURNS.format("one", "a", "b", "")}{TURNS.format("two", "b", "c", "")}
+{TURNS.format("three", "tip", "c", "POSE")}</model></sdf>"""
+
+
+def test_a_loop_whose_named_parent_frame_is_elsewhere_is_told(tmp_path):
+    """SDFormat puts a joint at its child, and takes only the body of a frame that is its parent."""
+    file = tmp_path / "loop.sdf"
+    file.write_text(OPEN.replace("POSE", ""))
+    with pytest.raises(ScenarioError, match=r"'three'.* 0\.28 m .*'tip'"):
+        robot_links(Robot(str(file)), SceneGraph())
+    file.write_text(OPEN.replace("POSE", "<pose relative_to='tip'/>"))
+    _, (loop,) = robot_links(Robot(str(file)), SceneGraph())
+    assert loop.name == "three"

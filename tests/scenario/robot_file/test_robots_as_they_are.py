@@ -560,3 +560,36 @@ def test_a_robot_in_the_place_of_a_scenario_is_reported(name, tmp_path):
     file = written(tmp_path, text, name)
     with pytest.raises(ScenarioError, match="drake-dae new"):
         load_scenario(file)
+
+
+# MJCF with defaults.
+
+CLASSES = """<mujoco><compiler angle="degree" autolimits="true"/>
+<default><joint damping="0.3" armature="0.2"/><geom density="500"/>
+<default class="wrist"><joint axis="1 0 0" armature="0.05" range="-30 60"/>
+<geom type="capsule" size="0.03 0.1"/></default></default>
+<worldbody><body name="a" euler="10 20 30"><joint name="j1" axis="0 1 0"/>
+<geom type="box" size="0.1 0.2 0.3"/>
+<body name="b" childclass="wrist" pos="0 0 0.4"><joint name="j2"/><geom/>
+<body name="c" pos="0 0.1 0.3"><joint name="j3" class="main" axis="0 0 1"/><geom size="0.05 0.2"/>
+</body></body></body></worldbody></mujoco>"""
+
+
+def test_defaults_and_rotors_of_mjcf_are_those_of_mujoco(tmp_path):
+    """MuJoCo has M(q) and limits of the same file; its masses of capsules and boxes are exact."""
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(CLASSES)
+    data = mujoco.MjData(model)
+    plant = plant_of(written(tmp_path, CLASSES, "arm.xml"), actuators="all")
+    context = plant.CreateDefaultContext()
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        q, wanted = random.normal(size=3), np.zeros((3, 3))
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, wanted)
+        plant.SetPositions(context, q)
+        np.testing.assert_allclose(plant.CalcMassMatrix(context), wanted, atol=1e-12)
+    low = plant.GetPositionLowerLimits()
+    np.testing.assert_allclose(low, [-np.inf, -np.pi / 6, -np.inf])
+    assert [plant.GetJointByName(f"j{k}").default_damping() for k in (1, 2, 3)] == [0.3] * 3

@@ -21,7 +21,7 @@ from drake_dae import (
 )
 from drake_dae.arrays import listed
 from drake_dae.dae.system.signals import Signal
-from drake_dae.errors import ModelError, WiringError
+from drake_dae.errors import ModelError
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.simulation.records.record import Recorded
 
@@ -129,15 +129,6 @@ def test_rows_before_a_change_of_parameters_keep_the_old_ones():
     later = loop.record(context, 0.2)
     np.testing.assert_array_equal(later.time, record.time[record.time > 0.2])
     np.testing.assert_array_equal(later["control"], record["control"][record.time > 0.2])
-
-
-def test_a_fixed_port_of_the_controller_leaves_no_record():
-    """The state alone does not tell the control then."""
-    loop, context = build_scenario(scenario("two_link_wall"))
-    port = loop.controller.GetInputPort("reference")
-    port.FixValue(loop.controller.GetMyMutableContextFromRoot(context), np.zeros(port.size()))
-    with pytest.raises(WiringError, match="'reference' of tracking_controller"):
-        loop.record(context)
 
 
 def test_the_last_row_is_after_the_projection(run):

@@ -103,9 +103,6 @@ def test_rule_3_laws(controller):
     context = controller.CreateDefaultContext()
     values = controller.all_parameters(context)
     assert values.shape == controller.law.all_parameters().shape
-    np.testing.assert_array_equal(
-        controller.parameters_along(context, [0.0, 1.0]), [values, values]
-    )
     if controller.takes_over or isinstance(controller, RestingController):
         with pytest.raises(ModelError, match=type(controller).__name__):
             controller.set_gains(context, poles(-9.0))
@@ -166,7 +163,6 @@ def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
             last = 2.0 * outputs[-1] - outputs[-2]
         np.testing.assert_allclose(found, last, atol=1e-6)
         np.testing.assert_allclose(wanted, desired[-1], atol=1e-6)
-    assert ("control" in loop.logged) is not controller.follows
     assert len(controller.changes(own)) == (1 if controller.takes_over else 0)
 
 
@@ -176,7 +172,6 @@ def test_a_controller_that_is_sampled_is_logged(controller):
         controller = TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=SAMPLE)
     loop, context = wired(controller, sampling=Sampling(SAMPLE, delay=SAMPLE))
     simulate(loop.diagram, context, 0.02, fixed_step())
-    assert "control" in loop.logged
     assert np.isfinite(loop.record(context)["control"]).all()
 
 

@@ -142,17 +142,6 @@ def test_rule_3_state_and_steps(plant):
     np.testing.assert_array_equal(plant.GetOutputPort("state").Eval(own), plant.state(own))
 
 
-def test_rule_4_what_is_computed_afterwards_is_what_the_ports_showed(plant):
-    own, record = run_of(plant)
-    given = {name: record[name] for name in record.signals if name not in plant.functions}
-    given["parameters"] = plant.parameters_along(own, record.time)
-    given["control"] = np.tile(plant.GetInputPort("control").Eval(own), (record.time.size, 1))
-    for port in plant.functions:
-        np.testing.assert_allclose(plant.along(port, given), record[port], atol=FINE, err_msg=port)
-    with pytest.raises(ModelError, match="nothing"):
-        plant.along("nothing", given)
-
-
 def test_rule_5_exogenous_signals(plant):
     assert not plant.exogenous_layout.degrees  # Of this robot nothing moves.
     assert list(plant.exogenous_places) == []
@@ -164,7 +153,6 @@ def test_rule_6_parameters(plant):
     before = plant.parameters(context)
     np.testing.assert_array_equal(before, plant.dae.parameter_values)
     np.testing.assert_array_equal(plant.current_parameters(context), before)
-    np.testing.assert_array_equal(plant.parameters_along(context, [0.0, 1.0]), [before, before])
     with pytest.raises(ModelError, match="nothing"):
         plant.set_parameter(context, "nothing", 1.0)
     place = plant.dae.parameter_slice("link2.mass")

@@ -125,10 +125,6 @@ class CompliantPlant(ParameterizedSystem, Plant):
         value = float(context.get_numeric_parameter(0).GetAtIndex(place))
         return {constraint.name: value for constraint in self.robot("friction").constraints}
 
-    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        along = super().parameters_along(context, times)
-        return along[:, : self.dae.parameter_symbol.numel()]
-
     def state(self, context: Context) -> FloatArray:
         if not self.time_step:
             return super().state(context)
