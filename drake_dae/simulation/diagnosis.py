@@ -35,6 +35,9 @@ which it is why a run ends. Steps become too short long before it is zero."""
 NEARLY = 0.05
 """The same, at the last state that is found along a path that ends."""
 
+OFF = 0.1
+"""The distance from N*, in units of the states, up to which A(x) is judged."""
+
 PART = 0.3
 """An output takes part in a singular direction from this share of the largest part on."""
 
@@ -93,7 +96,7 @@ def explained(
     if state.size and plant.is_ideal and isinstance(own, ConstraintStructure):
         values = plant.dae.parameter_values if parameters is None else parameters
         margin, _ = _margin(own, own.elimination.constraint_matrix, state, values)
-        if margin < SINGULAR:
+        if margin < SINGULAR and _is_near_manifold(own, state, values):
             names = own.dependent_constraints(state, values)
             return singular_configuration(name, error.time, state, names)
     if structure is None:
@@ -149,6 +152,15 @@ def _dependent(
     if not margin < limit:
         return ()
     return tuple(signals[rows[i]].name for i in np.flatnonzero(part > PART * part.max()))
+
+
+def _is_near_manifold(
+    structure: ConstraintStructure, state: FloatArray, parameters: FloatArray
+) -> bool:
+    """Whether a state is no farther off N* than a few steps lead; elsewhere A(x) says nothing."""
+    manifold, scale = structure.manifold, structure.scale
+    usual = np.linalg.norm(manifold.gradients(structure.states[0]) * scale, axis=1)
+    return bool(np.all(np.abs(manifold.residual(state, parameters)) <= OFF * usual))
 
 
 def _margin(
