@@ -86,9 +86,9 @@ table: $(VENV)/installed-dev
 
 pictures: $(VENV)/installed
 	$(BIN)/drake-dae simulate wall_polish --out runs/polish
-	$(BIN)/drake-dae render runs/polish --force --out $(PICTURES)/wall_polish.gif
+	$(BIN)/drake-dae plot --film runs/polish --force --out $(PICTURES)/wall_polish.gif
 	$(BIN)/drake-dae simulate seven_joint_wall --set duration=8 --out runs/pictures
-	$(BIN)/drake-dae render runs/pictures --force --out $(PICTURES)/seven_joint_wall.gif
+	$(BIN)/drake-dae plot --film runs/pictures --force --out $(PICTURES)/seven_joint_wall.gif
 
 docs: $(VENV)/installed-docs
 	$(BIN)/python examples/book --out $(BOOK)

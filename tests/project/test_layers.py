@@ -37,7 +37,7 @@ def test_the_mathematics_loads_no_drake() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
-    [["list"], ["print"], ["print", "--path"], ["--version"], ["--help"], ["simulate", "--help"]],
+    [["list"], ["print"], ["print", "--path"], ["--version"], ["--help"]],
 )
 def test_what_needs_no_robot_loads_none(words: list[str]) -> None:
     code = (
@@ -50,13 +50,6 @@ def test_what_needs_no_robot_loads_none(words: list[str]) -> None:
     tops = {name.split(".")[0] for name in printed.splitlines()[-1].split()}
     assert "drake_dae" in tops
     assert tops.isdisjoint({"pydrake", "casadi", "scipy", "matplotlib", "pydantic", "tqdm"})
-
-
-@pytest.mark.slow
-def test_what_most_runs_do_not_need_loads_when_it_is_used() -> None:
-    loaded = loaded_with(["commands"])
-    assert "pydrake" in loaded
-    assert loaded.isdisjoint({"matplotlib", "scipy.integrate", "scipy.optimize"})
 
 
 @pytest.mark.slow
