@@ -4,8 +4,10 @@ import errno
 import os
 import stat
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
 from zipfile import ZipFile
 
@@ -156,3 +158,25 @@ def check_folder(folder: Path) -> None:
     """
     if os.path.lexists(folder) and not folder.is_dir():
         raise ModelError(f"'{folder}' is a file, and no folder; name a folder")
+
+
+@contextmanager
+def complete(folder: Path, *names: str) -> Iterator[Path]:
+    """A temporary folder for files, all or those named, which are moved when they are complete.
+
+    Raises:
+        OSError: A file cannot be written; the error names the first of the files if it has no other
+            path.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = TemporaryDirectory(prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True)
+    try:
+        with temporary as place:
+            yield Path(place)
+            for name in names or os.listdir(place):
+                Path(place, name).replace(folder / name)
+    except OSError as error:
+        # Errors of NumPy, zipfile and Pillow have no path, or one in the removed temporary folder.
+        if str(error.filename or temporary.name).startswith(temporary.name):
+            error.filename, error.filename2 = str(folder.joinpath(*names[:1])), None
+        raise

@@ -1,4 +1,4 @@
-"""One task on Drake's own contact, by our law and by what users would do today: `make peers`.
+"""One task on Drake's own contact, by our law and by what users would do today.
 
     python tests/benchmarks/contact_peers.py
 

@@ -19,11 +19,11 @@ from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_violation
 from drake_dae.dae.structure.dependence import find_dependence, redundant_constraints
 from drake_dae.dae.structure.redundancy import all_constraints_hold
-from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
+from drake_dae.dae.structure.relative_degrees import InputActions, constraint_chains
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibrated, positive, smallest_singular_value
+from drake_dae.trace.round_off import equilibrated, equilibration, positive, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 
@@ -129,8 +129,8 @@ def find_constraint_structure(
     if violation:
         raise violation.error()
     # Rows of n* that are only round-off are no feedthrough.
-    _, n_star = eliminated_at(samples, structure.elimination)
-    acts = np.any([value for value, _ in n_star], axis=(0, 2))
+    actions = InputActions(samples, structure.elimination)
+    acts = actions.numbers(actions.feedthrough).any(axis=(0, 2))
     rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
     feedthrough = ca.sparsify(ca.mtimes(rows, structure.elimination.n_star))
     return replace(structure, elimination=replace(structure.elimination, n_star=feedthrough))
@@ -286,7 +286,23 @@ def with_numbers(
 
     family = Family(manifold, states)
     if violation is None:
-        lost = family.lost(determinant)
+        usual = [
+            np.abs(function(x, system.parameter_values)[0]).reshape(matrix.shape) for x in states
+        ]
+        rows, columns = equilibration(np.mean(usual, axis=0))
+        sign = determinant(states[0], system.parameter_values)
+
+        @np.errstate(all="ignore")
+        def margin(state: FloatArray, parameters: FloatArray) -> float:
+            """The smallest singular value; minus one where the determinant has another sign."""
+            value = function(state, parameters)[0].reshape(matrix.shape) / rows[:, None] / columns
+            if not np.all(np.isfinite(value)):
+                return np.inf
+            if np.linalg.slogdet(value)[0] * sign < 0.0:
+                return -1.0
+            return smallest_singular_value(value)
+
+        lost = family.lost(margin, system.least_margin)
         return Violation(assumption, ViolationKind.BOUNDS, (), deciding=lost) if lost else None
     if any(determinant(state, system.parameter_values) for state in states):
         return violation

@@ -1,4 +1,4 @@
-"""`drake-dae new` and `analyze`: write a scenario for a robot, and examine one without a run."""
+"""`drake-dae new`, `analyze`: a scenario for a robot of one's own, and one that is examined."""
 
 import argparse
 import json
@@ -13,7 +13,7 @@ from pathlib import Path
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import number_in
-from drake_dae.commands.options import program
+from drake_dae.commands.parser import Parser, program, waiting
 from drake_dae.errors import DrakeDaeError, GeometryWarning, ScenarioError, SimulationError
 from drake_dae.files import check_unwritten
 from drake_dae.robots.surfaces.surface import Vector
@@ -22,7 +22,7 @@ from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
 from drake_dae.scenario.new import new_scenario
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.simulate import simulate
 
@@ -30,37 +30,41 @@ _LONGEST = 20.0
 """The time in s by the clock after which a new scenario is no longer checked."""
 
 
-def run_command(options: argparse.Namespace) -> int:
-    """Runs the command that the options name; returns the exit code."""
-    return {"new": _new, "analyze": _analyze}[options.command](options)
-
-
-def _analyze(options: argparse.Namespace) -> int:
-    """Prints the report on the scenario that the options name."""
-    path = find_scenario(options.scenario)
-    report = find_feasibility(load_scenario(path, options.settings))
-    if options.json:
-        print(json.dumps({"scenario": path.stem, **report.to_dict()}, indent=2))
-    else:
-        print(f"{path.stem}\n\n{report}")
-    return 2 if report.problems else 0
+def _new_options(parser: Parser) -> None:
+    parser.add_argument("robot", help="a URDF, SDFormat, MJCF or model-directives file")
+    surfaces = ("plane", "cylinder", "sphere")
+    parser.add_argument(
+        "--surface", choices=surfaces, default="plane", help="the surface (default: plane)"
+    )
+    parser.add_argument(
+        "--tip",
+        default="",
+        metavar="LINK[:x,y,z]",
+        help="the link or frame in contact, and the contact point in it in m (default: the end of "
+        "the longest chain)",
+    )
+    parser.out("FILE", "the file (default: <robot>_<surface>.yaml)")
 
 
 def _new(options: argparse.Namespace) -> int:
-    """Writes a scenario for the robot that the options name."""
-    robot = Path(options.robot)
-    out = options.out or Path(f"{robot.name.split('.')[0]}_{options.surface}.yaml")
+    """Writes a scenario for a robot of which only the file is known.
+
+    It finds base, chain and tip, locks grippers and wheels, places a surface within good reach of
+    the tip, and makes the tip circle and press there within the limits. Comments give the reasons.
+    A run checks it: the exit code is 0 if that is GOOD, and 2 otherwise.
+    """
+    out = options.out or Path(f"{Path(options.robot).name.split('.')[0]}_{options.surface}.yaml")
     check_unwritten([out], options.force)
     # The simulation reports what it leaves out, and Drake's parser warns of every tag.
     logging.getLogger("drake").setLevel(logging.ERROR)
+    began = time.perf_counter()
+
+    def tell(text: str) -> None:
+        print(f"{time.perf_counter() - began:4.1f} s: {text}", file=sys.stderr, flush=True)
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", GeometryWarning)
         tip, point = _tip(options.tip)
-        began = time.perf_counter()
-
-        def tell(text: str) -> None:
-            print(f"{time.perf_counter() - began:4.1f} s: {text}", file=sys.stderr, flush=True)
-
         where = options.robot, options.surface, tip, point, out.parent
         _, text = new_scenario(*where, progress=tell)
         out.write_text(text, encoding="utf-8")
@@ -92,17 +96,36 @@ def _check(scenario: Scenario, end: float) -> str:
 
 
 def _tip(text: str) -> tuple[str, Vector]:
-    """The frame and the point in a text "LINK" or "LINK:x,y,z".
-
-    Raises:
-        ScenarioError: The point is not three numbers.
-    """
+    """The frame and the point in a text "LINK" or "LINK:x,y,z"."""
     match = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
     if match is None:
         return text, (0.0, 0.0, 0.0)
-    numbers = [number_in(word) for word in match[2].split(",")]
-    x, y, z = numbers if len(numbers) == 3 else (None, None, None)
-    if x is None or y is None or z is None:
+    numbers = [number for word in match[2].split(",") if (number := number_in(word)) is not None]
+    if len(numbers) != 3 or match[2].count(",") != 2:
         form = "LINK or LINK:x,y,z with three numbers in m"
         raise ScenarioError(("--tip", f"expected {form}, got '{text}'"))
-    return match[1], (x, y, z)
+    return match[1], (numbers[0], numbers[1], numbers[2])
+
+
+def _analyze_options(parser: Parser) -> None:
+    parser.scenario(DEFAULT_SCENARIO)
+    parser.json("print the report")
+    parser.epilog = "exit code: 0, or 2 if a problem was found (the lines PROBLEM)"
+
+
+def _analyze(options: argparse.Namespace) -> int:
+    """Examines the robot of a scenario and what its reference takes.
+
+    Of the robot: relative degrees, index, Assumptions (1)-(5), zero dynamics. Of the reference: the
+    nearest singularity, control and joint forces against their limits, contact forces, joint
+    limits, and when it leaves what the robot can reach.
+    """
+    path = find_scenario(options.scenario)
+    with waiting(f"analyzing {path.stem}"):
+        report = find_feasibility(load_scenario(path, options.settings))
+    as_json = {"scenario": path.stem, **report.to_dict()}
+    print(json.dumps(as_json, indent=2) if options.json else f"{path.stem}\n\n{report}")
+    return 2 if report.problems else 0
+
+
+COMMANDS = {"new": (_new_options, _new), "analyze": (_analyze_options, _analyze)}
