@@ -43,7 +43,7 @@ from drake_dae.scenario.motion import exogenous_references, reference_and_start,
 from drake_dae.scenario.robot_file.links import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.judgement import FindingKind, Outcome, RunFinding, judge
-from drake_dae.simulation.limits import ranges_of, robot_limits
+from drake_dae.simulation.limits import limited_values, robot_limits
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import RunSummary
@@ -59,6 +59,9 @@ range; and the shortest interval that is divided, relative to the whole."""
 
 MOST_TIMES = 2000
 """The most times of a record at which its references are examined."""
+
+BREAK = 0.01
+"""The share of a run that broke off, at its end, in which its limits are not judged."""
 
 WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
 """The remedy for a link behind a surface."""
@@ -344,12 +347,16 @@ def judge_run(
     """
     model, changes = loop.plant.robot("a scenario"), loop.changes(context)
     limits = robot_limits(model, scenario.judgement.friction_cones)
-    ranges, own = ranges_of(limits, record), loop.plant_parameters(record, context)
+    own, stop = loop.plant_parameters(record, context), record.time.size
+    if failure:  # The last numbers of a run that broke off are not those of its motion.
+        first, last = record.time[[0, -1]]
+        stop = max(1, int(np.searchsorted(record.time, last - BREAK * (last - first))))
+    ranges = limits.ranges(record.time[:stop], limited_values(limits, record)[:stop])
     behind = []
     for link in links_behind(model, record.time, record["state"], own):
         numbers = Signal(link.link, "m"), link.depth, 0.0, link.time
         behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
-    is_paced = any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
+    is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
     remedies = _slower(loop, model, limits, record) if is_paced else []
     notes = [constraint.remark for constraint in model.constraints]
     notes += [_beyond_edge(constraint, model, record) for constraint in model.constraints]

@@ -236,7 +236,10 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, dict
             locked[names[joint.index()]] = float(min(max(0.0, low), high))
     why["locked"] = "m or rad; all that is not of the chain, or mimics"
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
-    actuators = None if all(joint.index() in driven for joint in chain) else "all"
+    is_driven = all(joint.index() in driven for joint in chain)
+    # Motors that Drake does not read are no loss where the scenario names the driven joints.
+    is_driven &= parts_to_leave_out(replace(robot, actuators=None)) == robot.leave_out
+    actuators = None if is_driven else "all"
     why["actuators"] = "that are not locked: the file drives not all of them"
     directions = _directions(plant, chain, tip, point)
     if not any(point) and directions < min(len(chain), 3):
