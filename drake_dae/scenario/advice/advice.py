@@ -19,10 +19,10 @@ from drake_dae.scenario.advice.sensed import (
 )
 from drake_dae.scenario.advice.touch import Touching, reaction_time, rounded
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.task_controller import opening_contact
 
 _SOFTER = 5.0
 """The ratio of the poles of positions to those of the distance, of a robot without contact."""
