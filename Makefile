@@ -15,7 +15,6 @@ VERSION := $(shell "$(PYTHON)" -c '$(PROBE)' 2>/dev/null)
 VENV := .venv-$(VERSION)
 BIN := $(VENV)/bin
 PICTURES := examples/pictures
-HOUSE := $(PICTURES)/house.png
 BOOK ?= build/book
 
 # Tests start some hundred processes, which compile all of the code again where none is kept.
@@ -24,12 +23,14 @@ unexport PYTHONDONTWRITEBYTECODE
 # One process per core; one that has nothing left to do takes tests from another.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-# The oldest processor that OpenBLAS has code for, and NumPy without what it found in this one.
-# On other processors than x86 the first changes nothing.
-OLD := OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES="$$($(BIN)/python -c 'import numpy; \
-	print(*numpy.show_config("dicts")["SIMD Extensions"].get("found", ()))')"
+# The tables that `make table` makes: each with its own environment, and its program.
+TABLE_friction := examples/unknown_friction
+TABLE_referee := -m referee
+TABLE_robots := tests/campaign/real_robots.py
+TABLE_equations := tests/support/equations.py
+TABLE_peers := tests/benchmarks/contact_peers.py
 
-.PHONY: help demo check test processor benchmark campaign robots friction peers house equations pictures docs referee clean lint
+.PHONY: help demo check test benchmark campaign docs pictures clean table
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 
@@ -37,15 +38,14 @@ help:
 	@echo 'make demo [SCENARIO=$(SCENARIO)]  simulate a scenario into runs/'
 	@echo 'make check       lint, types and the quick tests: the daily round, some four minutes'
 	@echo 'make test        lint, types and tests: a quarter of an hour on two cores'
-	@echo 'make processor   quick tests of numbers, rounded as on another processor; some minutes'
 	@echo 'make benchmark   speed, with ratios, beside peers that it installs; some 10 minutes'
 	@echo 'make campaign    bad inputs, random robots, memory, the dearest tests: hours'
-	@echo 'make robots      robots of packages, from drake-dae new to a run; an hour'
-	@echo 'make peers       our law beside others on the same contact, as a table: half an hour'
-	@echo 'make referee     constraint forces of four engines and the right ones, into tests/benchmarks/referee/table.md'
-	@echo 'make friction    the table of contact whose friction the law does not know: some minutes'
-	@echo 'make house       draw who imports whom, into $(HOUSE)'
-	@echo 'make equations   from each equation of the paper to its line and its test'
+	@echo 'make table NAME=friction|referee|robots|equations|peers [ARGS=...]'
+	@echo '    friction     contact whose friction the law does not know: some minutes'
+	@echo '    referee      constraint forces of four engines and the right ones: some minutes'
+	@echo '    robots       robots of packages, from drake-dae new to a run: an hour'
+	@echo '    equations    from each equation of the paper to its line and its test'
+	@echo '    peers        our law beside others on the same contact: half an hour'
 	@echo 'make pictures    film the demo and a task, into $(PICTURES)/'
 	@echo 'make docs        run the pages of the book and make its site, in $(BOOK)/site/'
 	@echo 'make clean       remove environments, caches and packages; keeps runs/'
@@ -54,20 +54,19 @@ help:
 demo: $(VENV)/installed
 	$(BIN)/drake-dae simulate $(SCENARIO) --out runs/$(SCENARIO)
 
-lint: $(VENV)/installed-dev
+define LINT
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+endef
 
-check: lint
+check: $(VENV)/installed-dev
+	$(LINT)
 	$(PYTEST) -m 'not slow and not thorough'
 
-test: lint
+test: $(VENV)/installed-dev
+	$(LINT)
 	$(PYTEST) -m 'not thorough'
-
-processor: $(VENV)/installed-dev
-	$(OLD) $(PYTEST) -m 'not slow and not thorough' $(addprefix tests/, \
-		analysis dae literature robots systems trace test_symbolic.py)
 
 benchmark: $(VENV)/installed-benchmark
 	$(BIN)/python -m pytest tests/benchmarks -q
@@ -78,31 +77,18 @@ campaign: $(VENV)/installed-dev
 	$(PYTEST) -m thorough
 	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_tasks.py --count 1000 --seed $(SEED)
 
-# Those of example-robot-data, and of pybullet_data and robosuite where these are installed.
-robots: $(VENV)/installed-dev
-	$(BIN)/python tests/campaign/real_robots.py $(ARGS)
-
-friction: $(VENV)/installed
-	$(BIN)/python examples/unknown_friction
-
-peers: $(VENV)/installed
-	$(BIN)/python tests/benchmarks/contact_peers.py
-
-# Engines that are not installed are left out: .[referee] brings them.
-referee: $(VENV)/installed-dev
-	PYTHONPATH=tests/benchmarks $(BIN)/python -m referee $(ARGS)
-
-house: $(VENV)/installed-dev
-	$(BIN)/python tests/support/draw_house.py $(HOUSE)
-
-equations:
-	@$(PYTHON) tests/support/equations.py
+# Robots are those of example-robot-data, and of pybullet_data and robosuite where these are
+# installed; engines of the referee that are not installed are left out: .[referee] brings them.
+table: $(VENV)/installed-dev
+	@test -n '$(TABLE_$(NAME))' || \
+		{ echo 'NAME is friction, referee, robots, equations or peers' >&2; exit 1; }
+	PYTHONPATH=tests/benchmarks $(BIN)/python $(TABLE_$(NAME)) $(ARGS)
 
 pictures: $(VENV)/installed
 	$(BIN)/drake-dae simulate wall_polish --out runs/polish
-	$(BIN)/drake-dae render runs/polish --force --out $(PICTURES)/wall_polish.gif
+	$(BIN)/drake-dae plot --film runs/polish --force --out $(PICTURES)/wall_polish.gif
 	$(BIN)/drake-dae simulate seven_joint_wall --set duration=8 --out runs/pictures
-	$(BIN)/drake-dae render runs/pictures --force --out $(PICTURES)/seven_joint_wall.gif
+	$(BIN)/drake-dae plot --film runs/pictures --force --out $(PICTURES)/seven_joint_wall.gif
 
 docs: $(VENV)/installed-docs
 	$(BIN)/python examples/book --out $(BOOK)

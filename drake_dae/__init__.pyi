@@ -105,7 +105,7 @@ from .scenario.build import build_scenario as build_scenario
 from .scenario.commanded import build_commanded as build_commanded
 from .scenario.files import load_scenario as load_scenario
 from .scenario.model import complete_scenario as complete_scenario
-from .scenario.new.new_scenario import new_scenario as new_scenario
+from .scenario.new import new_scenario as new_scenario
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .simulation.records.record import Record as Record

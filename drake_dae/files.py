@@ -4,15 +4,23 @@ import errno
 import os
 import stat
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from tempfile import TemporaryDirectory
+from typing import Any, BinaryIO
 from zipfile import ZipFile
+
+import numpy as np
+from numpy.typing import NDArray
 
 from drake_dae.errors import ModelError
 
 MOST_BYTES = 1 << 28
 """The largest size of a file of data: so many bytes of numbers take gigabytes in Python."""
+
+MESHES = (".obj", ".stl", ".ply", ".off", ".dae", ".gltf", ".glb")
+"""Kinds of meshes that are read: none of them is packed."""
 
 MOST_RECORDED = 1 << 31
 """The largest size of a record, unpacked."""
@@ -100,6 +108,31 @@ def read_text(path: str | Path, most: int = MOST_BYTES) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
+def read_mesh(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The vertices of a mesh, shape (n, 3), in its unit, and its triangles, shape (k, 3).
+
+    Raises:
+        ModelError: It cannot be read, or the package trimesh is not installed.
+    """
+    check_file(file, ModelError)
+    if file.suffix.lower() not in MESHES:
+        raise ModelError(f"'{file.name}' is none of the meshes that are read: {', '.join(MESHES)}")
+    try:
+        import trimesh
+    except ImportError:
+        raise ModelError(f"'{file.name}': pip install 'drake_dae[meshes]' to read meshes") from None
+    try:
+        mesh: Any = trimesh.load(file, force="mesh")
+        vertices, triangles = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
+        corners = vertices[triangles]
+        if not (corners.size and corners.shape[1:] == (3, 3) and np.all(np.isfinite(corners))):
+            raise ValueError("it has no triangles, or no numbers")
+    except Exception as error:  # trimesh has no exceptions of its own.
+        reason = " ".join(str(error).split())[:200]
+        raise ModelError(f"no mesh in '{file.name}': {reason}") from None
+    return vertices, triangles
+
+
 def check_unwritten(files: Iterable[Path], force: bool) -> None:
     """The rule of all commands: a file is replaced by --force alone, and what is no file never.
 
@@ -125,3 +158,25 @@ def check_folder(folder: Path) -> None:
     """
     if os.path.lexists(folder) and not folder.is_dir():
         raise ModelError(f"'{folder}' is a file, and no folder; name a folder")
+
+
+@contextmanager
+def complete(folder: Path, *names: str) -> Iterator[Path]:
+    """A temporary folder for files, all or those named, which are moved when they are complete.
+
+    Raises:
+        OSError: A file cannot be written; the error names the first of the files if it has no other
+            path.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = TemporaryDirectory(prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True)
+    try:
+        with temporary as place:
+            yield Path(place)
+            for name in names or os.listdir(place):
+                Path(place, name).replace(folder / name)
+    except OSError as error:
+        # Errors of NumPy, zipfile and Pillow have no path, or one in the removed temporary folder.
+        if str(error.filename or temporary.name).startswith(temporary.name):
+            error.filename, error.filename2 = str(folder.joinpath(*names[:1])), None
+        raise

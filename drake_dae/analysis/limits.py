@@ -246,7 +246,8 @@ def limits_along(
     def slowed(i: int, rate: float, force: float = 1.0) -> FloatArray:
         goal = goals[i] * rate**powers
         goal[commanded] *= force
-        point = pinned.point(pinned.state(goal, motion.states[i], p[i]), goal, p[i])
+        at = pinned.at(goal, p[i])
+        point = at.point(at.state(motion.states[i]))
         return limits.pinned_values(point.state, point.control, point.constraint_input, p[i])[0]
 
     def worst(rate: float, chosen: Sequence[int] = range(times.size)) -> Excess | None:

@@ -31,13 +31,9 @@ def cannot_go_on(
         reason: The reason, in words.
         remedy: What to do if neither the loop nor its reference is the cause.
     """
-    return SimulationError(
-        f"the simulation cannot go on at t = {time:.6g} s, state {show_state(state)}: "
-        f"{reason.rstrip('.')}. If the state grows without bound, or a reference is out of "
-        f"reach, change these; otherwise {remedy}",
-        time,
-        state,
-    )
+    where = f"at t = {time:.6g} s, state {show_state(state)}"
+    text = f"the simulation cannot go on {where}: {reason.rstrip('.')}"
+    return SimulationError(f"{text}. If nothing else is wrong, {remedy}", time, state)
 
 
 def simulation_error(

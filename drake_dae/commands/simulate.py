@@ -6,270 +6,265 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable
-from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 
 import drake_dae
-from drake_dae.commands.options import program
-from drake_dae.commands.play import show
-from drake_dae.commands.run.files import RunFiles
-from drake_dae.commands.run.folder import (
-    ANIMATION,
-    FILES,
-    MARK,
-    PART,
-    SCENARIO,
-    new_folder,
-    run_folder,
-)
+from drake_dae.commands.folder import FILES, PART, RECORD, SCENARIO, SUMMARY, show
+from drake_dae.commands.parser import Parser, program, waiting
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import DrakeDaeError, ScenarioError
-from drake_dae.pictures.plots import PLOTS
+from drake_dae.errors import DrakeDaeError, ScenarioError, describe_os_error
+from drake_dae.files import check_folder, check_unwritten, complete
+from drake_dae.pictures.run_pictures import ANIMATION, save_animation, save_run_plots
 from drake_dae.pictures.scene.view import start_meshcat
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.completion.completion import Completed
 from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.scenario import Scenario, scenario_data
-from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.judgement import Outcome
-from drake_dae.simulation.real_time import attainable_rate
 from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
-from drake_dae.simulation.records.record import Record, RecordAfter
+from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
 from drake_dae.simulation.records.record_writer import RecordWriter
 from drake_dae.simulation.simulate import RunStatistics, simulate
 from drake_dae.simulation.summary import RunSummary
 
 
-def run_command(options: argparse.Namespace) -> int:
-    """Runs the scenario that the options name; returns the exit code."""
-    path = find_scenario(options.scenario)
-    scenario = load_scenario(path, options.settings)
-    if options.open and not scenario.write.animation:
-        raise ScenarioError(
-            ("write.animation", ("--open shows the animation, so write.animation must be true"))
-        )
+def _options(parser: Parser) -> None:
+    parser.scenario(DEFAULT_SCENARIO)
+    parser.out("FOLDER", "folder for the results (default: runs/<scenario>-<time>)")
+    parser.flag("--meshcat", "show the robot while it runs, in a browser")
+    parser.flag("--open", "open the animation in a browser at the end")
+    parser.flag("--rollout", "run the whole loop as one function, without Drake's Simulator")
+    parser.flag("--check", "exit code 2 for a run that missed its task")
+    parser.json("print the verdict and the files, and all else on stderr,")
+
+
+def _command(options: argparse.Namespace) -> int:
+    """Runs a scenario and writes its record, a summary and an animation into a folder.
+
+    The first line of the summary says whether the run is GOOD, BAD or UNDECIDED, and why. A rollout
+    is faster for many runs (see sweep), not for one; its record has every fixed step, or 1000 rows
+    under error control.
+    """
     if not options.json:
-        return _simulate(options, path.stem, scenario)[0]
+        return _simulate(options)[0]
     with redirect_stdout(sys.stderr):
-        code, results = _simulate(options, path.stem, scenario)
+        code, results = _simulate(options)
     print(json.dumps(results, indent=2))
     return code
 
 
-def _simulate(
-    options: argparse.Namespace, name: str, scenario: Scenario
-) -> tuple[int, dict[str, Any]]:
+def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Runs a scenario; returns the exit code, and the results for JSON."""
-    if options.meshcat:
-        scenario.integrator.target_realtime_rate = scenario.integrator.target_realtime_rate or 1.0
-    meshcat = start_meshcat() if options.meshcat else None
-    began, remark = time.perf_counter(), ""
+    # The scenario, and whether its files may be written.
+    path = find_scenario(options.scenario)
+    scenario, remarks = load_scenario(path, options.settings), list[str]()
+    if options.open and not scenario.write.animation:
+        text = "--open shows the animation, so write.animation must be true"
+        raise ScenarioError(("write.animation", text))
+    if options.rollout and options.meshcat:
+        raise ScenarioError(("--meshcat", "leave it out: --rollout shows nothing while it runs"))
+    if options.out is not None:
+        check_folder(options.out)
+        check_unwritten((options.out / name for name in (*FILES, PART)), options.force)
+
+    # The loop at its start.
+    began = time.perf_counter()
     if options.rollout:
         from drake_dae.scenario.rolled import for_rollout
 
-        scenario, remark = for_rollout(scenario)
-    completed, loop = build_completed(scenario, meshcat)
-    scenario, context = completed.scenario, start_scenario(completed.scenario, loop)
-    simulate_by = _roll if options.rollout else _step
-    print(f"{name}: built in {time.perf_counter() - began:.2f} s", flush=True)
-    for note in (*completed.notes, *filter(None, [remark])):
-        print(note, flush=True)
-    folder = options.out or _unused(f"{name}-{datetime.now():%Y%m%d-%H%M%S}")
-    with ending_signals(end_at_once), run_folder(folder) as moved_to:
-        if moved_to is not None:
-            print(f"the earlier run in {folder}/ is kept in {moved_to}/", flush=True)
-        save_scenario(scenario, folder / SCENARIO, f"{MARK} {drake_dae.__version__}")
-        if meshcat is not None:
-            print(f"watch at {meshcat.web_url()}", flush=True)
-        title = f"{name}: {scenario.description}" if scenario.description else name
-        code, results = _run(loop, context, completed, folder, simulate_by, title)
+        scenario, *remarks = for_rollout(scenario)
+    if options.meshcat:
+        rate = scenario.integrator.target_realtime_rate
+        scenario.integrator.target_realtime_rate = rate or 1.0
+    meshcat = start_meshcat() if options.meshcat else None
+    with waiting(f"building {path.stem}"):
+        completed, loop = build_completed(scenario, meshcat)
+        scenario, context = completed.scenario, start_scenario(completed.scenario, loop)
+    notes = [*completed.notes, *filter(None, remarks)]
+    took = f"{path.stem}: built in {time.perf_counter() - began:.2f} s"
+    print(took, *notes, sep="\n", flush=True)
+
+    # The run, in a folder of its own.
+    name = f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+    unused = (Path("runs", name if i == 1 else f"{name}-{i}") for i in count(1))
+    folder = options.out or next(path for path in unused if not path.exists())
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in (*FILES, PART):
+        (folder / file).unlink(missing_ok=True)
+    first_line = f"# Scenario as run by drake-dae {drake_dae.__version__}"
+    save_scenario(scenario, folder / SCENARIO, first_line)
+    title = f"{path.stem}: {scenario.description}".removesuffix(": ")
+    run = _Run(scenario, loop, context, folder, title, notes)
+    with _watched(meshcat):
+        code, results = run.made(options.rollout)
     if options.open:
         show(folder)
     if code == 0 and options.check and results.get("missed"):
         code = 2
-    return code, {"scenario": name, "folder": str(folder), **results}
+    return code, {"scenario": path.stem, "folder": str(folder), **results}
 
 
-def _unused(name: str) -> Path:
-    """A new folder below runs/."""
-    runs = Path("runs")
-    runs.mkdir(exist_ok=True)
-    return new_folder(runs / (name if i == 1 else f"{name}-{i}") for i in count(1))
+@contextmanager
+def _watched(meshcat: Meshcat | None) -> Iterator[None]:
+    """Waits on a terminal for somebody who looks, and at the end for Enter: then the view ends."""
+    if meshcat is not None:
+        print(f"watch at {meshcat.web_url()}", flush=True)
+    is_asked = meshcat is not None and sys.stdin is not None and sys.stdin.isatty()
+    while is_asked and meshcat is not None and not meshcat.GetNumActiveConnections():
+        time.sleep(0.1)
+    yield
+    if is_asked:
+        input("the view stays until you press Enter")
 
 
 @dataclass
-class _CommandRun:
-    """A run of the command: its loop, context and scenario, and what it has recorded."""
+class _Run:
+    """A run of the command, what it has recorded, and which files it could not write."""
 
+    scenario: Scenario
     loop: ClosedLoop
     context: Context
-    completed: Completed
-    writer: RecordWriter
+    folder: Path
+    title: str
+    notes: list[str]
     statistics: RunStatistics | None = None
-    record: Record | None = None
     recorded: RecordAfter | None = None
+    problems: list[str] = field(default_factory=list)
 
-    @property
-    def scenario(self) -> Scenario:
-        """The completed scenario."""
-        return self.completed.scenario
+    def made(self, by_rollout: bool) -> tuple[int, dict[str, Any]]:
+        """Runs and writes the files, also if the run fails or is interrupted.
 
+        Returns:
+            The exit code, and the results.
+        """
+        failure, about = "", {"scenario": scenario_data(self.scenario)}
+        with RecordWriter(self.folder / PART, self._record, about) as writer:
+            try:
+                (self._roll if by_rollout else self._step)(writer)
+            except DrakeDaeError as error:
+                failure = str(error)
+                raise
+            except KeyboardInterrupt:
+                failure = "interrupted in the middle of a step"
+                raise
+            finally:
+                results = self._write(writer, failure)
+        if self.statistics is not None and self.statistics.interrupted:
+            return 128 + self.statistics.interrupted, results
+        return 1 if self.problems else 0, results
 
-def _step(run: _CommandRun) -> RunStatistics:
-    """Runs by Drake's Simulator."""
-    _warn_of_rate(run)
-    return simulate(
-        run.loop.diagram,
-        run.context,
-        run.scenario.duration,
-        run.scenario.integrator,
-        progress=True,
-        look=run.writer.update if run.scenario.write.record else None,
-        may_diverge=run.scenario.judgement.may_diverge,
-    )
+    def _record(self, context: Context, after: float | None = None) -> Record:
+        found = self.recorded
+        return self.loop.record(context, after) if found is None else found(after)
 
-
-def _warn_of_rate(run: _CommandRun) -> None:
-    """Warns if this machine is too slow for a run in real time."""
-    scenario, config = run.scenario, run.scenario.integrator
-    target = config.target_realtime_rate
-    if not target:
-        return
-    rate = attainable_rate(run.loop.diagram, run.context, scenario.duration, config)
-    if rate is not None and rate < target:
-        print(
-            f"runs at about {rate:.2g} times real time here, not at {target:g}: the view is slow "
-            "motion. Machine code (--compiled true, with a C compiler) and larger steps are faster",
-            flush=True,
+    def _step(self, writer: RecordWriter) -> None:
+        """Runs by Drake's Simulator."""
+        self.statistics = simulate(
+            self.loop.diagram,
+            self.context,
+            self.scenario.duration,
+            self.scenario.integrator,
+            progress=True,
+            look=writer.update if self.scenario.write.record else None,
+            may_diverge=self.scenario.judgement.may_diverge,
         )
 
+    def _roll(self, writer: RecordWriter) -> None:
+        """Runs by `rollout`."""
+        from drake_dae.scenario.rolled import roll_scenario
 
-def _roll(run: _CommandRun) -> RunStatistics:
-    """Runs by `rollout`.
+        began = time.perf_counter()
 
-    Raises:
-        SimulationError: The run cannot continue.
-    """
-    from drake_dae.scenario.rolled import roll_scenario
+        def look(record: RecordAfter) -> bool:
+            self.recorded = record
+            if self.scenario.write.record:
+                writer.update(self.context)
+            return ending.signal is not None
 
-    began = time.perf_counter()
+        with ending_signals(ending := Interruption()), waiting("rolling out"):
+            rollout = roll_scenario(self.scenario, self.loop, self.context, look=look)
+        self.recorded = rollout.record.after
+        self.context = rollout.context or self.context
+        if rollout.failure is not None:
+            raise rollout.failure
+        times, wall = rollout.record.time, time.perf_counter() - began
+        simulated = float(times[-1] - times[0]) if times.size else 0.0
+        self.statistics = RunStatistics(simulated, wall, rollout.steps, ending.signal)
 
-    def look(record: RecordAfter) -> bool:
-        run.recorded = record
-        if run.scenario.write.record:
-            run.writer.update(run.context)
-        return ending.signal is not None
-
-    with ending_signals(ending := Interruption()):
-        rollout = roll_scenario(run.scenario, run.loop, run.context, look=look)
-    run.record, run.recorded = rollout.record, rollout.record.after
-    run.context = rollout.context or run.context
-    if rollout.failure is not None:
-        raise rollout.failure
-    times, wall = run.record.time, time.perf_counter() - began
-    simulated = float(times[-1] - times[0]) if times.size else 0.0
-    return RunStatistics(simulated, wall, rollout.steps, ending.signal)
-
-
-def _run(
-    loop: ClosedLoop,
-    context: Context,
-    completed: Completed,
-    folder: Path,
-    simulate_by: Callable[[_CommandRun], RunStatistics],
-    title: str,
-) -> tuple[int, dict[str, Any]]:
-    """Runs, and writes the files, also if the run fails or is interrupted."""
-    about = {"scenario": scenario_data(completed.scenario)}
-
-    def recorded(context: Context, after: float | None) -> Record:
-        return loop.record(context, after) if run.recorded is None else run.recorded(after)
-
-    files, failure = RunFiles(folder), ""
-    with RecordWriter(folder / PART, recorded, about) as writer:
-        run = _CommandRun(loop, context, completed, writer)
+    def _write(self, writer: RecordWriter, failure: str) -> dict[str, Any]:
+        """Writes the files and prints the summary; returns the results."""
+        # A signal from here on takes effect after the record is written and before the pictures.
+        with ending_signals(ending := Interruption()):
+            record, wanted = self._record(self.context), self.scenario.write
+            if record.time.size == 0:
+                return {}
+            judged = self.scenario, self.loop, self.context, record, self.statistics, failure
+            summary = judge_run(*judged)
+            if wanted.record:
+                self._attempt(self._write_record, record, writer)
+            self._attempt(self._write_summary, "\n".join([summary.text, *self.notes, ""]))
         try:
-            run.statistics = simulate_by(run)
-        except DrakeDaeError as error:
-            failure = str(error)
-            raise
-        except KeyboardInterrupt:
-            failure, title = "interrupted in the middle of a step", ""
-            raise
+            if ending.signal is not None:
+                end_at_once(ending.signal)
+            drawn = record, self.loop, self.context, self.folder
+            is_drawn = not failure.startswith("interrupted")
+            with waiting("drawing"):
+                if wanted.plots and is_drawn:
+                    predicted = self.loop.predicted_error(record)
+                    self._attempt(save_run_plots, *drawn, predicted, summary.accuracy)
+                if wanted.animation and is_drawn:
+                    self._attempt(save_animation, *drawn, self.title)
         finally:
-            results = _write(run, files, failure, title)
-    if run.statistics.interrupted:
-        return 128 + run.statistics.interrupted, results
-    return 1 if files.problems else 0, results
+            written = [name for name in (*FILES, PART) if (self.folder / name).exists()]
+            self._attempt(self._tell, summary, written)
+            print("".join(f"error: {line}\n" for line in self.problems), end="", file=sys.stderr)
+        return {**summary.data, "files": written}
 
+    def _attempt(self, write: Callable[..., None], *arguments: Any) -> None:
+        """Writes something; other files are written also if this one cannot be."""
+        try:
+            write(*arguments)
+        except OSError as error:
+            self.problems.append(describe_os_error(error))
 
-def _write(run: _CommandRun, files: RunFiles, failure: str, title: str) -> dict[str, Any]:
-    """Writes the files, prints the summary, and returns the results.
+    def _write_record(self, record: Record, writer: RecordWriter) -> None:
+        """Writes the record with the predicted error, in place of the one written in the run."""
+        predicted = self.loop.predicted_error(record), record.signals["tracking_error"].signals
+        signals = {**record.signals, "predicted_error": Recorded(*predicted)}
+        try:
+            with complete(self.folder, RECORD) as place:
+                replace(record, signals=signals, about=writer.about).save(place / RECORD)
+        except OSError:
+            with suppress(OSError):
+                writer.finish(self.context)  # The rows that still fit.
+            raise
+        writer.path.unlink(missing_ok=True)
 
-    Args:
-        run: The run, which has ended.
-        files: Its files.
-        failure: The reason of its failure; empty if it did not fail.
-        title: The title of the animation; empty for a run without pictures.
-    """
-    scenario, wanted = run.scenario, run.scenario.write
-    # A signal from here on takes effect after the record is written and before the pictures.
-    with ending_signals(ending := Interruption()):
-        record = run.record or run.loop.record(run.context)
-        if record.time.size == 0:
-            return {}
-        report = judge_run(scenario, run.loop, run.context, record, run.statistics, failure)
-        if wanted.record:
-            files.write_record(record, run.loop, run.writer, run.context)
-        files.write_summary(report, *run.completed.notes)
-    try:
-        if ending.signal is not None:
-            end_at_once(ending.signal)
-        if title:
-            files.write_pictures(report, run.loop, run.context, wanted, title)
-    finally:
-        written = _print_report(report, files)
-    return {**report.data, "files": written}
+    def _write_summary(self, text: str) -> None:
+        with complete(self.folder, SUMMARY) as place:
+            (place / SUMMARY).write_text(text, encoding="utf-8")
 
-
-def _print_report(report: RunSummary, files: RunFiles) -> list[str]:
-    """Prints the verdict, the summary and the problems; returns the names of the files."""
-    folder = files.folder
-    written = [name for name in (*FILES, PART) if (folder / name).exists()]
-    with files.collected():
-        where = f"written to {folder}/: {', '.join(written)}"
-        _print(f"{_colored(report)}\n{where}", sys.stdout)
+    def _tell(self, summary: RunSummary, written: list[str]) -> None:
+        """Prints the summary, with its first word green, red or yellow on a terminal."""
+        text, word = summary.text, summary.judgement.outcome.name
+        if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
+            color = {"GOOD": 32, "BAD": 31, "UNDECIDED": 33}[word]
+            text = f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
+        print(f"{text}\nwritten to {self.folder}/: {', '.join(written)}", flush=True)
         if ANIMATION in written:
-            named = shlex.quote(str(folder))
-            drawn = "" if PLOTS[0] in written else f"; plots: {program()} plot {named} --all"
-            _print(f"watch it: {program()} play {named}{drawn}", sys.stdout)
-    with suppress(OSError):
-        _print("".join(f"error: {line}\n" for line in files.problems), sys.stderr)
-    return written
+            named = shlex.quote(str(self.folder))
+            plots = "" if self.scenario.write.plots else f"; plots: {program()} plot {named} --all"
+            print(f"watch it: {program()} play {named}{plots}", flush=True)
 
 
-def _colored(report: RunSummary) -> str:
-    """A summary for the screen: its first word green, red or yellow on a terminal."""
-    text, outcome = report.text, report.judgement.outcome
-    if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):
-        return text
-    color, word = {Outcome.GOOD: 32, Outcome.BAD: 31, Outcome.UNDECIDED: 33}[outcome], outcome.name
-    return f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
-
-
-def _print(text: str, file: TextIO) -> None:
-    """Prints and flushes; a closed output, as after SIGHUP, is not tried again on exit."""
-    try:
-        print(text, end="\n" if text and text[-1] != "\n" else "", file=file, flush=True)
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), file.fileno())
-        raise
+COMMANDS = {"simulate": (_options, _command)}

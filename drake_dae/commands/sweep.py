@@ -1,25 +1,84 @@
-"""`drake-dae sweep`: run a scenario many times with other values."""
+"""`drake-dae sweep`: runs a scenario many times with other values."""
 
 import argparse
 import json
+import re
 import sys
 from collections import Counter
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from drake_dae.analysis.tables import count_of
+from drake_dae.arrays import number_in
+from drake_dae.commands.parser import Parser
 from drake_dae.errors import ModelError
 from drake_dae.files import check_folder
 from drake_dae.scenario.files import load_scenario
-from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
+from drake_dae.studies.runs import Outcome
+from drake_dae.studies.study import FILES
+from drake_dae.studies.sweep import sweep
+from drake_dae.studies.variations import parse_variations
 
 JOURNAL = "runs.db"
 """The name of the file with the results, from which the command continues."""
 
+TIME_LIMIT = 3600.0
+"""The default time limit of a run, in s."""
 
-def run_command(options: argparse.Namespace) -> int:
-    """Runs the study that the options describe; returns the exit code."""
+
+def _whole_number(text: str) -> int:
+    """A whole number; Python also reads 1_000 and digits of other alphabets."""
+    if not re.fullmatch("-?[0-9]{1,15}", text):
+        raise argparse.ArgumentTypeError(f"expected a whole number, got '{text}'")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    value = number_in(text)
+    if value is None or value <= 0.0:
+        raise argparse.ArgumentTypeError(f"expected a positive number of seconds, got '{text}'")
+    return value
+
+
+def _options(parser: Parser) -> None:
+    parser.scenario(DEFAULT_SCENARIO)
+    parser.repeatable(
+        "--vary",
+        "KEY=VALUES",
+        'what varies, for example "start.errors.tool.z=0..0.05:6" (six even values), '
+        '"law.gains.all=[[-4], [-8]]" (these), "plant.parameters.link1.mass=9.5..10.5" with '
+        '--random, "plant.parameters.wall.position=[[0.69..0.71, 0, 0]]" likewise, or '
+        '"sensors.force.seed=1..20:20"',
+        required=True,
+    )
+    chosen = parser.add_mutually_exclusive_group()
+    count: dict[str, Any] = {"type": _whole_number, "metavar": "COUNT"}
+    random = "number of runs with random values, even in their ranges, instead of a grid"
+    chosen.add_argument("--random", **count, help=random)
+    together = "the first values of all keys, then the second ones, instead of a grid"
+    chosen.add_argument("--together", action="store_true", help=together)
+    parser.add_argument("--seed", type=_whole_number, default=0, help="of random values (0)")
+    parser.flag("--rollout", "as `simulate --rollout` does: many times as fast")
+    parser.add_argument("--workers", **count, help="how many processes (default: one per core)")
+    parser.add_argument(
+        "--time-limit",
+        type=_seconds,
+        default=TIME_LIMIT,
+        metavar="SECONDS",
+        help="how long a run may take by the clock until its process is ended (3600)",
+    )
+    parser.flag("--check", "exit code 2 if a run did not finish")
+    parser.json("print outcomes and figures, and all else on stderr,")
+    parser.path("--out", "FOLDER", "folder for the results (default: runs/<scenario>-sweep)")
+
+
+def _command(options: argparse.Namespace) -> int:
+    """Runs a scenario once for every combination of the values of some keys, on all cores.
+
+    It writes a table and a plot with figures of each run. The same command continues a study that
+    was killed, and tries runs again whose process died or was too slow (exit code 1).
+    """
     if not options.json:
         return _sweep(options)[0]
     with redirect_stdout(sys.stderr):
@@ -30,12 +89,6 @@ def run_command(options: argparse.Namespace) -> int:
 
 def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Runs the study; returns the exit code, and the results for JSON."""
-    # They load SciPy's integrators, which no other command needs.
-    from drake_dae.studies.runs import Outcome
-    from drake_dae.studies.study import FILES
-    from drake_dae.studies.sweep import sweep
-    from drake_dae.studies.variations import parse_variations
-
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     variations = parse_variations(options.vary, options.random, options.seed, options.together)
@@ -44,9 +97,8 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     file = folder / JOURNAL
     others = [name for name in FILES if (folder / name).exists()]
     if others and not file.exists():
-        raise ModelError(
-            f"'{folder}' holds {', '.join(others)}, not from a study; choose another folder"
-        )
+        names = ", ".join(others)
+        raise ModelError(f"'{folder}' holds {names}, not from a study; choose another folder")
     try:
         study = sweep(
             scenario,
@@ -62,11 +114,7 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         raise
     files = [file.name, *(written.name for written in study.save(folder))]
     print(f"{study}\nwritten to {folder}/: {', '.join(files)}", flush=True)
-    unfinished = {
-        run: result
-        for run, result in enumerate(study.results)
-        if result.outcome is not Outcome.FINISHED
-    }
+    missing = {n: r for n, r in enumerate(study.results) if r.outcome is not Outcome.FINISHED}
     report = {
         "scenario": path.stem,
         "folder": str(folder),
@@ -74,13 +122,16 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         "outcomes": Counter(str(result.outcome) for result in study.results),
         "not_finished": [
             {"run": run, "outcome": str(result.outcome), "reason": result.reason}
-            for run, result in unfinished.items()
+            for run, result in missing.items()
         ],
         "figures": study.extent(),
         "files": files,
     }
-    if again := [str(run) for run, result in unfinished.items() if not result.outcome.is_final]:
-        text = f"{count_of(len(again), 'run')} died or took too long; the same command tries again"
-        print(f"error: {text}: {', '.join(again[:10])}", file=sys.stderr)
+    if again := [str(run) for run, result in missing.items() if not result.outcome.is_final]:
+        text = "died or took too long; the same command tries again"
+        print(f"error: runs {', '.join(again[:10])} {text}", file=sys.stderr)
         return 1, report
-    return 2 if unfinished and options.check else 0, report
+    return 2 if missing and options.check else 0, report
+
+
+COMMANDS = {"sweep": (_options, _command)}

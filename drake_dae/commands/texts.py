@@ -1,55 +1,61 @@
-"""`drake-dae print`, `schema`, `cache`: scenarios, their keys, machine code."""
+"""`drake-dae list`, `print`, `schema`: what one reads; the first two load no Drake."""
 
 import argparse
 import json
 
-from drake_dae.errors import MachineCodeError, ScenarioError
-from drake_dae.scenario.shipped import find_scenario
+from drake_dae.commands.parser import Parser
+from drake_dae.errors import ScenarioError
+from drake_dae.files import read_text
+from drake_dae.scenario.shipped import (
+    DEFAULT_SCENARIO,
+    description,
+    find_scenario,
+    shipped_scenarios,
+)
 
 
-def run_command(options: argparse.Namespace) -> int:
-    """Prints what the options name; returns the exit code."""
-    if options.command == "print":
-        print(_scenario(options), end="")
-        return 0
-    if options.command == "cache":
-        _cache(options.clear)
-        return 0
-    from drake_dae.scenario.scenario import scenario_schema  # `print` needs no Drake.
+def _list_options(parser: Parser) -> None:
+    parser.json("print names and descriptions")
+
+
+def _list(options: argparse.Namespace) -> int:
+    """Lists the shipped scenarios."""
+    found = {name: description(path) for name, path in shipped_scenarios().items()}
+    width = max(map(len, found), default=0)
+    lines = [f"{name.ljust(width)}  {text}" for name, text in found.items()]
+    print(json.dumps(found, indent=2) if options.json else "\n".join(lines))
+    return 0
+
+
+def _print_options(parser: Parser) -> None:
+    parser.add_argument("scenario", nargs="?", default=DEFAULT_SCENARIO, help="which one")
+    parser.flag("--path", "print where its file is instead")
+
+
+def _print(options: argparse.Namespace) -> int:
+    """Prints a shipped scenario with its comments, as the beginning of your own."""
+    path = find_scenario(options.scenario)
+    try:
+        print(f"{path}\n" if options.path else read_text(path), end="")
+    except UnicodeDecodeError:
+        raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
+    return 0
+
+
+def _schema_options(parser: Parser) -> None:
+    pass
+
+
+def _schema(options: argparse.Namespace) -> int:
+    """Prints the JSON Schema of a scenario, by which editors complete and check keys."""
+    from drake_dae.scenario.scenario import scenario_schema
 
     print(json.dumps(scenario_schema(), indent=1))
     return 0
 
 
-def _scenario(options: argparse.Namespace) -> str:
-    """The text of the scenario that the options name, or its path.
-
-    Raises:
-        ScenarioError: The file cannot be read.
-    """
-    path = find_scenario(options.scenario)
-    if options.path:
-        return f"{path}\n"
-    try:
-        return path.read_text("utf-8")
-    except UnicodeDecodeError:
-        raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
-
-
-def _cache(is_cleared: bool) -> None:
-    """Prints the size of the cache of machine code, and the compiler; or empties the cache."""
-    from drake_dae.trace.cache import cache_folder, clear, contents
-    from drake_dae.trace.compiler import find_compiler
-
-    files = contents()
-    size = sum(path.stat().st_size for path in files if path.is_file())
-    what = f"{len(files)} files, {size / 1e6:.1f} MB"
-    if is_cleared:
-        clear()
-        print(f"removed from {cache_folder()}: {what}")
-        return
-    print(f"cache     {cache_folder()}: {what}")
-    try:
-        print(f"compiler  {' '.join(find_compiler().command)}")
-    except MachineCodeError as error:
-        print(f"compiler  none: {error}")
+COMMANDS = {
+    "list": (_list_options, _list),
+    "print": (_print_options, _print),
+    "schema": (_schema_options, _schema),
+}

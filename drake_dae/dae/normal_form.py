@@ -40,7 +40,8 @@ class NormalForm:
     Phi is a local diffeomorphism where its Jacobian is regular. By Theorem 2.1 the differentials of
     both chains are independent wherever A(x) of Assumption (2) and B(x) of (16) are regular; if the
     Jacobian is singular, A or B is, or xi does not complete the chains there. The paper allows any
-    completion; L_h* xi = 0 is not required.
+    completion; L_h* xi = 0 is not required. In all methods states, guesses and coordinates
+    (y, zeta, xi) have shape (n,), and `parameters` are those of all, the defaults if None.
 
     Args:
         system: The system (1)-(3).
@@ -105,28 +106,14 @@ class NormalForm:
         return f"NormalForm('{self.system.name}', coordinates={names})"
 
     def coordinates(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Returns Phi(x) = (y, zeta, xi) of (20)-(22).
-
-        Args:
-            state: x, shape (n,), on N* or not.
-            parameters: Values of all parameters; the defaults if None.
-
-        Returns:
-            (y, zeta, xi), shape (n,), named by `coordinate_signals`.
-        """
+        """Returns Phi(x) = (y, zeta, xi) of (20)-(22), for x on N* or not."""
         x = self.system.state_vector(state)
         return self._coordinates(x, self.system.parameter_vector(parameters))[0]
 
     def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Returns dPhi/dx, shape (n, n); it is singular where Phi is no change of coordinates.
-
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-        """
-        return self._at(self.system.state_vector(state), self.system.parameter_vector(parameters))[
-            1
-        ]
+        """Returns dPhi/dx, shape (n, n); it is singular where Phi is no change of coordinates."""
+        x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
+        return self._at(x, p)[1]
 
     def rates(
         self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
@@ -138,14 +125,6 @@ class NormalForm:
 
         With `state`, which is Phi^-1(0, zeta, xi), these are n - sum r_i ordinary differential
         equations without constraints.
-
-        Args:
-            state: x, shape (n,).
-            control: u, shape (p,).
-            parameters: Values of all parameters; the defaults if None.
-
-        Raises:
-            ModelError: An argument has a wrong shape.
         """
         structure, dae, layout = self.structure, self.system, self.structure.layout
         u = structure.derivatives.control
@@ -174,18 +153,9 @@ class NormalForm:
         guess is found by damped Newton's method or, if that fails, by continuation along the
         straight line from the coordinates of the guess to the given ones.
 
-        Args:
-            coordinates: (y, zeta, xi), shape (n,).
-            guess: A state near the solution, shape (n,); the nominal consistent state if None.
-            parameters: Values of all parameters; the defaults if None.
-
-        Returns:
-            x, shape (n,).
-
         Raises:
             InconsistentStateError: There is no such state, or it is not reached from the guess. Its
                 residual is the remaining error of the coordinates, shape (n,).
-            ModelError: Shapes do not fit, or numbers are not finite.
         """
         target = vector(f"{self.system.name}: coordinates", coordinates, self.system.num_states)
         x = self.system.state_vector(self.structure.states[0] if guess is None else guess)
@@ -247,25 +217,15 @@ class NormalForm:
         weakest = weak[:, sizes <= 10.0 * sizes[-1] + ROUND_OFF * sizes[0]]
         blocked = weakest @ (weakest.T @ (missing / rows))
         worst = int(np.argmax(np.abs(blocked * missing / rows)))
+        completion = ", ".join(signal.name for signal in self.completion_signals)
         message = (
             f"{self.system.name}: no way from the guess to the given coordinates: "
             f"{self.coordinate_signals[worst].name} can be brought from {start[worst]:.6g} to "
             f"{values[worst]:.6g}, but not to {target[worst]:.6g}; the search ended at x = "
-            f"{show(state)}. "
+            f"{show(state)}. Start from a guess that is nearer. If the coordinates become "
+            "dependent there, A(x) of Assumption (2) or B(x) of (16) loses its rank (Theorem 2.1), "
+            f"or the completion ({completion or 'none'}) does not complete the chains any more"
         )
-        before = np.linalg.svd(first * columns / rows[:, None], compute_uv=False)
-        if sizes[-1] < 0.1 * before[-1]:
-            message += (
-                "The coordinates (20)-(22) become dependent there: A(x) of Assumption (2) or B(x) "
-                "of (16) loses its rank (Theorem 2.1)"
-            )
-            if self.completion_signals:
-                message += (
-                    f", or {', '.join(s.name for s in self.completion_signals)} does not complete "
-                    "the chains any more"
-                )
-        else:
-            message += "Start from a guess that is nearer, in the domain of the functions"
         return InconsistentStateError(message, missing)
 
     def _at(self, state: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -143,6 +143,7 @@ def references_by_name(
         ReferenceSignalError: A name has no output, an output has no reference or two, or a
             reference does not fit or is not smooth enough.
     """
+    outputs = list(outputs)
     if len(degrees) != len(outputs):
         raise ReferenceSignalError(f"{len(outputs)} outputs have {len(degrees)} degrees")
     assignments = []

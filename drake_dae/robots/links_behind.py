@@ -35,13 +35,7 @@ class LinkBehind:
 
 
 class LinkDepths:
-    """How deep links are behind surfaces; what moves with a contact is left out.
-
-    Args:
-        links: The robot.
-        touches: Name of a constraint -> its contact.
-        parameters: The symbols of all parameters.
-    """
+    """How deep links are behind the surfaces of contacts; what moves with a contact is left out."""
 
     def __init__(self, links: Links, touches: Mapping[str, Touch], parameters: ca.SX) -> None:
         def moved_by(R: ca.SX, p: ca.SX) -> set[int]:
@@ -79,8 +73,8 @@ class LinkDepths:
         world = np.hstack([pose[:, :3] @ points + pose[:, 3:] for pose, points in pairs])
         depths, starts = {}, np.cumsum([0, *self._sizes[:-1]])
         for name, (function, counts, inner) in self._surfaces.items():
-            values = (v.full().ravel() for v in function(world, q, parameters))
-            depth, to_contact, to_base, base = values
+            out = (v.full().ravel() for v in function(world, q, parameters))
+            depth, to_contact, to_base, base = out
             depth = depth + self._radii
             near = (to_contact < NEARER * to_base) | (inner & (base < TOUCHING))
             behind = counts & near & (depth > np.maximum(TOUCHING, BESIDE * to_contact))

@@ -1,7 +1,7 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +21,7 @@ from drake_dae.analysis.limits import (
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
@@ -29,22 +29,21 @@ from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
-from drake_dae.references.reference import common_period
+from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.links_behind import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.advice.sticking import sticking_note
+from drake_dae.scenario.build import tracking_law
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.loop import build_loop, exogenous_references
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
-from drake_dae.scenario.plants import IdealConstraints
+from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
 from drake_dae.scenario.robot_file.links import RobotLinks
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.start import start_scenario
 from drake_dae.simulation.judgement import FindingKind, Outcome, RunFinding, judge
-from drake_dae.simulation.limits import ranges_of, robot_limits
+from drake_dae.simulation.limits import limited_values, robot_limits
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import RunSummary
@@ -60,6 +59,9 @@ range; and the shortest interval that is divided, relative to the whole."""
 
 MOST_TIMES = 2000
 """The most times of a record at which its references are examined."""
+
+BREAK = 0.01
+"""The share of a run that broke off, at its end, in which its limits are not judged."""
 
 WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
 """The remedy for a link behind a surface."""
@@ -211,7 +213,7 @@ def complete_and_examine(
     """
     if scenario.task is not None:
         check_task(scenario)
-    completed, model = completed_model(scenario, scene_graph, drawn=False, robot=robot)
+    completed, model, _ = completed_model(scenario, scene_graph, drawn=False, robot=robot)
     return completed.scenario, _feasibility(completed.scenario, model)
 
 
@@ -227,30 +229,28 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
             structure = examined.structure
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    gains = _without_gains(scenario, model, structure)
+    gains, law = "", None
+    try:
+        law = tracking_law(advised(scenario, model, structure).scenario, model, structure)
+    except ScenarioError as error:
+        if not scenario.is_advised:
+            raise
+        gains = str(error)
     if scenario.task is not None:
         return Feasibility(analyze(model.dae), scenario.duration, gains=gains)
-    # The law's model, without differences of the plant.
-    ideal = replace(
-        scenario,
-        plant=IdealConstraints(parameters=scenario.plant.parameters),
-        sensors=replace(scenario.sensors, encoders=None),
-        estimator=None,
-    )
-    loop = build_loop(ideal, model, structure)
-    context = start_scenario(ideal, loop)
-    reference, begin = loop.reference.reference, scenario.integrator.start_time
+    reference, start = reference_and_start(scenario, model, structure)
+    degrees = None if law is None or scenario.estimator is not None else law.exogenous_degrees
+    exogenous = exogenous_references(scenario, model.dae, degrees)
+    names = [signal.name for signal in model.dae.output_signals]
+    outputs = references_of(scenario, names, structure.layout.reference_degrees)
+    period = common_period([r.repeats for r in (*outputs, *exogenous)])
+    moving = stack_references(exogenous, [1] * sum(r.size for r in exogenous))
 
     def signals(time: float) -> FloatArray:
-        moving = [] if loop.exogenous is None else [loop.exogenous.reference(time)]
-        return np.concatenate([reference(time), *moving])
+        return np.concatenate([reference(time), moving(time)] if exogenous else [reference(time)])
 
+    begin = scenario.integrator.start_time
     times, is_resolved = sample_times(signals, begin, begin + scenario.duration)
-    start = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    exogenous = exogenous_references(
-        scenario, loop.plant.dae, loop.controller.law.exogenous_degrees
-    )
-    period = common_period([r.repeats for r in (*loop.reference.references, *exogenous)])
     analysis = along(
         examined or examine(model.dae), reference, times, start, period or None, exogenous
     )
@@ -276,15 +276,6 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
         gains,
         slowing,
     )
-
-
-def _without_gains(scenario: Scenario, model: RobotModel, structure: Structure) -> str:
-    """Why no gains can be computed where they are left out, else empty."""
-    try:
-        advised(scenario, model, structure)
-    except ScenarioError as error:
-        return str(error)
-    return ""
 
 
 def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
@@ -356,12 +347,16 @@ def judge_run(
     """
     model, changes = loop.plant.robot("a scenario"), loop.changes(context)
     limits = robot_limits(model, scenario.judgement.friction_cones)
-    ranges, own = ranges_of(limits, record), loop.plant_parameters(record, context)
+    own, stop = loop.plant_parameters(record, context), record.time.size
+    if failure:  # The last numbers of a run that broke off are not those of its motion.
+        first, last = record.time[[0, -1]]
+        stop = max(1, int(np.searchsorted(record.time, last - BREAK * (last - first))))
+    ranges = limits.ranges(record.time[:stop], limited_values(limits, record)[:stop])
     behind = []
     for link in links_behind(model, record.time, record["state"], own):
         numbers = Signal(link.link, "m"), link.depth, 0.0, link.time
         behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
-    is_paced = any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
+    is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
     remedies = _slower(loop, model, limits, record) if is_paced else []
     notes = [constraint.remark for constraint in model.constraints]
     notes += [_beyond_edge(constraint, model, record) for constraint in model.constraints]
@@ -380,7 +375,7 @@ def judge_run(
         record,
         loop.predicted_error(record),
         ranges,
-        tolerances=scenario.judgement.tolerances,
+        tolerances=scenario.judgement.tolerated,
         changes=changes,
         ended=ended,
         accuracy=accuracy,

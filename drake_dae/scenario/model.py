@@ -1,9 +1,8 @@
-"""The robot model of a scenario: constraints, outputs and actuation."""
+"""The robot model of a scenario, completed."""
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,29 +12,36 @@ from pydrake.multibody.tree import BodyIndex
 from drake_dae.analysis.analyze import examine
 from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.arrays import unknown_name
 from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.dae.system.signals import Parameter, Signal
-from drake_dae.errors import GeometryWarning, InconsistentStateError, ModelError, ScenarioError
-from drake_dae.robots.actuation import Stage
+from drake_dae.errors import (
+    AssumptionError,
+    GeometryWarning,
+    InconsistentStateError,
+    ModelError,
+    ScenarioError,
+)
 from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.constraints.plant_constraints import plant_constraints
 from drake_dae.robots.control_choice import control_choice
-from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
-from drake_dae.robots.known_forces import Load
+from drake_dae.robots.force_outputs import force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.model import RobotModel
 from drake_dae.robots.outputs import PositionOutput
-from drake_dae.scenario.completion.completion import Completed, complete
-from drake_dae.scenario.completion.of_task import complete_task
+from drake_dae.scenario.completion import Completed, completions
 from drake_dae.scenario.forms.keys import at, each
-from drake_dae.scenario.parts.written import WrittenConstraint, WrittenOutput, make
+from drake_dae.scenario.motion import in_the_way
+from drake_dae.scenario.parts.written import make
 from drake_dae.scenario.robot_file.links import RobotLinks, robot_links
 from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.start import start_guess
+
+NOTHING_FOUND = "no start was found"
+"""How the note begins if no outputs and start are good along the references."""
 
 _LARGE = 30.0
 """The ratio of the size of a surface to that of the robot above which its unit is doubtful."""
@@ -58,14 +64,23 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
 def complete_scenario(scenario: Scenario) -> Completed:
     """Adds missing outputs and a start to a scenario.
 
-    Outputs are missing if there are fewer than actuators minus force outputs. Independent outputs
-    are added, in this order: the world coordinates along the surface of each contact point; the
-    directions of the tool's axis by `tool_axis`; and positions of joints, chosen so that B(x) of
-    (16) is best conditioned and joints are away from their limits along the reference. Outputs
-    without a reference keep their initial value.
+    Outputs are missing if there are fewer than actuators minus force outputs. They are added by
+    this rule, as long as some are missing, each if it is independent of those before it:
 
-    If start.positions are left out and Newton's method finds no regular start from the default
-    configuration, a start with the first values of the references is searched.
+    1. what `references` name, as tool for its position along the surface;
+    2. the position of each contact point along its surface: of its world coordinates all but that
+       closest to the normal;
+    3. the direction of the tool's axis, by `tool_axis`: its tilt from the normal; if no start keeps
+       it and all limits along the reference, it is left free;
+    4. positions of the joints that are left free, the choice for which B(x) of (16) is best
+       conditioned. They are held where they start, and a run is not judged by their errors.
+
+    If start.positions are left out, a start with the first values of the references is searched by
+    inverse kinematics from many guesses, with the tool's axis along the normal if possible. Of the
+    starts, and of the choices of joints, that one is taken with which the robot is best conditioned
+    along the whole reference, within the limits of joints. It is examined along the reference by
+    inverse dynamics, as `analyze` does; if that exceeds a limit, the next one is tried. If there is
+    none, a note says what is in the way.
 
     Args:
         scenario: What `load_scenario` returns.
@@ -77,7 +92,7 @@ def complete_scenario(scenario: Scenario) -> Completed:
         ScenarioError: The scenario is not valid, the robot cannot reach the start, or no outputs
             are independent of those in the scenario; the message names the key.
     """
-    return _build(scenario, *robot_links(scenario.robot, SceneGraph(), drawn=False)).completed
+    return completed_model(scenario)[0]
 
 
 def completed_model(
@@ -86,7 +101,7 @@ def completed_model(
     payloads: Sequence[Payload] = (),
     drawn: bool = True,
     robot: RobotLinks | None = None,
-) -> tuple[Completed, RobotModel]:
+) -> tuple[Completed, RobotModel, Structure | None]:
     """The results of `complete_scenario` and `scenario_model`, for a robot with payloads.
 
     Args:
@@ -95,21 +110,109 @@ def completed_model(
         payloads: The payloads.
         drawn: Whether the scene graph, if there is one, will be drawn.
         robot: What `robot_links` made of the other arguments; None to read the robot.
+
+    Returns:
+        The completed scenario, its robot, and the structure if it was examined already.
     """
-    drawn = drawn and scene_graph is not None
     if robot is None:
+        drawn = drawn and scene_graph is not None
         robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)
-    built = _build(scenario, *robot)
-    scenario = built.completed.scenario
-    outputs = _outputs(scenario.outputs, built.constraints, built.links)
-    with at("actuation" if built.stages else "outputs"):
+    links, loops = robot
+    constraints = _checked_constraints(scenario, links, loops)
+    guess = start_guess(scenario, links)
+    ways = list[tuple[Completed, RobotModel, Structure | None]]()
+    problems = list[str]()
+    for completed in completions(scenario, links, constraints, guess):
+        model, structure = _model(completed.scenario, links, constraints), None
+        if completed.scenario is scenario or scenario.task is not None:
+            return completed, model, None
+        try:
+            structure = scenario_structure(model)
+            problem = in_the_way(completed.scenario, model, structure)
+        except (AssumptionError, ScenarioError) as error:
+            problem = str(error)
+        if not problem:
+            return completed, model, structure
+        ways.append((completed, model, structure))
+        problems.append(problem)
+    # One that can be examined, if there is any.
+    best = next((i for i, way in enumerate(ways) if way[2] is not None), 0)
+    completed, model, structure = ways[best]
+    note = (
+        f"{NOTHING_FOUND} from which the robot keeps its limits along the references; with this "
+        f"one {problems[best]}. Move the surface or the references, make them slower, or give "
+        "other outputs or start.positions"
+    )
+    return Completed(completed.scenario, (*completed.notes, note)), model, structure
+
+
+def _checked_constraints(
+    scenario: Scenario, links: MultibodyExpressions, loops: Sequence[Constraint]
+) -> list[Constraint]:
+    """The constraints, and a check of every key that the model takes, for errors with its place."""
+    name = scenario.robot.title
+    constraints = each("constraints", scenario.constraints, lambda form: make(form, ()))
+    names = [constraint.name for constraint in (*plant_constraints(links), *loops)]
+    for index, constraint in enumerate(constraints):
+        with at(f"constraints.{index}"):  # Unknown names.
+            if constraint.residual(links).numel() < len(constraint.force_signals):
+                constraint.rate(links.kinematics())
+        if not constraint.name or constraint.name in names:
+            key = f"constraints.{index}.name"
+            text = f"each constraint needs a name of its own, got '{constraint.name}'"
+            raise ScenarioError((key, text))
+        names.append(constraint.name)
+        _compare_sizes(constraint, links)
+    constraints += loops
+    bound = ConstraintSet([*constraints, *plant_constraints(links)])
+    actuators = (*links.actuator_signals, *bound.motors)
+    if not actuators:
+        text = (
+            f"no joint of '{Path(scenario.robot.file).name or name}' is driven; write all, or a "
+            "list of joints. Without this key those are driven to which the file gives an "
+            "actuator, as a URDF does by a <transmission>"
+        )
+        raise ScenarioError(("robot.actuators", text))
+    _outputs(scenario, constraints, links)
+    if links.actuator_signals:
+        each("actuation", scenario.actuation, lambda stage: stage.attach(links))
+    with at("actuation"):
+        chain(scenario.actuation, links)
+    forces, known = scenario.forces, scenario.robot.known_forces
+    each("forces", forces or (), lambda f: force_rows(force_outputs([f], bound), bound, links))
+    with at("forces"):
+        force_outputs(forces, bound)
+    for force, value in (scenario.compliances or {}).items():
+        with at(f"compliances.{force}"):
+            bound.place(force)
+            if not value > 0.0:
+                raise ModelError(f"a compliance must be positive, got {value}")
+    each("robot.known_forces", known, lambda force: force.reaction(links.kinematics()))
+    with at("law.control_weights"):
+        choice = control_choice(name, scenario.law.control_weights or None, actuators)
+    with at("exogenous"):
+        attached = [stage.attach(links).parameters for stage in scenario.actuation]
+        members = [one.parameters for one in constraints] + [one.parameters for one in known]
+        groups = [links.parameters, *members, *attached, choice]
+        parameters = [parameter.name for group in groups for parameter in group]
+        for moving in scenario.exogenous:
+            if moving not in parameters:
+                raise ModelError(unknown_name("parameter", moving, parameters))
+    return constraints
+
+
+def _model(
+    scenario: Scenario, links: MultibodyExpressions, constraints: Sequence[Constraint]
+) -> RobotModel:
+    """The robot model of a completed scenario."""
+    with at("actuation" if scenario.actuation else "outputs"):
         model = RobotModel(
-            built.links,
-            built.constraints,
-            outputs,
-            start_guess(scenario.start.positions, built.links),
-            built.name,
-            built.stages,
+            links,
+            constraints,
+            _outputs(scenario, constraints, links),
+            start_guess(scenario, links),
+            scenario.robot.title,
+            scenario.actuation,
             scenario.forces,
             tuple(scenario.exogenous),
             scenario.robot.known_forces,
@@ -121,52 +224,7 @@ def completed_model(
         model.dae = model.dae.with_values(scenario.parameters)
     with at("bounds"):
         model.dae = model.dae.with_bounds(scenario.bounds)
-    return built.completed, model
-
-
-@dataclass(frozen=True, eq=False)
-class _BuiltRobot:
-    """A scenario's checked robot, and the completed scenario."""
-
-    name: str
-    links: MultibodyExpressions
-    constraints: Sequence[Constraint]
-    stages: Sequence[Stage]
-    completed: Completed
-
-
-def _build(
-    scenario: Scenario, links: MultibodyExpressions, loops: Sequence[Constraint]
-) -> _BuiltRobot:
-    # The constraints.
-    name = scenario.robot.title
-    constraints = _constraints(scenario.constraints, loops, links)
-    actuators = (*links.actuator_signals, *ConstraintSet(constraints).motors)
-    if not actuators:
-        text = (
-            f"no joint of '{Path(scenario.robot.file).name or name}' is driven; write all, or a "
-            "list of joints. Without this key those are driven to which the file gives an "
-            "actuator, as a URDF does by a <transmission>"
-        )
-        raise ScenarioError(("robot.actuators", text))
-
-    # Outputs, start and actuation.
-    _outputs(scenario.outputs, constraints, links)
-    guess = start_guess(scenario.start.positions, links)
-    stages = _stages(scenario.actuation, links)
-    bound = ConstraintSet([*constraints, *plant_constraints(links)])
-    _check_forces(scenario.forces, bound, links)
-    _check_compliances(scenario.compliances or {}, bound)
-    known_forces = scenario.robot.known_forces
-    each("robot.known_forces", known_forces, lambda force: force.reaction(links.kinematics()))
-    with at("law.control_weights"):
-        choice = control_choice(name, scenario.law.control_weights or None, actuators)
-    _check_exogenous(scenario.exogenous, links, [*constraints, *known_forces], stages, choice)
-
-    # The completion.
-    completing = complete if scenario.task is None else complete_task
-    completed = completing(scenario, links, constraints, plant_constraints(links), guess)
-    return _BuiltRobot(name, links, constraints, stages, completed)
+    return model
 
 
 def scenario_structure(model: RobotModel) -> Structure:
@@ -211,24 +269,6 @@ def _near_constraints() -> Iterator[None]:
         raise ScenarioError(("constraints or start.positions", str(error))) from error
 
 
-def _constraints(
-    forms: Sequence[WrittenConstraint],
-    loops: Sequence[Constraint],
-    links: MultibodyExpressions,
-) -> list[Constraint]:
-    constraints = each("constraints", forms, lambda form: make(form, ()))
-    each("constraints", constraints, lambda constraint: _evaluate(constraint, links))
-    names = [constraint.name for constraint in (*plant_constraints(links), *loops)]
-    for index, constraint in enumerate(constraints):
-        name = constraint.name
-        if not name or name in names:
-            key = f"constraints.{index}.name"
-            raise ScenarioError((key, f"each constraint needs a name of its own, got '{name}'"))
-        names.append(name)
-        _compare_sizes(constraint, links)
-    return [*constraints, *loops]
-
-
 def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
     """Warns of a surface much larger than the robot: its file may be in millimetres."""
     extent = getattr(getattr(constraint, "surface", None), "extent", None)
@@ -249,92 +289,9 @@ def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
         )
 
 
-def _evaluate(constraint: Constraint, links: Links) -> None:
-    """Evaluates a constraint's equations, which raises an error for unknown names."""
-    if constraint.residual(links).numel() < len(constraint.force_signals):
-        constraint.rate(links.kinematics())
-
-
-def _check_forces(
-    forces: Sequence[str | ForceOutput] | None, bound: ConstraintSet, links: Links
-) -> None:
-    each("forces", forces or (), lambda f: force_rows(force_outputs([f], bound), bound, links))
-    with at("forces"):
-        force_outputs(forces, bound)
-
-
-def _check_compliances(compliances: Mapping[str, float], bound: ConstraintSet) -> None:
-    for name, value in compliances.items():
-        with at(f"compliances.{name}"):
-            bound.place(name)
-            if not value > 0.0:
-                raise ModelError(f"a compliance must be positive, got {value}")
-
-
 def _outputs(
-    forms: Sequence[WrittenOutput],
-    constraints: Sequence[Constraint],
-    links: Links,
+    scenario: Scenario, constraints: Sequence[Constraint], links: Links
 ) -> list[PositionOutput]:
-    outputs = each("outputs", forms, lambda form: make(form, constraints))
+    outputs = each("outputs", scenario.outputs, lambda form: make(form, constraints))
     each("outputs", outputs, lambda output: output.expression(links))
     return outputs
-
-
-def _stages(stages: Sequence[Stage], links: Links) -> Sequence[Stage]:
-    if links.actuator_signals:
-        each("actuation", stages, lambda stage: stage.attach(links))
-    else:
-        with at("actuation"):
-            chain(stages, links)  # The model refuses them.
-    return stages
-
-
-@at("exogenous")
-def _check_exogenous(
-    names: Iterable[str],
-    links: Links,
-    members: Sequence[Constraint | Load],
-    stages: Sequence[Stage],
-    choice: Sequence[Parameter],
-) -> None:
-    """Checks that exogenous names are parameters."""
-    attached = [stage.attach(links).parameters for stage in stages]
-    groups = [links.parameters, *(member.parameters for member in members), *attached]
-    parameters = [parameter.name for group in (*groups, choice) for parameter in group]
-    for name in names:
-        if name not in parameters:
-            raise ModelError(unknown_name("parameter", name, parameters))
-
-
-@at("start.positions")
-def start_guess(
-    positions: dict[str, float], links: Links, others: FloatArray | None = None
-) -> FloatArray:
-    """The initial guess of q for the computation of the start.
-
-    Args:
-        positions: Joint name -> position.
-        links: The robot.
-        others: The positions of all joints that are not named, shape (nq,); the robot's defaults
-            if None.
-    """
-    guess = (links.default_positions if others is None else others).copy()
-    for name, value in positions.items():
-        index = index_of(name, links.position_signals, "joint position")
-        low, high = (limits[index] for limits in links.position_limits)
-        if not low <= value <= high:
-            unit = links.position_signals[index].unit
-            raise ModelError(
-                f"{name} = {value:g} {unit} is outside its limits, {low:g} to {high:g} {unit}"
-            )
-        guess[index] = value
-    return guess
-
-
-def index_of(name: str, signals: Sequence[Signal], kind: str) -> int:
-    """The index of a name among signals."""
-    names = [signal.name for signal in signals]
-    if name not in names:
-        raise ModelError(unknown_name(kind, name, names))
-    return names.index(name)

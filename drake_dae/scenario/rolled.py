@@ -16,7 +16,7 @@ from drake_dae.diagrams.state_feedback import (
 )
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.rollout.problems import start_values
-from drake_dae.running.rollout.rollout import Rollout, run_loop
+from drake_dae.running.rollout.rollout import Rollout, diagnosed, run_loop
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.simulation.divergence import DivergenceWatch
 from drake_dae.simulation.records.record import Record, RecordAfter
@@ -122,7 +122,7 @@ def roll_scenario(
         lasting=lasting,
         look=watched,
     )
-    return watched.judged(rollout)
+    return diagnosed(loop, watched.judged(rollout))
 
 
 def _seeds(scenario: Scenario) -> dict[str, int]:

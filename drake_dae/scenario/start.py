@@ -1,31 +1,26 @@
 """The start of the runs of a scenario."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray
-from drake_dae.dae.tracking.gains import FeedbackGains
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.robots.links.links import Links
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.model import index_of, start_guess
-from drake_dae.scenario.own_model import begin_own_model
-from drake_dae.scenario.parts.parts import Gains
 from drake_dae.scenario.scenario import Scenario
 
 _SLACK = 1e-6
 """The allowed excess over a joint limit at the start, rad or m: references may start at the
 limit. Also the allowed depth behind a surface, in m."""
-
-_TURNS = np.array([0.0, -1.0, 1.0])
-"""The whole turns that are tried, relative to the number of turns nearest to a guess."""
 
 
 def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
@@ -44,31 +39,61 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     Raises:
         ScenarioError: There is no such start, or something does not fit; the message names the key.
     """
-    context = loop.diagram.CreateDefaultContext()
+    context, plant = loop.diagram.CreateDefaultContext(), loop.plant
     _set_numbers(scenario, loop, context)
+    model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
+    parameters = plant.current_parameters(at_plant)
     if loop.controller.takes_over:
-        _begin_at_rest(scenario, loop, context)
+        forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
+        with at("start"):
+            state = _at_rest(scenario, loop, model, forces, parameters)
+            plant.set_state(at_plant, state)
     else:
-        _begin_with_references(scenario, loop, context)
+        outputs = _outputs_at_start(scenario.start.errors, loop, context.get_time())
+        forces = outputs[len(model.position_signals) :]
+        with at("start"):
+            of_law = _of_law(loop, parameters)
+            state = start_state(scenario, model, outputs, parameters, of_law)
+            moving = _in_motion(loop, context, outputs, state) if scenario.exogenous else state
+            moving, speeds = moving.copy(), model.links.velocity_signals
+            for name, value in scenario.start.velocities.items():
+                with at("start.velocities"):
+                    moving[model.links.q.numel() + index_of(name, speeds, "velocity")] = value
+            plant.set_consistent_state(at_plant, moving, [*scenario.start.velocities])
+    if loop.sensor is not None:
+        force = model.rest_forces(state[: model.links.q.numel()], forces, parameters)
+        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
     return context
 
 
 def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
     """Sets all numbers of a context of a closed loop but those that `start` gives."""
-    if scenario.integrator.start_time < 0.0 and (loop.plant.time_step or scenario.sampling):
+    plant, controller, begin = loop.plant, loop.controller, scenario.integrator.start_time
+    if begin < 0.0 and (plant.time_step or scenario.sampling):
         with at("integrator.start_time"):
             raise ModelError(
-                "steps and samples begin at 0 s in Drake, and a run with them no earlier, got "
-                f"{scenario.integrator.start_time:g} s"
+                f"steps and samples begin at 0 s in Drake, and a run with them no earlier, got "
+                f"{begin:g} s"
             )
-    context.SetTime(scenario.integrator.start_time)
-    plant, controller = loop.plant, loop.controller
+    context.SetTime(begin)
     at_plant = plant.GetMyMutableContextFromRoot(context)
+    numbers: list[tuple[str, str, ArrayLike]] = []
     if not scenario.plant.carries:
-        with at("plant.parameters"):
-            for name, numbers in scenario.plant.parameters.items():
-                plant.set_parameter(at_plant, name, numbers)
-    begin_own_model(scenario, plant, at_plant)
+        numbers += [("plant.parameters", *entry) for entry in scenario.plant.parameters.items()]
+        numbers += [("plant.payloads", f"{p.name}.mass", p.mass) for p in scenario.plant.payloads]
+        numbers += [
+            ("plant.disturbances", f"plant_disturbance_{index}.force", disturbance.force)
+            for index, disturbance in enumerate(scenario.plant.disturbances)
+        ]
+    values = plant.parameters(at_plant)
+    for key, name, value in numbers:
+        with at(key):
+            # A user's own plant may not let these numbers be set, and has been made with them.
+            is_set = key != "plant.parameters" and np.array_equal(
+                values[plant.dae.parameter_slice(name)], np.ravel(value)
+            )
+            if not is_set:
+                plant.set_parameter(at_plant, name, value)
     with at("plant"):
         scenario.plant.begin(plant, at_plant)
     force, encoders = scenario.sensors.force, scenario.sensors.encoders
@@ -76,38 +101,40 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
         with at("sensors.force"):
             at_sensor = loop.sensor.GetMyMutableContextFromRoot(context)
             loop.sensor.set_errors(at_sensor, force.bias, force.noise_deviation, force.drift)
-    gains = scenario.law.gains
-    if gains is not None and not controller.takes_over:  # Advised gains are in the law.
+    # The loop has the gains with which it was built.
+    gains, designs = scenario.law.gains, loop.memory.setdefault("gains", {})
+    if gains is not None and not controller.takes_over and designs.get(repr(gains), "") is not None:
         with at("law.gains"):
+            if repr(gains) not in designs:
+                designs[repr(gains)] = controller.law.design(gains.design())
             at_controller = controller.GetMyMutableContextFromRoot(context)
-            controller.set_gains(at_controller, _designed(gains, loop))
+            controller.set_gains(at_controller, designs[repr(gains)])
     loop.set_seed(context, 0 if force is None else force.seed)
     if loop.encoders is not None and encoders is not None:
         loop.encoders.set_seed(context, encoders.seed)
 
 
-def _begin_at_rest(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
-    """Starts plant and sensor at rest at start.positions, or next to them on the constraints."""
-    plant = loop.plant
-    model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
-    parameters = plant.current_parameters(at_plant)
-    forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
-    with at("start"):
-        guess = start_guess(scenario.start.positions, model.links)
-        near = model.rest_state(guess, forces, parameters)
-        structure = loop.controller.start_structure
-        of_law = structure.system.parameters_of(plant.dae, parameters)
-        q = structure.manifold.settle(near, of_law)[: guess.size]
-        _check_limits(model, q, "Give")
-        at_rest = model.rest_state(q, forces, parameters)
-        if scenario.exogenous and not structure.manifold.is_consistent(at_rest, of_law):
-            raise ModelError(
-                "a task begins at rest, and its first phase in contact with a surface that moves "
-                "then; begin with a phase without contact, such as Approach"
-            )
-        _check_outside(scenario, model, at_rest, model.dae.parameters_of(plant.dae, parameters))
-        plant.set_state(at_plant, at_rest)
-    _begin_sensor(loop, context, q, forces)
+def _at_rest(
+    scenario: Scenario,
+    loop: ClosedLoop,
+    model: RobotModel,
+    forces: FloatArray,
+    parameters: FloatArray,
+) -> FloatArray:
+    """The state at rest at start.positions, or next to them on the constraints."""
+    structure, guess = loop.controller.start_structure, start_guess(scenario, model.links)
+    of_law = structure.system.parameters_of(loop.plant.dae, parameters)
+    near = structure.manifold.settle(model.rest_state(guess, forces, parameters), of_law)
+    q = near[: guess.size]
+    _check_limits(model, q, "Give")
+    state = model.rest_state(q, forces, parameters)
+    if scenario.exogenous and not structure.manifold.is_consistent(state, of_law):
+        raise ModelError(
+            "a task begins at rest, and its first phase in contact with a surface that moves "
+            "then; begin with a phase without contact, such as Approach"
+        )
+    _check_outside(scenario, model, state, model.dae.parameters_of(loop.plant.dae, parameters))
+    return state
 
 
 def _check_outside(
@@ -137,34 +164,6 @@ def _check_outside(
             )
 
 
-def _begin_sensor(loop: ClosedLoop, context: Context, q: FloatArray, forces: FloatArray) -> None:
-    """Starts the force sensor, if there is one, at the constraint forces at rest."""
-    if loop.sensor is not None:
-        plant = loop.plant
-        parameters = plant.current_parameters(plant.GetMyContextFromRoot(context))
-        force = plant.robot("a scenario").rest_forces(q, forces, parameters)
-        loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
-
-
-def _begin_with_references(scenario: Scenario, loop: ClosedLoop, context: Context) -> None:
-    """Starts plant and sensor at the references plus the errors."""
-    plant = loop.plant
-    model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
-    parameters = plant.current_parameters(at_plant)
-    outputs = _outputs_at_start(scenario.start.errors, loop, context.get_time())
-    count = len(model.position_signals)
-    positions, forces = outputs[:count], outputs[count:]
-    with at("start"):
-        # By default near the start of the completion, which is not reported elsewhere.
-        guess = start_guess(scenario.start.positions, model.links, model.nominal_positions)
-        q = _configuration(model, positions, guess, parameters, _of_law(loop, parameters))
-        state = model.balance.state(q, forces, parameters)
-        if scenario.exogenous:
-            state = _in_motion(loop, context, outputs, state)
-        plant.set_consistent_state(at_plant, state)
-    _begin_sensor(loop, context, q, forces)
-
-
 def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
     """The parameters of the plant's system as the law assumes them, shape (k,).
 
@@ -178,15 +177,6 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
         if p.name not in moving and sizes.get(p.name) == p.value.size:
             of_law[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
     return of_law
-
-
-def _designed(gains: Gains, loop: ClosedLoop) -> FeedbackGains:
-    """The gains of a scenario; those of the last run are reused if the design is the same."""
-    key, design = loop.memory.get("gains", ("", None))
-    if key != repr(gains):
-        design = loop.controller.law.design(gains.design())
-        loop.memory["gains"] = repr(gains), design
-    return cast(FeedbackGains, design)
 
 
 def _in_motion(
@@ -204,7 +194,7 @@ def _in_motion(
 
 
 @at("start.errors")
-def _outputs_at_start(errors: dict[str, float], loop: ClosedLoop, time: float) -> FloatArray:
+def _outputs_at_start(errors: Mapping[str, float], loop: ClosedLoop, time: float) -> FloatArray:
     """z at the start: the references plus the errors, shape (p,)."""
     degrees = loop.controller.law.degrees
     outputs = loop.controller.law.layout.values(loop.reference.reference(time))
@@ -218,44 +208,53 @@ def _outputs_at_start(errors: dict[str, float], loop: ClosedLoop, time: float) -
     return outputs
 
 
-def _configuration(
+def start_state(
+    scenario: Scenario,
     model: RobotModel,
-    positions: FloatArray,
-    guess: FloatArray,
+    outputs: FloatArray,
     parameters: FloatArray,
     of_law: FloatArray,
 ) -> FloatArray:
-    """q with the position outputs of the law, on the plant's constraints, within limits.
+    """The state at rest near start.positions, within limits, with given outputs.
 
-    Whole turns are removed.
+    Args:
+        scenario: The scenario.
+        model: Its robot.
+        outputs: z, shape (p,), as the law sees them.
+        parameters: Values of all parameters of the plant, for its constraints.
+        of_law: The same as the law assumes them, for the outputs.
+
+    Raises:
+        ModelError: There is none.
     """
+    count = len(model.position_signals)
+    # By default near the start of the completion.
+    guess = start_guess(scenario, model.links, model.nominal_positions)
 
-    def solve(start: FloatArray) -> FloatArray:
-        return model.placing.solve(positions, start, parameters, of_law)
+    def solve(near: FloatArray) -> FloatArray:
+        return model.placing.solve(outputs[:count], near, parameters, of_law)
 
     try:
-        q = _unwound(model, solve, solve(guess), guess)
+        q = _unwound(model, solve, guess)
     except InconsistentStateError as error:
         goal = ", ".join(
             f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
-            for signal, value in zip(model.position_signals, positions, strict=True)
+            for signal, value in zip(model.position_signals, outputs[:count], strict=True)
         )
         raise ModelError(
             f"found no configuration near start.positions with {goal} (the references and "
             f"start.errors at the start) on the constraints: {error}"
         ) from error
     _check_limits(model, q, "Change the first values of the references, or give")
-    return q
+    return model.balance.state(q, outputs[count:], parameters)
 
 
 def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
     """Checks that all joints of a configuration are within their limits."""
-    low, high = model.links.position_limits
+    rows = zip(model.links.position_signals, q, *model.links.position_limits, strict=True)
     outside = [
         f"{signal.name} = {value:.4g} {signal.unit}, and its limits are {least:g} to {most:g}"
-        for signal, value, least, most in zip(
-            model.links.position_signals, q, low, high, strict=True
-        )
+        for signal, value, least, most in rows
         if not least - _SLACK <= value <= most + _SLACK
     ]
     if outside:
@@ -266,33 +265,52 @@ def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
 
 
 def _unwound(
-    model: RobotModel,
-    solve: Callable[[FloatArray], FloatArray],
-    solution: FloatArray,
-    guess: FloatArray,
+    model: RobotModel, solve: Callable[[FloatArray], FloatArray], guess: FloatArray
 ) -> FloatArray:
-    """Removes whole turns of joints from a configuration, as far as limits and outputs permit.
+    """A solution near a guess without whole turns of joints, as far as limits and outputs permit.
 
     Newton's method may add whole turns to a joint. `solve` returns a configuration near a guess.
     """
-    q, turn = solution, 2 * np.pi
-    limits = model.links.position_limits
-    is_inside = (limits[0] - _SLACK <= q) & (q <= limits[1] + _SLACK)
-    is_wound = ~is_inside | (np.abs(q - guess) >= np.pi)
-    if not is_wound.any():
-        return q
-    for index in np.flatnonzero(is_wound):
-        if model.links.position_signals[index].unit != "rad":
+    q, turn, (low, high) = solve(guess), 2 * np.pi, model.links.position_limits
+    for index, signal in enumerate(model.links.position_signals):
+        is_inside = low[index] - _SLACK <= q[index] <= high[index] + _SLACK
+        if signal.unit != "rad" or (is_inside and abs(q[index] - guess[index]) < np.pi):
             continue
-        low, high = limits[0][index], limits[1][index]
-        turns = q[index] - turn * np.round((q[index] - guess[index]) / turn) + turn * _TURNS
-        inside = [value for value in turns if low - _SLACK <= value <= high + _SLACK]
-        nearest = min(inside, key=lambda value: abs(value - guess[index]), default=q[index])
-        if abs(nearest - q[index]) < 1.0:
-            continue
+        nearest = q[index] - turn * np.round((q[index] - guess[index]) / turn)
+        inside = [
+            value
+            for value in (nearest, nearest - turn, nearest + turn)
+            if low[index] - _SLACK <= value <= high[index] + _SLACK
+        ]
         trial = q.copy()
-        trial[index] = nearest
+        trial[index] = min(inside, key=lambda v: abs(v - guess[index]), default=q[index])
+        if abs(trial[index] - q[index]) < 1.0:
+            continue
         with suppress(InconsistentStateError):
             settled = solve(trial)
             q = settled if np.max(np.abs(settled - trial)) < 1e-6 else q
     return q
+
+
+@at("start.positions")
+def start_guess(scenario: Scenario, links: Links, others: FloatArray | None = None) -> FloatArray:
+    """The initial guess of q: start.positions, and other joints at `others` or their defaults."""
+    guess = (links.default_positions if others is None else others).copy()
+    for name, value in scenario.start.positions.items():
+        index = index_of(name, links.position_signals, "joint position")
+        low, high = (limits[index] for limits in links.position_limits)
+        if not low <= value <= high:
+            unit = links.position_signals[index].unit
+            raise ModelError(
+                f"{name} = {value:g} {unit} is outside its limits, {low:g} to {high:g} {unit}"
+            )
+        guess[index] = value
+    return guess
+
+
+def index_of(name: str, signals: Sequence[Signal], kind: str) -> int:
+    """The index of a name among signals."""
+    names = [signal.name for signal in signals]
+    if name not in names:
+        raise ModelError(unknown_name(kind, name, names))
+    return names.index(name)

@@ -1,13 +1,14 @@
 """Runs that diverge: a state, a control or a tracking error leaves all measure, and since when."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.framework import Context, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import SimulationError
+from drake_dae.simulation.diagnosis import blocks_of
 from drake_dae.simulation.judgement import unit_sizes
 from drake_dae.simulation.records.record import Record, computed_record, recorded_values
 from drake_dae.systems.control.contract import Controller
@@ -180,7 +181,7 @@ class DiagramWatch:
     """
 
     def __init__(self, diagram: System, context: Context, duration: float) -> None:
-        blocks = list(_blocks(diagram))
+        blocks = list(blocks_of(diagram))
         plants = [block for block in blocks if isinstance(block, Plant)]
         self._controller = next((b for b in blocks if isinstance(b, Controller)), None)
         self._watches = {plant: DivergenceWatch(plant, duration) for plant in plants}
@@ -258,12 +259,3 @@ class DiagramWatch:
         else:
             rows["controlled_output"] = value("controlled_output"), dae.output_signals
         return rows
-
-
-def _blocks(system: System) -> Iterator[System]:
-    """The blocks of a diagram; a plant or a controller that is a diagram is one block."""
-    if isinstance(system, Diagram) and not isinstance(system, Plant | Controller):
-        for block in system.GetSystems():
-            yield from _blocks(block)
-    else:
-        yield system

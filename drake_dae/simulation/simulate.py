@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -26,14 +27,17 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
-from drake_dae.blocks.failures import cannot_go_on
-from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
+from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation.compiled_run import NO_EVENTS, CompiledRun
+from drake_dae.simulation.diagnosis import RunDiagnosis
 from drake_dae.simulation.divergence import DiagramWatch
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines without a terminal, in s."""
+
+PATIENCE = 1.0
+"""The time in s after a signal at which a step is ended in its middle."""
 
 MANY_STEPS = 1e7
 """A number of steps that takes over an hour, and gigabytes of memory for the log."""
@@ -86,8 +90,9 @@ def simulate(
     A run whose start_time is the end of an earlier run appends to its logs. A run that starts
     earlier clears them.
 
-    Ctrl-C, SIGTERM and SIGHUP end the run after the current step; a second signal ends it
-    immediately with a KeyboardInterrupt. Logs are kept, also if an exception ends the run.
+    Ctrl-C, SIGTERM and SIGHUP end the run after the current step, or within it after a second; a
+    second signal ends it immediately with a KeyboardInterrupt. Logs are kept, also if an exception
+    ends the run.
 
     Args:
         diagram: The system.
@@ -123,21 +128,35 @@ def simulate(
     ending = Interruption()
     began: float | None = None
     watch: DiagramWatch | None = None
+    steps, composed = 0, None
+    diagnosis = RunDiagnosis(diagram, context, config, duration)
+    accepted = start, context.get_continuous_state_vector().CopyToVector()
 
     def stop(number: signal.Signals) -> None:
         ending(number)
         if began is not None:
             simulator.set_monitor(monitor)
+            # In the middle of a long step, a second one ends it between two evaluations.
+            impatience.number = number
+            impatience.start()
 
-    with ending_signals(stop), _StepMonitor(duration, progress) as shown:
+    with (
+        _Impatience() as impatience,
+        ending_signals(stop),
+        _StepMonitor(duration, progress) as shown,
+    ):
 
         def seen(current: Context, steps: int) -> bool:
+            nonlocal accepted
+            state = current.get_continuous_state_vector().CopyToVector()
+            accepted = current.get_time(), state
             if progress:
                 shown.update(current.get_time() - start)
             for function in followers:
                 function(current)
             if watch is not None:
                 watch.look(current, steps)
+            diagnosis.look(current, steps)
             return ending.signal is None
 
         def monitor(current: Context) -> EventStatus:
@@ -154,10 +173,8 @@ def simulate(
             is_needed = progress or followers or (watch is not None and watch.sees)
             if is_needed or ending.signal is not None:
                 simulator.set_monitor(monitor)
-            composed = None
             if after_step is None and not config.target_realtime_rate:
                 composed = CompiledRun.of(diagram, context, config, duration)
-            steps = 0
             if composed is None or not composed.run(start + duration, seen):
                 if composed is not None:  # To the failure, whose message the blocks know.
                     simulator.Initialize(NO_EVENTS)
@@ -168,15 +185,25 @@ def simulate(
             elapsed = time.perf_counter() - began
             if watch is not None:
                 watch.look(context, is_last=True)
+        except KeyboardInterrupt:
+            if began is None or not impatience.is_over:
+                raise
+            context.SetTimeAndContinuousState(*accepted)
+            steps = simulator.get_num_steps_taken() + (0 if composed is None else composed.steps)
+            elapsed = time.perf_counter() - began
         except (DrakeDaeError, RuntimeError) as error:
             if began is None and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.
+            grown: DrakeDaeError | RuntimeError = error
             if watch is not None:
-                watch.look(context, states_only=True)  # They may diverge within a few steps.
-            if not isinstance(error, InconsistentStateError | RuntimeError):
+                try:
+                    watch.look(context, states_only=True)  # They may diverge within a few steps.
+                except SimulationError as diverged:
+                    grown = diverged
+            told = diagnosis.explain(grown, context)
+            if told is error:
                 raise
-            state = context.get_continuous_state_vector().CopyToVector()
-            raise cannot_go_on(context.get_time(), state, str(error)) from error
+            raise told from error
         shown.finish(context.get_time() - start)
         return RunStatistics(context.get_time() - start, elapsed, steps, ending.signal)
 
@@ -281,6 +308,29 @@ def check_config(config: SimulatorConfig) -> None:
             f"use_error_control: {scheme} has none; set it to false and max_step_size to the "
             "step, or choose runge_kutta5"
         )
+
+
+class _Impatience:
+    """Sends a signal once more if what it should end lasts, as long as the block is open."""
+
+    def __init__(self) -> None:
+        self.number, self.is_over = signal.SIGINT, False
+        self._timer = threading.Timer(PATIENCE, self._send)
+        self._timer.daemon = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._timer.cancel()
+
+    def start(self) -> None:
+        """Starts to wait."""
+        self._timer.start()
+
+    def _send(self) -> None:
+        self.is_over = True
+        os.kill(os.getpid(), self.number)
 
 
 class _StepMonitor:

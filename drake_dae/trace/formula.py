@@ -21,14 +21,12 @@ _OPERATORS: dict[type[ast.AST], Callable[..., ca.SX]] = {
     ast.USub: operator.neg,
 }
 
+_OF_ONE = (
+    *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh"),
+    *("atanh", "exp", "log", "sqrt", "erf"),
+)
 _FUNCTIONS: dict[str, tuple[int, Callable[..., ca.SX]]] = {
-    **{
-        name: (1, getattr(ca, name))
-        for name in (
-            *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
-            *("asinh", "acosh", "atanh", "exp", "log", "sqrt", "erf"),
-        )
-    },
+    **{name: (1, getattr(ca, name)) for name in _OF_ONE},
     "atan2": (2, ca.atan2),
 }
 """Name -> number of arguments, and the function."""
@@ -50,19 +48,58 @@ def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
     """
     if len(text) > MOST_LETTERS:
         raise ModelError(f"a formula has at most {MOST_LETTERS} letters, this one {len(text)}")
-    formula = _FormulaReader(" ".join(text.split()), symbols)
-    if not formula.text:
+    text, names = " ".join(text.split()), {**CONSTANTS, **symbols}
+    if not text:
         raise ModelError("the formula is empty; write one such as z - 0.1*sin(x)")
+
+    def wrong(place: int, what: str) -> ModelError:
+        return ModelError(f"formula '{_short(text)}', column {place + 1}: {what}")
+
+    def value(node: ast.expr) -> ca.SX:
+        piece = ast.get_source_segment(text, node) or ""
+        match node:
+            # Python also accepts 1_000 and 0x10, and makes numbers that are too large infinite.
+            case ast.Constant() if (number := number_in(piece)) is not None:
+                return ca.SX(number)
+            case ast.Name(id=name) if name in names:
+                return ca.SX(names[name])
+            case ast.BinOp(left, op, right) if type(op) in _OPERATORS:
+                return _OPERATORS[type(op)](value(left), value(right))
+            case ast.UnaryOp(op, operand) if type(op) in _OPERATORS:
+                return _OPERATORS[type(op)](value(operand))
+            case ast.Call(ast.Name(id=name), arguments, []) if name in _FUNCTIONS:
+                count, function = _FUNCTIONS[name]
+                if len(arguments) == count:
+                    return function(*map(value, arguments))
+                why = f"{name} takes {count} value(s), got '{_short(piece)}'"
+            case ast.Name(id=name) if name in _FUNCTIONS:
+                why = f"'{name}' is a function and takes brackets, {name}(x)"
+            case ast.Name(id=name):
+                why = unknown_name("name", name, names)
+            case ast.Call(ast.Name(id=name)) if name not in (*_FUNCTIONS, *_ROUGH):
+                why = unknown_name("function", name, _FUNCTIONS)
+            case ast.Call(ast.Name(id=name)) if name in _ROUGH:
+                why = f"'{_short(piece)}' {_SMOOTH_INSTEAD}"
+            case ast.Compare() | ast.IfExp() | ast.BoolOp():
+                why = f"'{_short(piece)}' {_SMOOTH_INSTEAD}"
+            case ast.BinOp(op=ast.BitXor()):
+                why = f"'{_short(piece)}' has ^; a power is x**2"
+            case _:
+                why = (
+                    f"'{_short(piece)}' is not allowed; a formula has finite numbers, names, "
+                    "+ - * / **, brackets and functions"
+                )
+        raise wrong(len(text.encode()[: node.col_offset].decode()), why)
+
     try:
-        tree = ast.parse(formula.text, mode="eval")
+        body = ast.parse(text, mode="eval").body
     except SyntaxError as error:
         place = (error.offset or 1) - 1
-        rest = _short(formula.text[place:], 20) or "its end"
-        raise formula.error(f"it cannot be read at '{rest}'", place) from None
+        raise wrong(place, f"it cannot be read at '{_short(text[place:], 20)}'") from None
     except (ValueError, RecursionError, MemoryError):
         raise ModelError("the formula holds a null letter, or too many brackets") from None
     try:
-        return formula.value(tree.body)
+        return value(body)
     except RecursionError:
         raise ModelError("the formula holds too many brackets") from None
 
@@ -74,71 +111,6 @@ def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:
             raise ModelError(f"parameter '{name}': a name is a word such as r_1")
         if name in taken or name in CONSTANTS or name in _FUNCTIONS or name in _ROUGH:
             raise ModelError(f"parameter '{name}': in a formula this means something else")
-
-
-class _FormulaReader:
-    """A formula on one line, with the expressions of its names."""
-
-    def __init__(self, text: str, symbols: Mapping[str, ca.SX]) -> None:
-        self.text = text
-        self._names = {**CONSTANTS, **symbols}
-
-    def error(self, what: str, place: int) -> ModelError:
-        """Returns an error at a position of the text, counted from 0."""
-        return ModelError(f"formula '{_short(self.text)}', column {place + 1}: {what}")
-
-    def value(self, node: ast.expr) -> ca.SX:
-        """Returns the expression of a part of the text."""
-        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-            return self._number(node)
-        if isinstance(node, ast.Name):
-            if node.id not in self._names:
-                raise self._wrong(node, self._unknown(node.id))
-            return ca.SX(self._names[node.id])
-        if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
-            return _OPERATORS[type(node.op)](self.value(node.left), self.value(node.right))
-        if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
-            return _OPERATORS[type(node.op)](self.value(node.operand))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            return self._call(node, node.func.id)
-        raise self._wrong(node, f"'{self._piece(node)}' {self._remedy(node)}")
-
-    def _number(self, node: ast.Constant) -> ca.SX:
-        # Python also accepts 1_000 and 0x10, and makes numbers that are too large infinite.
-        number = number_in(ast.get_source_segment(self.text, node) or "")
-        if number is None:
-            raise self._wrong(node, f"{self._piece(node)} is no number, or is too large a number")
-        return ca.SX(number)
-
-    def _call(self, node: ast.Call, name: str) -> ca.SX:
-        if name in _ROUGH:
-            raise self._wrong(node, f"'{self._piece(node)}' {_SMOOTH_INSTEAD}")
-        if name not in _FUNCTIONS:
-            raise self._wrong(node, unknown_name("function", name, _FUNCTIONS))
-        count, function = _FUNCTIONS[name]
-        if len(node.args) != count or node.keywords:
-            words = "one value" if count == 1 else f"{count} values"
-            raise self._wrong(node, f"{name} takes {words}, got '{self._piece(node)}'")
-        return function(*(self.value(argument) for argument in node.args))
-
-    def _unknown(self, name: str) -> str:
-        if name in _FUNCTIONS:
-            return f"'{name}' is a function and takes brackets, {name}(x)"
-        return unknown_name("name", name, self._names)
-
-    def _wrong(self, node: ast.expr, what: str) -> ModelError:
-        return self.error(what, len(self.text.encode()[: node.col_offset].decode()))
-
-    def _piece(self, node: ast.expr) -> str:
-        return _short(ast.get_source_segment(self.text, node) or "")
-
-    @staticmethod
-    def _remedy(node: ast.expr) -> str:
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.BitXor):
-            return "has ^; a power is x**2"
-        if isinstance(node, (ast.Compare, ast.IfExp, ast.BoolOp)):
-            return _SMOOTH_INSTEAD
-        return "is not allowed; a formula has numbers, names, + - * / **, brackets and functions"
 
 
 def _short(text: str, letters: int = 60) -> str:

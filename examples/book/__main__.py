@@ -67,17 +67,7 @@ def _live_figures(texts: Iterable[str], library: str, out: Path) -> None:
         if page.exists() and stamp.exists() and stamp.read_text() == library:
             continue
         print(f"makes the live figure {name}", flush=True)
-        if command(
-            [
-                "page",
-                name,
-                "--force",
-                "--out",
-                str(page),
-                "--shared-bundle",
-                str(folder / "meshcat.js"),
-            ]
-        ):
+        if command(["page", name, "--force", "--out", str(page)]):
             page.write_text(NO_FIGURE.format(name=name), "utf-8")
         else:
             stamp.write_text(library)

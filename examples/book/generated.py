@@ -12,7 +12,7 @@ from unittest.mock import patch
 import drake_dae
 from book.keys import keys_page
 from book.pages import BOOK, blocks, pages
-from drake_dae.commands.options import parse_options
+from drake_dae.cli import main
 
 ROOT = BOOK.parents[1]
 sys.path.append(str(ROOT / "tests" / "support"))
@@ -120,7 +120,7 @@ def _help(arguments: list[str]) -> str:
         contextlib.redirect_stdout(printed),
         contextlib.suppress(SystemExit),
     ):
-        parse_options([*arguments, "--help"])
+        main([*arguments, "--help"])
     return printed.getvalue()
 
 
@@ -130,5 +130,5 @@ def equations_page() -> str:
 
     return (
         "# Equations\n\nFrom each equation of the paper to the line that computes it, and to the "
-        f"test that proves it. `make equations` prints the same.\n\n{table()}\n"
+        f"test that proves it. `make table NAME=equations` prints the same.\n\n{table()}\n"
     )

@@ -1,4 +1,4 @@
-"""One task on Drake's own contact, by our law and by what users would do today: `make peers`.
+"""One task on Drake's own contact, by our law and by what users would do today.
 
     python tests/benchmarks/contact_peers.py
 
@@ -36,8 +36,9 @@ from drake_dae import (
 )
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import DrakeDaeError
+from drake_dae.scenario import plants
 from drake_dae.scenario.advice.advice import advised
-from drake_dae.scenario.loop import build_loop, make_plant
+from drake_dae.scenario.build import build_completed, make_plant
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.start import start_scenario
 
@@ -308,6 +309,13 @@ class MeasuredPlant(ContactPlant):
         self._noise.SetRandomContext(noise, RandomGenerator(1))
 
 
+class _Measured(plants.MultibodyPlant):
+    """The plant of a scenario, as a `MeasuredPlant`."""
+
+    def plant(self, robot):
+        return MeasuredPlant(super().plant(robot), 0.0)
+
+
 @cache
 def ours(condition: Condition, friction: float):
     sensor = f"{{sample_period: {PERIOD}, noise_deviation: {FORCE_NOISE * condition.noise}}}"
@@ -325,8 +333,8 @@ def ours(condition: Condition, friction: float):
     if condition.noise:  # Its gains are those for sensors without noise.
         noisy = Encoders(position_noise=ANGLE_NOISE, velocity_noise=RATE_NOISE, seed=1)
         scenario = replace(scenario, sensors=replace(scenario.sensors, encoders=noisy))
-    plant = MeasuredPlant(make_plant(scenario, model, structure), 0.0)
-    loop = build_loop(scenario, model, structure, plant=plant)
+    measured = _Measured(**vars(scenario.plant))
+    _, loop = build_completed(replace(scenario, plant=measured))
     return loop, start_scenario(scenario, loop), scenario
 
 

@@ -13,7 +13,7 @@ from runs import scenario
 from timing import has_compiler
 
 from drake_dae import build_scenario, simulate
-from drake_dae.scenario.loop import make_plant
+from drake_dae.scenario.build import make_plant
 from drake_dae.scenario.model import completed_model, scenario_structure
 
 DURATION, ROUNDS = 4.0, 3
@@ -44,7 +44,7 @@ def whole(name):
 def plant_alone(name, record):
     """The `ContactPlant` of a scenario in a Simulator, driven by recorded torques."""
     chosen = scenario(name)
-    _, model = completed_model(chosen, SceneGraph())
+    _, model, _ = completed_model(chosen, SceneGraph())
     plant = make_plant(chosen, model, scenario_structure(model))
     builder = DiagramBuilder()
     builder.AddSystem(plant)

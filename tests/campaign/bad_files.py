@@ -194,8 +194,7 @@ WORDS = (
     "--json",
     "--check",
     "--rollout",
-    "--compiled=maybe",
-    "--compiled=false",
+    "--force",
     "--nonsense",
     "-h",
     "--surface=plane",
@@ -227,7 +226,7 @@ VARY = (
 def _command(choice: random.Random, folder: Path) -> Outcome:
     """A command line with random words, as far as it goes in a moment."""
     command = choice.choice(
-        ("simulate", "analyze", "sweep", "render", "play", "new", "print", "list", "export")
+        ("simulate", "analyze", "sweep", "plot", "play", "new", "print", "list", "export")
     )
     words = [command, *choice.sample(WORDS, choice.randint(0, 3))]
     if command == "sweep":

@@ -168,7 +168,7 @@ def main() -> int:
     parser.add_argument("--set", dest="settings", action="append", default=[])
     parser.add_argument("--limit", type=float, default=300.0, help="s for one run")
     given = parser.parse_args()
-    import drake_dae.scenario.new.new_scenario  # noqa: F401  Once, before the forks.
+    import drake_dae.scenario.new  # noqa: F401  Once, before the forks.
 
     counts, raw = {surface: 0 for surface in given.surfaces}, 0
     robots = whole = 0

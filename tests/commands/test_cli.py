@@ -20,8 +20,8 @@ from runs import some
 import drake_dae
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
-from drake_dae.commands import new, simulate
-from drake_dae.commands.run.folder import FILES, PART
+from drake_dae.commands import scenarios, simulate
+from drake_dae.commands.folder import FILES, PART
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.pictures.plots import PATHS, PLOTS
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
@@ -164,10 +164,8 @@ def test_view_says_what_is_missing(demo, tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
     for path, text in (
-        (folder.parent / "runn", f"no folder '.*runn'; there is {folder}"),
-        (tmp_path / "none", r"no folder '.*none'"),
-        (folder / "summary.txt", "is a file; name the folder of a run"),
-        (run, "'.*run' is no folder of a run: `drake-dae simulate --out FOLDER` makes one"),
+        (folder.parent / "runn", f"'.*runn' is no folder of a run; there is {folder}"),
+        (run, "'.*run' is no folder of a run"),
     ):
         assert main(["play", str(path)]) == 1
         assert re.search(text, error_line(capsys))
@@ -211,7 +209,7 @@ def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
     out, err = process.communicate(timeout=30)
     assert process.returncode == 130, err
     assert err == ""
-    assert "interrupted          the record ends there" in out
+    assert "interrupted" in out
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == sorted(FILES)
     record = Record.load(tmp_path / "run" / "record.npz")
     assert 0.0 < record.time[-1] < 60.0
@@ -237,46 +235,15 @@ def test_ctrl_c_in_the_middle_of_a_step_keeps_the_record(tmp_path, monkeypatch, 
     assert "interrupted" in (tmp_path / "summary.txt").read_text()
 
 
-@pytest.mark.slow
-def test_cache(tmp_path, monkeypatch, capsys):
-    """A run with a flag that fills it; no other flag does."""
-    monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "code"))
-    monkeypatch.delenv("CC", raising=False)
-    short = ["simulate", "two_link_wall", "--set", "duration=0.05", *BARE]
-    for flag in ("auto", "false"):
-        assert main([*short, "--out", str(tmp_path / flag), "--compiled", flag]) == 0
-    capsys.readouterr()
-    assert main(["cache"]) == 0
-    printed = capsys.readouterr().out
-    assert f"{tmp_path}/code: 0 files, 0.0 MB\n" in printed
-    assert re.search(r"^compiler +(cc$|none: no C compiler)", printed, flags=re.MULTILINE)
-    if "none" not in printed:
-        assert main([*short, "--out", str(tmp_path / "run"), "--compiled", "true"]) == 0
-        assert "compiled: true" in (tmp_path / "run" / "scenario.yaml").read_text()
-        capsys.readouterr()
-        assert main(["cache"]) == 0
-        assert re.search(r"code: [5-9] files, 0\.\d MB", capsys.readouterr().out)
-    assert main(["cache", "--clear"]) == 0
-    assert re.search(r"removed from .*: \d files", capsys.readouterr().out)
-    assert not list((tmp_path / "code").glob("*"))
-    monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "run" / "scenario.yaml"))
-    (tmp_path / "run").mkdir(exist_ok=True)
-    (tmp_path / "run" / "scenario.yaml").touch()
-    assert main(["cache"]) == 1
-    assert "is no folder" in error_line(capsys)
-
-
 def test_no_compiler_is_a_warning(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "code"))
     monkeypatch.setenv("CC", "no-such-compiler")
     short = ["simulate", "two_link_wall", "--set", "duration=0.05", *BARE]
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        assert main([*short, "--out", str(tmp_path / "run"), "--compiled", "true"]) == 0
+        assert main([*short, "--out", str(tmp_path / "run"), "--set=compiled=true"]) == 0
     (line,) = capsys.readouterr().err.splitlines()  # Once, though for each of the functions.
     assert line.startswith("warning: no C compiler: CC names 'no-such-compiler'")
-    assert main(["cache"]) == 0
-    assert "none: no C compiler" in capsys.readouterr().out
 
 
 def test_list(capsys):
@@ -359,7 +326,7 @@ def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, 
         warnings.warn("two tanks: non-minimum phase", NonMinimumPhaseWarning, stacklevel=1)
         raise ScenarioError(("", "empty"))
 
-    for command_of in (simulate, new):
+    for command_of in (simulate, scenarios):
         monkeypatch.setattr(command_of, "find_scenario", warn)
     assert main(["simulate", "two_tanks"]) == 1
     assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\nerror: empty\n"

@@ -13,7 +13,7 @@ from runs import some
 
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
-from drake_dae.commands import export
+from drake_dae.commands import written
 from drake_dae.running.rollout.run import num_cores
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import save_scenario
@@ -84,7 +84,6 @@ def test_a_good_run_is_reported_with_figures_and_files(tmp_path, capsys):
         (["simulate", "no_such"], "no_such"),
         (["analyze", "two_link_wall", "--set=gains={all: [4]}"], ""),
         (["sweep", "two_link_wall", "--vary=a=1"], "a"),
-        (["export", "wall_polish"], "task"),
     ],
 )
 def test_an_error_is_json_too(arguments, words, tmp_path, monkeypatch, capsys):
@@ -124,7 +123,6 @@ def test_a_study_is_json(tmp_path, capsys):
     [
         (["simulate", "--out", ""], "--out"),
         (["sweep", "--vary", "a=1", "--out="], "--out"),
-        (["render", ""], "folder"),
         (["play", ""], "RUN"),
         (["sweep", "--vary", "a=1", "--random=1_0"], "'1_0'"),
         (["sweep", "--vary", "a=1", "--time-limit=nan"], "--time-limit"),
@@ -147,18 +145,6 @@ def test_the_point_of_a_tip_is_three_numbers(tip, tmp_path, monkeypatch, capsys)
 
 
 # What it keeps.
-
-
-@pytest.mark.slow
-def test_a_second_run_keeps_the_first_one_and_says_where(tmp_path, capsys):
-    folder = tmp_path / "run"
-    for duration in (0.1, 0.2, 0.3):
-        arguments = ["simulate", "two_link_wall", *BARE, f"--set=duration={duration}"]
-        assert main([*arguments, f"--out={folder}"]) == 0
-    assert f"the earlier run in {folder}/ is kept in {folder}-2/" in capsys.readouterr().out
-    for name, duration in (("run-1", 0.1), ("run-2", 0.2), ("run", 0.3)):
-        assert Record.load(tmp_path / name / "record.npz").time[-1] == pytest.approx(duration)
-        assert load_scenario(tmp_path / name / "scenario.yaml").duration == duration
 
 
 def test_a_record_has_what_repeats_the_run(tmp_path):
@@ -189,7 +175,7 @@ def test_a_film_that_is_ended_leaves_nothing_behind(sent, tmp_path):
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from drake_dae.cli import main\nsys.exit(main(sys.argv[1:]))"
     )
-    command = [sys.executable, "-c", code, "render", str(folder)]
+    command = [sys.executable, "-c", code, "plot", "--film", str(folder)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     limit = time.monotonic() + 60
     while not list(folder.glob(".unfinished-*")):
@@ -240,7 +226,7 @@ def test_all_commands_start_at_the_same_state(name, tmp_path, monkeypatch):
         found["export"] = own.get_continuous_state_vector().CopyToVector()
         return []
 
-    monkeypatch.setattr(export, "export_code", kept)
+    monkeypatch.setattr(written, "export_code", kept)
     settings = ["--set=start={}", "--set=duration=0.01", *BARE]
     assert main(["export", name, *settings, f"--out={tmp_path / 'code'}"]) == 0
     assert main(["simulate", name, *settings, f"--out={tmp_path / 'run'}"]) == 0

@@ -8,7 +8,7 @@ from command_line import shown_on_a_terminal
 from drake_dae.cli import main
 from drake_dae.studies.study import FILES
 
-SHORT = ["--set", "duration=0.2", "--compiled", "false"]
+SHORT = ["--set", "duration=0.2", "--set", "compiled=false"]
 VARY = ["--vary", "start.errors.tool.z=0..0.05:3"]
 
 

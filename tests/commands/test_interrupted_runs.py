@@ -15,7 +15,7 @@ from runs import run_scenario, scenario, some
 
 from drake_dae import Record
 from drake_dae.cli import main
-from drake_dae.commands.run.folder import FILES, PART
+from drake_dae.commands.folder import FILES, PART
 from drake_dae.running.rollout.stepping.course import RunStepper
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
@@ -117,7 +117,7 @@ def check(sent, code, folder, undisturbed, complete=FILES):
 @pytest.mark.usefixtures("signals_of_a_shell")
 @pytest.mark.slow
 @pytest.mark.filterwarnings("always")
-def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path, capsys):
+def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path):
     moments = [(sent, 0.7 * SECONDS) for sent in (signal.SIGKILL, *ENDING_SIGNALS)]
     for sent, code, folder in interrupted(moments, tmp_path, BARE):
         count = check(sent, code, folder, undisturbed, WITHOUT_PICTURES)
@@ -127,12 +127,10 @@ def test_each_signal_in_the_middle_of_a_run(undisturbed, tmp_path, capsys):
             assert sorted(path.name for path in folder.iterdir()) == sorted(WITHOUT_PICTURES)
     # A killed run is no obstacle to the next one.
     folder = tmp_path / "SIGKILL0"
-    (folder / ".unfinished-plots").mkdir()
     short = [f"--set={setting}" for setting in ("duration=0.1", *BARE)]
-    assert main(["simulate", "two_link_wall", "--out", str(folder), *short]) == 0
-    kept = tmp_path / "SIGKILL0-1"
-    assert f"the earlier run in {folder}/ is kept in {kept}/" in capsys.readouterr().out
-    assert Record.load(kept / PART).time.size
+    assert main(["simulate", "two_link_wall", "--out", str(folder), *short]) == 1
+    assert Record.load(folder / PART).time.size
+    assert main(["simulate", "two_link_wall", "--out", str(folder), "--force", *short]) == 0
     assert sorted(path.name for path in folder.iterdir()) == sorted(WITHOUT_PICTURES)
 
 
@@ -188,7 +186,7 @@ def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys)
         if self.steps == 20:
             os.kill(os.getpid(), signal.SIGINT)
 
-    words = ["simulate", "two_link_wall", "--rollout", "--compiled", "false", "--set=duration=10"]
+    words = ["simulate", "two_link_wall", "--rollout", "--set=compiled=false", "--set=duration=10"]
     words += [f"--set={setting}" for setting in BARE]
     assert main([*words, "--out", str(tmp_path / "whole")]) == 0
     monkeypatch.setattr(RunStepper, "accept", and_interrupt)
@@ -212,7 +210,7 @@ class Interrupting:
 sys.meta_path.insert(0, Interrupting())
 from drake_dae.cli import main
 assert "pydrake" not in sys.modules
-sys.exit(main(["render", "nowhere"]))
+sys.exit(main(["plot", "nowhere"]))
 """
 
 

@@ -8,7 +8,7 @@ from pydrake.systems.analysis import Simulator
 from runs import scenario
 
 from drake_dae.compiler.drake_steps import DrakeSteps
-from drake_dae.scenario.loop import make_plant
+from drake_dae.scenario.build import make_plant
 from drake_dae.scenario.model import completed_model, scenario_structure
 
 PUSH = "plant.disturbances=[{frame: tool, force: [100, 20, 5], start_time: 0.002}]"
@@ -17,7 +17,7 @@ PUSH = "plant.disturbances=[{frame: tool, force: [100, 20, 5], start_time: 0.002
 def stepped_part(name, *settings):
     """The part of the plant of a scenario that Drake steps, and its context where it touches."""
     chosen = scenario(name, "compiled=false", *settings)
-    completed, model = completed_model(chosen, SceneGraph())
+    completed, model, _ = completed_model(chosen, SceneGraph())
     plant = make_plant(completed.scenario, model, scenario_structure(model))
     touching, stepped = plant.CreateDefaultContext(), plant.traced().stepped
     plant.set_state(touching, plant.structure.manifold.project(model.dae.nominal_state))

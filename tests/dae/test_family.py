@@ -151,6 +151,26 @@ def test_a_rank_of_b_that_depends_on_numbers():
     assert found.violation.cause is ViolationKind.BOUNDS
 
 
+@pytest.mark.parametrize(
+    ("entry", "ranges", "names"),
+    [
+        (lambda p: (p.a - 2) ** 2, {"a": (0.1, 3.5)}, {"a"}),  # Without a change of sign.
+        (lambda p: (p.a - 1.7) * (p.a - 1.9), {"a": (0.1, 3.0)}, {"a"}),
+        (lambda p: 3.5 - p.a - p.b, {"a": (0.1, 2.0), "b": (0.1, 2.0)}, {"a", "b"}),  # At a corner.
+        (lambda p: (p.a - 1.5) ** 2 + (p.b - 1.6) ** 2, {"a": (0, 2), "b": (0, 2)}, {"a", "b"}),
+    ],
+)
+def test_a_rank_that_is_lost_inside_a_box_of_parameters(entry, ranges, names):
+    regular = coupled(lambda p: [[entry(p), 0], [0, 1]])
+    assert find_structure(regular).output_degrees == (1, 1)
+    with pytest.raises(AssumptionError) as caught:
+        find_structure(regular.with_bounds(ranges))
+    assert caught.value.violation.cause is ViolationKind.BOUNDS
+    assert set(caught.value.violation.deciding.names) == names
+    narrow = {name: (low, 1.2) for name, (low, _) in ranges.items()}
+    assert find_structure(regular.with_bounds(narrow)).output_degrees == (1, 1)
+
+
 def test_a_rank_of_a_within_bounds():
     """A = 1 + w: lost at w = -1, which bounds may hold."""
     system = DaeSystem.from_functions(

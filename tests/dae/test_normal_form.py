@@ -74,9 +74,12 @@ def test_phi_and_its_inverse_compose_to_the_identity(name):
 
 
 @pytest.mark.slow
-@pytest.mark.equation(23)
+@pytest.mark.equation(23, 26, 27)
 def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
-    """dPhi/dx (f + g v + h u): integrators, then a + B u by hand; y stays; v by hand."""
+    """dPhi/dx (f + g v + h u): integrators, then a + B u by hand; y stays; v by hand.
+
+    `rates` has the same of (zeta, xi).
+    """
     system = problem.system
     normal_form = NormalForm(system)
     fields = ca.Function(
@@ -104,6 +107,8 @@ def test_the_vector_field_in_the_coordinates_is_that_of_26(problem):
         )
         residual = problem.derivatives(x)
         np.testing.assert_allclose(coordinates[: residual.size], residual, atol=1e-13)
+        found = normal_form.rates(x, u)
+        np.testing.assert_allclose(found, moving[residual.size :], rtol=0, atol=1e-11 * scale)
 
 
 @pytest.mark.parametrize("name", ["two_link", "seven_joint"])

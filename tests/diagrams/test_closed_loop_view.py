@@ -343,7 +343,7 @@ def test_only_this_machine_reaches_meshcat():
     with socket.create_connection(("localhost", url.port), timeout=5):
         pass
     # On Linux all of 127.0.0.0/8 is this machine, so that a server on all interfaces would answer.
-    with pytest.raises(OSError, match=r"refused|timed out|assign|unreachable"):
+    with pytest.raises(OSError):  # noqa: PT011 (each system has its own words)
         socket.create_connection(("127.0.0.2", url.port), timeout=5)
 
 

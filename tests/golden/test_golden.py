@@ -4,15 +4,30 @@ Steps are fixed: with error control two correct versions differ by 1e-5. `record
 records anew; the commit that does so says why, and by how much they moved.
 """
 
+import ctypes
 import json
 import shutil
+from ctypes import POINTER, c_double
 from importlib.metadata import version
 
 import numpy as np
 import pytest
+from c_controller import compile_c
 from golden.cases import CASES, FIXTURE
-from golden.recording import analysis_of, gains_found, rollout_of, run_of, values_at
+from golden.recording import (
+    SIGNALS,
+    analysis_of,
+    built,
+    gains_found,
+    rollout_of,
+    run_of,
+    times_of,
+    values_at,
+)
 from runs import DEAR, some
+
+from drake_dae import export_code
+from drake_dae.running.export.parts import parts_of
 
 KEPT = np.load(FIXTURE)
 
@@ -53,6 +68,28 @@ def test_rollouts_are_as_recorded(name, compiled):
         KEPT[f"run/{name}"],
         CONTACT if CASES[name].amplifies else 1e-9,
     )
+
+
+@pytest.mark.parametrize("name", params(["two_link_wall", "seven_joint_wall"]))
+def test_exported_c_is_as_recorded(name, tmp_path):
+    """All signals that the loop in C computes from the recorded states."""
+    if shutil.which("cc") is None:
+        pytest.skip("there is no C compiler")
+    _, loop, context = built(CASES[name])
+    export_code(loop, context, name, tmp_path)
+    path = compile_c(tmp_path, [f"{name}.c"], f"{name}.so", "-O1", "-shared", "-fPIC")
+    function = getattr(ctypes.CDLL(path), f"{name}_loop_outputs")
+    compiled = parts_of(loop).compiled
+    parameters = compiled.values(context)
+    ends = np.cumsum([loop.diagram.GetOutputPort(port).size() for port in compiled.outputs])
+    wanted, found = KEPT[f"run/{name}"], []
+    for row, time in zip(wanted, times_of(CASES[name])[::2], strict=True):
+        state = row[: loop.plant.dae.num_states].copy()
+        arrays = np.array([time]), state, np.zeros(0), parameters, np.empty(ends[-1])
+        assert not function(*(a.ctypes.data_as(POINTER(c_double)) for a in arrays))
+        found.append(dict(zip(compiled.outputs, np.split(arrays[-1], ends), strict=False)))
+    columns = np.vstack([np.hstack([row[signal] for signal in SIGNALS]) for row in found])
+    assert_near(columns, wanted, IDEAL)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from collections.abc import Collection
 from pathlib import Path
 
 import pytest
-from draw_house import draw
 from house import PAPER, ROOMS, ROOT, WITHOUT_DRAKE, imports, may_import, modules, room, violations
 
 
@@ -38,7 +37,7 @@ def test_the_mathematics_loads_no_drake() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
-    [["list"], ["print"], ["print", "--path"], ["--version"], ["--help"], ["simulate", "--help"]],
+    [["list"], ["print"], ["print", "--path"], ["--version"], ["--help"]],
 )
 def test_what_needs_no_robot_loads_none(words: list[str]) -> None:
     code = (
@@ -51,13 +50,6 @@ def test_what_needs_no_robot_loads_none(words: list[str]) -> None:
     tops = {name.split(".")[0] for name in printed.splitlines()[-1].split()}
     assert "drake_dae" in tops
     assert tops.isdisjoint({"pydrake", "casadi", "scipy", "matplotlib", "pydantic", "tqdm"})
-
-
-@pytest.mark.slow
-def test_what_most_runs_do_not_need_loads_when_it_is_used() -> None:
-    loaded = loaded_with(["commands"])
-    assert "pydrake" in loaded
-    assert loaded.isdisjoint({"matplotlib", "scipy.integrate", "scipy.optimize"})
 
 
 @pytest.mark.slow
@@ -97,12 +89,6 @@ def test_the_guide_has_the_rules_of_this_file() -> None:
 def test_the_guide_has_the_order_of_the_paper() -> None:
     (order,) = re.findall(r"^    (system/(?:\s+\w+/?)*)$", GUIDE, flags=re.MULTILINE)
     assert tuple(name.rstrip("/") for name in order.split()) == PAPER
-
-
-@pytest.mark.slow
-def test_the_house_is_drawn(tmp_path) -> None:
-    draw(tmp_path / "house.png")
-    assert (tmp_path / "house.png").stat().st_size > 50_000
 
 
 def test_files_that_the_guide_names_exist() -> None:

@@ -67,6 +67,8 @@ def test_a_mistake_is_told_in_one_line_with_its_place(text, line, kind, tmp_path
         return
     assert problems == tuple(dict.fromkeys(problems))
     for key, told in problems:
-        assert key and told and "\n" not in key + told
+        assert key
+        assert told
+        assert "\n" not in key + told
     if kind != "text":
         assert any(f"[wrong.yaml:{line}]" in told for _, told in problems)

@@ -1,4 +1,4 @@
-"""Where each equation of the paper is computed, and which test proves it: `make equations`.
+"""Where each equation of the paper is computed, and which test proves it.
 
 The number of an equation stands as a comment at the line that computes it, `# (13), (14)`, and as
 the mark `@pytest.mark.equation(13, 14)` at the test that holds that line against another source.

@@ -21,16 +21,16 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import lie_derivative
-from drake_dae.dae.extension.extension import Extension, integrated, nominal_controls, refuse_metric
+from drake_dae.dae.extension.extension import Extension, by_control, integrated, refuse_metric
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples, spread_of
-from drake_dae.dae.structure.relative_degrees import eliminated_at
+from drake_dae.dae.structure.relative_degrees import InputActions
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import Factorization
-from drake_dae.trace.round_off import multiply, positive
+from drake_dae.trace.round_off import positive
 
 
 @checked(ModelError)
@@ -70,10 +70,11 @@ def dynamic_extension(
     refuse_metric(system)
     limit = system.num_states if max_integrators is None else max_integrators
     check_whole_number(f"{system.name}: max_integrators", limit, 0)
-    chain = _Chain(system, nominal_controls(system, nominal_control), spread)
+    nominal = by_control(system, "nominal_control", nominal_control or {})
+    chain = _Chain(system, nominal, spread)
     while True:
         try:
-            structure, _ = examine_structure(chain.beside_nominal(), spread=chain.spread)
+            structure, _ = examine_structure(chain.near_nominal(), spread=chain.spread)
         except AssumptionError as error:
             if error.assumption != 3:
                 raise
@@ -112,15 +113,18 @@ class _Chain:
         self._names = [signal.name for signal in system.control_signals]
         self._bases = [(signal, 0) for signal in system.control_signals]
 
-    def beside_nominal(self) -> DaeSystem:
+    def near_nominal(self) -> DaeSystem:
         """Returns the system with a nominal state at which no sine is accidentally zero.
 
         Rows of B(x) may vanish accidentally there, as sin(heading) does at heading 0.
         """
         random = np.random.default_rng(0)
         step = 0.1 * self.spread * random.standard_normal(self.system.num_states)
-        beside = self.system.nominal_state + step
-        return replace(self.system, nominal_state=beside, state_scale=self.system.scale)
+        return replace(
+            self.system,
+            nominal_state=self.system.nominal_state + step,
+            state_scale=self.system.scale,
+        )
 
     def integrate(self, columns: list[int], mixing: ca.SX | None = None) -> None:
         """Puts one integrator before each of some controls."""
@@ -216,32 +220,25 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
 
 def _control_matrices(structure: Structure, samples: Samples) -> FloatArray:
     """B(x) without its round-off, shape (samples, p, p)."""
-    elimination, state = structure.elimination, structure.system.state
-    negligible = structure.system.negligible
-    h_star, n_star = eliminated_at(samples, elimination)
+    actions = InputActions(samples, structure.elimination)
+    matrices = actions.numbers(actions.feedthrough)
     dynamic = [i for i, degree in enumerate(structure.output_degrees) if degree]
-    last = ca.vertcat(ca.SX(0, 1), *[structure.output_chains[i][-1] for i in dynamic])
-    gradients = samples.values(gradient=ca.jacobian(last, state))
-    result = np.array([value for value, _ in n_star])
-    for matrix, (gradient,), field in zip(result, gradients, h_star, strict=True):
-        matrix[dynamic] = multiply(gradient, field, samples.scale, negligible)[0]
-    return result
+    if dynamic:
+        last = ca.vertcat(*[structure.output_chains[i][-1] for i in dynamic])
+        matrices[:, dynamic] = actions.numbers(actions.along(last, "h*"))
+    return matrices
 
 
 def _early_controls(system: DaeSystem, violation: AssumptionError) -> list[int]:
     """Returns the controls that act on a constraint's derivative before its inputs do."""
     x, explicit = system.state, system.explicit
     manifold = Manifold(system, [[explicit.k[i]] for i in range(system.num_constraints)])
-    samples = Samples(manifold, np.array([violation.state]))
+    actions = InputActions(Samples(manifold, np.array([violation.state])))
     early: set[int] = set()
     for i in range(system.num_constraints):
         last = explicit.k[i]
         for _ in range(system.num_states):
-            gradient = samples.values(gradient=ca.jacobian(last, x))[0][0]
-            by_force, by_control = (
-                multiply(gradient, samples.field(key)[0], samples.scale, system.negligible)[0]
-                for key in "gh"
-            )
+            by_force, by_control = (actions.numbers(actions.along(last, key))[0] for key in "gh")
             if by_force.any():
                 break
             if by_control.any():

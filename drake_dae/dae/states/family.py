@@ -24,25 +24,27 @@ factor, repeatedly."""
 
 _TRIES = 6
 
+CORNERS, STARTS, DESCENTS, STEP = 16, 3, 25, 1e-4
+"""How the box of bounds is searched: the number of random corners and of random places, of the
+places from which a margin is minimized, of steps, and the difference for its gradient."""
+
+SAME = 1e-3
+"""Parameters that differ less from their defaults, relative to the others, do not decide."""
+
 
 @dataclass(frozen=True, eq=False)
 class Deciding:
-    """Parameters for which an expression is not zero, although it is zero at the defaults."""
+    """Parameters that decide a degree or a rank: name, value and default of each."""
 
-    names: tuple[str, ...]
-    values: tuple[float, ...]
-    defaults: tuple[float, ...]
+    pairs: tuple[tuple[str, float, float], ...]
 
     @property
-    def pairs(self) -> tuple[tuple[str, float, float], ...]:
-        """Name, value and default of each."""
-        return tuple(zip(self.names, self.values, self.defaults, strict=True))
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for name, _, _ in self.pairs)
 
     def __str__(self) -> str:
-        there, here = (
-            " and ".join(f"{n} = {v:.3g}" for n, v in zip(self.names, values, strict=True))
-            for values in (self.values, self.defaults)
-        )
+        there = " and ".join(f"{name} = {value:.3g}" for name, value, _ in self.pairs)
+        here = " and ".join(f"{name} = {default:.3g}" for name, _, default in self.pairs)
         return f"at {there}, and not at the default {here}"
 
 
@@ -72,63 +74,100 @@ class Family:
             member = self._consistent(state, mixed)
             return member is not None and acts(*member)
 
-        numbers = self._numbers
-        candidates = [n for n in numbers if acts_with(n[1], others=defaults, those=values)]
+        every = self._places
+        chosen = [n for n in every if acts_with(every[n], others=defaults, those=values)]
         # No parameter alone decides: those without which it does not act.
-        candidates = candidates or [
-            n for n in numbers if not acts_with(n[1], others=values, those=defaults)
+        chosen = chosen or [
+            n for n in every if not acts_with(every[n], others=values, those=defaults)
         ]
-        largest = [
-            (name, places[int(np.argmax(np.abs(values[places] - defaults[places])))])
-            for name, places in candidates or numbers
-        ]
-        return Deciding(
-            tuple(name for name, _ in largest),
-            tuple(float(values[place]) for _, place in largest),
-            tuple(float(defaults[place]) for _, place in largest),
-        )
+        pairs = []
+        for name in chosen or every:
+            i = max(every[name], key=lambda i: abs(values[i] - defaults[i]))
+            pairs.append((name, float(values[i]), float(defaults[i])))
+        return Deciding(tuple(pairs))
 
-    def lost(self, determinant: Callable[[FloatArray, FloatArray], float]) -> Deciding | None:
-        """Returns a parameter for which a determinant vanishes within the bounds, or None."""
-        system, state = self._system, self._states[0]
-        defaults = system.parameter_values
-        here = determinant(state, defaults)
+    def lost(
+        self, margin: Callable[[FloatArray, FloatArray], float], least: float
+    ) -> Deciding | None:
+        """Returns parameters within their bounds where a margin is not above the least, or None.
+
+        The margin is tried at corners and random places of the box of bounds, and then minimized
+        from the lowest, as far as its gradient leads.
+        """
+        system, defaults = self._system, self._system.parameter_values
+        names, places = [], list[int]()
         for p in system.parameters:
-            if p.bounds is None:
-                continue
-            places = system.parameter_slice(p.name)
-            for i in range(p.value.size):
-                for bound in (p.low[i], p.high[i]):
-                    values = defaults.copy()
-                    values[places.start + i] = bound
-                    member = self._consistent(state, values)
-                    if member is None or determinant(*member) == here:
-                        continue
-                    name = p.signals[i].name
-                    return Deciding((name,), (float(bound),), (float(p.value[i]),))
+            if p.bounds is not None:
+                first = system.parameter_slice(p.name).start
+                names += [signal.name for signal in p.signals]
+                places += range(first, first + p.value.size)
+        low, high = (bound[places] for bound in system.parameter_box)
+        width = high - low
+
+        def at(box: FloatArray) -> float:
+            values = defaults.copy()
+            values[places] = low + width * box
+            member = self._consistent(self._states[0], values)
+            return np.inf if member is None else margin(*member)
+
+        count, random = len(places), np.random.default_rng(0)
+        default = (defaults[places] - low) / np.where(width > 0.0, width, 1.0)
+        alone = [
+            np.where(np.eye(count)[i] > 0, end, default) for i in range(count) for end in (0, 1)
+        ]
+        corners = random.integers(0, 2, (CORNERS, count))
+        tried = [*alone, *np.unique(corners, axis=0), *random.uniform(size=(CORNERS, count))]
+        lowest = sorted(((at(box), k) for k, box in enumerate(tried)))
+        for value, k in lowest[:STARTS]:
+            box = np.array(tried[k], dtype=float)
+            for _ in range(DESCENTS):
+                if not value > least:
+                    there = low + width * box
+                    moved = np.abs(box - default) > SAME * np.max(np.abs(box - default))
+                    rows = zip(names, there, defaults[places], moved, strict=True)
+                    return Deciding(tuple((n, float(v), float(d)) for n, v, d, m in rows if m))
+                slope = self._slope(at, box, value) * (width > 0.0)
+                square = float(slope @ slope)
+                if not 0.0 < square < np.inf:
+                    break
+                # To the zero of the linearized margin, or as far as the margin falls.
+                for part in (1.0, 0.25, 0.06):
+                    trial = np.clip(box - part * value / square * slope, 0.0, 1.0)
+                    if (following := at(trial)) < value:
+                        break
+                else:
+                    break
+                box, value = trial, following
         return None
 
+    @staticmethod
+    def _slope(at: Callable[[FloatArray], float], box: FloatArray, value: float) -> FloatArray:
+        """The derivatives of a margin by differences that stay in the box."""
+        slope = np.zeros(box.size)
+        for i in range(box.size):
+            other = box.copy()
+            other[i] += STEP if box[i] < 0.5 else -STEP
+            slope[i] = (at(other) - value) / (other[i] - box[i])
+        return slope
+
     @cached_property
-    def _numbers(self) -> list[tuple[str, list[int]]]:
+    def _places(self) -> dict[str, list[int]]:
         """The parameters and derivatives of signals to draw, with their indices."""
-        system = self._system
-        entries, start, following = [], 0, sum(p.value.size for p in system.parameters)
-        rates = []
-        for p in system.parameters:
-            size = p.value.size
-            free = [start + i for i in range(size) if p.low[i] < p.high[i]]
-            if free:
-                entries.append((p.name, free))
+        parameters, first = self._system.parameters, 0
+        following = sum(p.value.size for p in parameters)
+        places, rates = dict[str, list[int]](), dict[str, list[int]]()
+        for p in parameters:
+            free = np.flatnonzero(p.low < p.high)
+            places[p.name] = (first + free).tolist()
             for order in range(1, len(p.derivatives) + 1):
-                if free:
-                    rates.append((p.name + "'" * order, [following + i - start for i in free]))
-                following += size
-            start += size
-        return entries + rates
+                rates[p.name + "'" * order] = (following + free).tolist()
+                following += p.value.size
+            first += p.value.size
+        return {name: drawn for name, drawn in (places | rates).items() if drawn}
 
     @cached_property
     def _members(self) -> list[tuple[FloatArray, FloatArray]]:
-        if not self._numbers:
+        if not self._places:
             return []
         system, random = self._system, np.random.default_rng(0)
         low, high = system.parameter_box

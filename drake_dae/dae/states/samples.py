@@ -1,7 +1,5 @@
 """Consistent states, and the numbers of expressions at them."""
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +9,7 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.round_off import Sized, are_dependent, multiply, significant
+from drake_dae.trace.round_off import are_dependent, significant
 
 
 class Samples:
@@ -65,22 +63,6 @@ class Samples:
                 )
             result.append(tuple(as_matrix(value) for value in values))
         return result
-
-    def field(self, key: str) -> list[Sized]:
-        """Returns the field g or h at each state, with the sizes of its entries."""
-        return [(values[key], np.abs(values[key])) for values in self.fields]
-
-    def derivatives(self, rows: ca.SX, functions: ca.SX, field: Sequence[Sized]) -> FloatArray:
-        """Returns the derivatives of functions along fields; round-off is set to zero."""
-        if not rows.nnz():
-            return np.zeros((len(self.states), *rows.shape))
-        gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
-        return np.array(
-            [
-                multiply(gradient, value, self.scale, self.system.negligible)[0]
-                for (gradient,), value in zip(gradients, field, strict=True)
-            ]
-        )
 
     def dependent(self, functions: ca.SX) -> bool:
         """Returns whether the differentials of functions are linearly dependent at every state."""

@@ -20,10 +20,7 @@ class ViolationKind(Enum):
         "Keep away from this state, or write the constraint so that its gradient does not vanish"
     )
     OUTPUT_DEGREE = "Choose another output, or keep away from this state"
-    EARLY_CONTROL = (
-        "The constraint then binds the control instead of the state. Take that control out, or add "
-        "an actuator state in front of it"
-    )
+    EARLY_CONTROL = "Take that control out, or add an actuator state in front of it"
     NO_FORCE = "It is redundant, or no constraint input enforces it"
     NO_CONTROL = "Choose another output"
     CONSTRAINT_RANK = (
@@ -31,23 +28,19 @@ class ViolationKind(Enum):
         "independently. Keep away from this state, or change how the constraint inputs enter"
     )
     REDUNDANT = (
-        "The constraints are redundant at every state: the distribution of the forces among them "
-        "is not determined. Remove a redundant constraint with its constraint input, as "
-        "drop_constraints does, or have the forces shared by least squares: share_forces, or "
-        "`compliances` of a robot or a scenario"
+        "The constraints are redundant at every state, so that the forces are not determined. "
+        "Remove one with its constraint input, as drop_constraints does, or have the forces shared "
+        "by least squares: share_forces, or `compliances` of a robot or a scenario"
     )
     SINGULAR_CONFIGURATION = (
-        "This is a singular configuration: the constraints are redundant there, and not around "
-        "it, so that forces are not determined, and motions on N* may branch. A plant that "
-        "starts elsewhere passes through it if its velocity leads across; a law cannot, and "
-        "smaller steps do not help. Choose a nominal state away from it, and for a law motions "
-        "that keep away; or write other constraints that stay independent there; a spring or a "
-        "clearance in one of them makes the forces determined"
+        "This is a singular configuration: forces are not determined there, and motions on N* may "
+        "branch. A plant that starts elsewhere passes through it if its velocity leads across; a "
+        "law cannot. Choose a nominal state and motions that keep away, or give one of the "
+        "constraints a spring or a clearance"
     )
     HIDDEN_DEGREE = (
-        "No constraint is redundant, but the system is not in the class as it is written: such a "
-        "constraint, less the combination of others that its row follows from, has a higher "
-        "relative degree. Write this difference in place of the constraint: N* stays the same"
+        "No constraint is redundant, but one less the combination of others that its row follows "
+        "from has a higher relative degree. Write this difference in its place: N* stays the same"
     )
     NUMBERS = (
         "The structure must be the same for all values of parameters and signals. Give such a "
@@ -56,8 +49,8 @@ class ViolationKind(Enum):
     )
     BOUNDS = "Give narrower bounds, which exclude this value"
     CONTROL_RANK = (
-        "An output may repeat a constraint or another output; choose other outputs, keep away from "
-        "this state, or see whether `dynamic_extension` finds integrators that help"
+        "Choose other outputs, keep away from this state, or see whether `dynamic_extension` finds "
+        "integrators that help"
     )
 
 
@@ -97,84 +90,66 @@ class Violation:
         names = ", ".join(f"'{name}'" for name in self.names)
         where = "" if self.state is None else f" at x = {show(self.state)}"
         value = "" if self.singular_value is None else f"{self.singular_value:.1e}"
-        scaled = "rows and columns scaled"
-        if self.least is not None:
-            scaled += f"; below the system's least_margin of {self.least:.0e} it is lost"
+        if value:
+            value = f"smallest singular value {value}, rows and columns scaled"
+            value += "" if self.least is None else f", below the least_margin of {self.least:.0e}"
         rows = "; ".join(map(str, self.combinations))
+        kind = ViolationKind
         match self.cause:
-            case ViolationKind.COUNT:
+            case kind.COUNT:
+                return f"the m = {len(self.names)} constraints are more than the states"
+            case kind.CONSTRAINT_DEGREE | kind.OUTPUT_DEGREE:
+                what, inputs = "constraint", "constraint inputs act"
+                if self.cause is kind.OUTPUT_DEGREE:
+                    what, inputs = "output", "control acts"
                 return (
-                    f"the m = {len(self.names)} constraints are more than the states, so they "
-                    "depend on each other"
+                    f"the relative degree of {what} {names} is not defined{where}: the {inputs} "
+                    f"on its derivative {self.order} around this state, but not there"
                 )
-            case ViolationKind.CONSTRAINT_DEGREE:
-                return (
-                    f"the relative degree of constraint {names} is not defined{where}: the "
-                    f"constraint inputs act on its derivative {self.order} around this state, but "
-                    "not there"
-                )
-            case ViolationKind.OUTPUT_DEGREE:
-                return (
-                    f"the relative degree of output {names} is not defined{where}: the control "
-                    f"acts on its derivative {self.order} around this state, but not there"
-                )
-            case ViolationKind.EARLY_CONTROL:
+            case kind.EARLY_CONTROL:
                 return (
                     f"the control acts on derivative {self.order} of constraint {names}, before "
-                    f"any constraint input does{where}"
+                    f"any constraint input does{where}, and so binds the control, not the state"
                 )
-            case ViolationKind.NO_FORCE:
+            case kind.NO_FORCE:
                 return (
                     f"no constraint input ever acts on constraint {names}: none reaches it, or its "
                     "derivatives repeat each other or fill the state"
                     f"{f'; gradients of constraints: {rows}' if rows else ''}"
                 )
-            case ViolationKind.NO_CONTROL:
-                why = (
-                    f"it follows from the constraints, {rows}"
-                    if rows
-                    else (
-                        "its derivatives repeat those of the constraints, or no control reaches it"
-                    )
-                )
+            case kind.NO_CONTROL:
+                why = f"it follows from the constraints, {rows}"
+                if not rows:
+                    why = "its derivatives repeat those of the constraints, or none reaches it"
                 return (
                     f"the control never acts on output {names}: {why}, so it has no relative "
                     "degree and B(x) no row for it"
                 )
-            case (
-                ViolationKind.CONSTRAINT_RANK
-                | ViolationKind.REDUNDANT
-                | ViolationKind.SINGULAR_CONFIGURATION
-                | ViolationKind.HIDDEN_DEGREE
-            ):
-                what = "gradients of constraints"
-                if self.cause in (ViolationKind.CONSTRAINT_RANK, ViolationKind.HIDDEN_DEGREE):
-                    what = "rows of A(x)"
-                statements = [f"{what}: {rows}"] if rows else []
-                if value:
-                    statements.insert(0, f"smallest singular value {value} ({scaled})")
-                return f"A(x) loses rank{where}: {'; '.join(statements)}"
-            case ViolationKind.NUMBERS:
-                kind = "output" if self.assumption == 4 else "constraint"
+            case kind.NUMBERS:
+                what = "output" if self.assumption == 4 else "constraint"
                 inputs = "constraint inputs act" if self.assumption == 1 else "control acts"
                 return (
-                    f"the relative degree of {kind} {names} depends on numbers: the {inputs} on "
+                    f"the relative degree of {what} {names} depends on numbers: the {inputs} on "
                     f"its derivative {self.order} {self.deciding}"
                 )
-            case ViolationKind.BOUNDS:
+            case kind.BOUNDS:
                 matrix = "A(x)" if self.assumption == 2 else "B(x) of (16)"
-                statements = [
+                places = [
                     f" of '{name}', between its default {default:.6g} and {bound:.6g}"
                     for name, bound, default in (self.deciding.pairs if self.deciding else ())
                 ]
-                return f"{matrix} loses rank within the bounds{','.join(statements)}"
-            case ViolationKind.CONTROL_RANK:
+                return f"{matrix} loses rank within the bounds{','.join(places)}"
+            case kind.CONTROL_RANK:
                 return (
                     f"B(x) of (16) is singular{where}: the controlled outputs "
-                    f"{', '.join(self.names)} cannot be steered independently; smallest singular "
-                    f"value {value} ({scaled})"
+                    f"{', '.join(self.names)} cannot be steered independently; {value}"
                     f"{f'; rows of B(x): {rows}' if rows else ''}"
                 )
+            case _:  # A(x) has lost its rank.
+                in_rows = self.cause in (kind.CONSTRAINT_RANK, kind.HIDDEN_DEGREE)
+                what = "rows of A(x)" if in_rows else "gradients of constraints"
+                parts = [part for part in (value, rows and f"{what}: {rows}") if part]
+                return f"A(x) loses rank{where}: {'; '.join(parts)}"
 
 
 def rank_violation(

@@ -1,6 +1,8 @@
 """The structure of the constraints alone: Assumptions (1)-(3), N*, and (9)-(14)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import casadi as ca
@@ -19,11 +21,11 @@ from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_violation
 from drake_dae.dae.structure.dependence import find_dependence, redundant_constraints
 from drake_dae.dae.structure.redundancy import all_constraints_hold
-from drake_dae.dae.structure.relative_degrees import constraint_chains, eliminated_at
+from drake_dae.dae.structure.relative_degrees import InputActions, constraint_chains
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import equilibrated, positive, smallest_singular_value
+from drake_dae.trace.round_off import equilibrated, equilibration, positive, smallest_singular_value
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 
@@ -72,25 +74,25 @@ class ConstraintStructure:
     def constraint_matrix(
         self, state: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """Returns A(x) at a state, shape (m, m): for one frictionless contact its mobility in 1/kg.
+        """Returns A(x) at a state, shape (m, m): for one contact its mobility in 1/kg."""
+        return self._matrix(
+            self.system.state_vector(state), self.system.parameter_vector(parameters)
+        )
 
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-        """
+    @cached_property
+    def _matrix(self) -> Callable[[FloatArray, FloatArray], FloatArray]:
         matrix = self.elimination.constraint_matrix
         function = self.system.trace("A(x)", {"value": matrix}, often=False)
-        x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
-        return function(x, p)[0].reshape(matrix.shape)
+        return lambda x, p: function(x, p)[0].reshape(matrix.shape)
 
     def dependent_constraints(self, state: FloatArray, parameters: FloatArray) -> tuple[str, ...]:
         """Returns the names of the constraints that become dependent where A(x) is singular.
 
         They are the parts of n with n^T A(x) = 0, in units of the usual lengths of the gradients.
         """
-        usual = [np.diag(self.constraint_matrix(x, parameters)) for x in self.states]
+        usual = [np.diag(self._matrix(x, parameters)) for x in self.states]
         unit = 1.0 / np.sqrt(positive(np.median(np.abs(usual), axis=0)))
-        matrix = self.constraint_matrix(state, parameters) * unit * unit[:, None]
+        matrix = self._matrix(state, parameters) * unit * unit[:, None]
         if not np.isfinite(matrix).all():
             return ()
         part = np.abs(np.linalg.svd(matrix)[0][:, -1])
@@ -129,8 +131,8 @@ def find_constraint_structure(
     if violation:
         raise violation.error()
     # Rows of n* that are only round-off are no feedthrough.
-    _, n_star = eliminated_at(samples, structure.elimination)
-    acts = np.any([value for value, _ in n_star], axis=(0, 2))
+    actions = InputActions(samples, structure.elimination)
+    acts = actions.numbers(actions.feedthrough).any(axis=(0, 2))
     rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
     feedthrough = ca.sparsify(ca.mtimes(rows, structure.elimination.n_star))
     return replace(structure, elimination=replace(structure.elimination, n_star=feedthrough))
@@ -286,7 +288,23 @@ def with_numbers(
 
     family = Family(manifold, states)
     if violation is None:
-        lost = family.lost(determinant)
+        usual = [
+            np.abs(function(x, system.parameter_values)[0]).reshape(matrix.shape) for x in states
+        ]
+        rows, columns = equilibration(np.mean(usual, axis=0))
+        sign = determinant(states[0], system.parameter_values)
+
+        @np.errstate(all="ignore")
+        def margin(state: FloatArray, parameters: FloatArray) -> float:
+            """The smallest singular value; minus one where the determinant has another sign."""
+            value = function(state, parameters)[0].reshape(matrix.shape) / rows[:, None] / columns
+            if not np.all(np.isfinite(value)):
+                return np.inf
+            if np.linalg.slogdet(value)[0] * sign < 0.0:
+                return -1.0
+            return smallest_singular_value(value)
+
+        lost = family.lost(margin, system.least_margin)
         return Violation(assumption, ViolationKind.BOUNDS, (), deciding=lost) if lost else None
     if any(determinant(state, system.parameter_values) for state in states):
         return violation

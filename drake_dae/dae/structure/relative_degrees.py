@@ -8,13 +8,12 @@ there must be zero with all other numbers.
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.arrays import Booleans, FloatArray, show
 from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.manifold.manifold import Manifold
@@ -24,9 +23,8 @@ from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind
 from drake_dae.dae.structure.dependence import following_outputs, redundant_constraints
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import NegligibleWarning
+from drake_dae.errors import ModelError, NegligibleWarning
 from drake_dae.trace.factorization import nonzeros
-from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.round_off import Sized, multiply
 
 MANY = 10
@@ -52,10 +50,10 @@ def constraint_chains(
         by_force = lie_derivative_along(last, explicit.g, x)
         by_control = lie_derivative_along(last, explicit.h, x)
         samples = Samples(Manifold(system, chains), guesses, region)
-        force_acts = _acts(samples.derivatives(by_force, last, samples.field("g")))
-        control_acts = _acts(samples.derivatives(by_control, last, samples.field("h")))
+        actions, next_undecided, stuck = InputActions(samples), [], []
+        force_acts = actions.acts(by_force, actions.along(last, "g"))
+        control_acts = actions.acts(by_control, actions.along(last, "h"))
         reached = _reached(explicit.g, f, last, x)
-        numbers, next_undecided, stuck = _ChainRows(samples), [], []
         for row, i in enumerate(undecided):
             order = len(chains[i])
             if force_acts[row].all():
@@ -72,7 +70,7 @@ def constraint_chains(
             for key, rows, assumption in (("g", by_force, 1), ("h", by_control, 3)):
                 if rows[row, :].nnz():
                     violation = Violation(assumption, ViolationKind.NUMBERS, (names[i],), order)
-                    along = numbers.along(chains[i][-1], key)
+                    along = actions.along(chains[i][-1], key)
                     by_numbers.examine(i, violation, samples, along)
             next_undecided.append(i)
             if not reached[row] or (
@@ -118,17 +116,16 @@ def output_chains(
     names, count = [s.name for s in system.output_signals], system.num_outputs
     controls = system.num_controls
     moving = system.outputs(derivatives.constraint_input)
-    h_star_values, n_star_values = eliminated_at(samples, elimination)
     drift, control_matrix = ca.SX(count, 1), ca.SX(count, controls)
     highest_derivatives = ca.SX(count, 1)
     round_off, need_force = np.zeros((count, controls), dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
-    slopes = np.array([value for value, _ in n_star_values])
-    by_numbers, numbers = ByNumbers(), _ChainRows(samples, elimination)
+    by_numbers, actions = ByNumbers(), InputActions(samples, elimination)
+    slopes = actions.numbers(actions.feedthrough)
     following, rows = elimination.l_star, elimination.n_star
     undecided = list(range(count))
     while True:
-        acts, still = _acts(slopes), []
+        acts, still = np.asarray(slopes.any(axis=2)).T, []
         for row, i in enumerate(undecided):
             if acts[row].all():
                 by_numbers.refuse(i)
@@ -143,7 +140,7 @@ def output_chains(
             else:
                 if not chains[i] and rows[row, :].nnz():
                     violation = Violation(4, ViolationKind.NUMBERS, (names[i],), 0)
-                    by_numbers.examine(i, violation, samples, numbers.feedthrough(i))
+                    by_numbers.examine(i, violation, samples, actions.feedthrough, i)
                 still.append(i)
                 chains[i].append(following[row])
                 need_force = need_force or derivatives.has_unknowns(moving[row])
@@ -153,15 +150,15 @@ def output_chains(
         # Along x' = f* + h* u: the derivative is L_f* + L_h* u of the last one.
         moving = derivatives.derivative(moving[[undecided.index(i) for i in still]])
         following, rows = derivatives.by_control(moving)
-        slopes = samples.derivatives(rows, last, h_star_values)
-        acts, stuck = _acts(slopes), []
+        slopes = actions.numbers(actions.along(last, "h*"), rows)
+        acts, stuck = np.asarray(slopes.any(axis=2)).T, []
         reached = _reached(h_star, f_star, last, x)
         for row, i in enumerate(still):
             if acts[row].any():
                 continue
             if rows[row, :].nnz():
                 violation = Violation(4, ViolationKind.NUMBERS, (names[i],), len(chains[i]))
-                by_numbers.examine(i, violation, samples, numbers.along(chains[i][-1], "h*"))
+                by_numbers.examine(i, violation, samples, actions.along(chains[i][-1], "h*"))
             # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
             # where nothing acts although the structure allows it.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
@@ -183,16 +180,74 @@ def output_chains(
     return OutputChains(every, drift, control_matrix, highest_derivatives, need_force, round_off)
 
 
-def eliminated_at(samples: Samples, elimination: Elimination) -> tuple[list[Sized], list[Sized]]:
-    """h* (10) and n* (12) at each state, without their round-off."""
-    factors = samples.values(
-        gradient=elimination.constraint_gradient, matrix=elimination.constraint_matrix
-    )
-    pairs = [
-        eliminate_numbers(fields, gradient, matrix, samples.scale, samples.system.negligible)
-        for fields, (gradient, matrix) in zip(samples.fields, factors, strict=True)
-    ]
-    return [h_star for h_star, _ in pairs], [n_star for _, n_star in pairs]
+class InputActions:
+    """The numbers by which inputs act on functions, at states and for values of all parameters.
+
+    A `Row` is a function of state, parameters and the threshold for zero. It returns numbers in
+    which round-off is zero, with their sizes before cancellation.
+    """
+
+    def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
+        self._samples, self._system, self._scale = samples, samples.system, samples.scale
+        if elimination is not None:
+            gradient, matrix = elimination.constraint_gradient, elimination.constraint_matrix
+            factors = {"gradient": gradient, "matrix": matrix}
+            self._factors = self._system.trace("sample", factors, often=False)
+
+    def along(self, functions: ca.SX, key: str) -> Row:
+        """Returns the derivatives of functions along the columns of g, h or h* (10)."""
+        system = self._system
+        gradient = ca.jacobian(functions, system.state)
+        trace = system.trace("sample", {"gradient": gradient}, often=False)
+
+        def row(state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
+            if key == "h*":
+                field, _ = self._eliminated(state, parameters, negligible)
+            else:
+                value = fields_at(system, state, parameters)[key]
+                field = value, np.abs(value)
+            gradients = trace(state, parameters)[0].reshape(gradient.shape)
+            if not np.all(np.isfinite(gradients)):
+                nowhere = np.full((len(gradients), field[0].shape[1]), np.nan)
+                return nowhere, nowhere
+            return multiply(gradients, field, self._scale, negligible)
+
+        return row
+
+    def feedthrough(self, state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
+        """Returns n* (12)."""
+        return self._eliminated(state, parameters, negligible)[1]
+
+    def numbers(self, row: Row, pattern: ca.SX | None = None) -> FloatArray:
+        """Returns a row at the samples; zeros if an expression of it, if given, is zero."""
+        samples, system = self._samples, self._system
+        if pattern is not None and not pattern.nnz():
+            return np.zeros((len(samples.states), *pattern.shape))
+        values = [row(x, system.parameter_values, system.negligible)[0] for x in samples.states]
+        for state, value in zip(samples.states, values, strict=True):
+            if not np.all(np.isfinite(value)):
+                raise ModelError(
+                    f"{system.name}: a derivative is not finite at the consistent state x = "
+                    f"{show(state)}; give a nominal_state inside the domain of the functions and "
+                    "of their derivatives"
+                )
+        return np.array(values)
+
+    def acts(self, pattern: ca.SX, row: Row) -> Booleans:
+        """Returns where a row is not zero, shape (functions, samples)."""
+        return np.asarray(self.numbers(row, pattern).any(axis=2)).T
+
+    def _eliminated(
+        self, state: FloatArray, parameters: FloatArray, negligible: float
+    ) -> tuple[Sized, Sized]:
+        """h* and n*."""
+        fields = fields_at(self._system, state, parameters)
+        gradient, matrix = map(as_matrix, self._factors(state, parameters))
+        try:
+            return eliminate_numbers(fields, gradient, matrix, self._scale, negligible)
+        except np.linalg.LinAlgError:
+            h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
+            return (h_star, h_star), (n_star * np.nan, n_star)
 
 
 class ByNumbers:
@@ -201,15 +256,17 @@ class ByNumbers:
     def __init__(self) -> None:
         self._violations: dict[int, Violation] = {}
 
-    def examine(self, index: int, violation: Violation, samples: Samples, row: Row) -> None:
-        """Evaluates a row that is zero at the default parameters at others."""
+    def examine(
+        self, index: int, violation: Violation, samples: Samples, row: Row, of: int = 0
+    ) -> None:
+        """Evaluates a row, or one of several, that is zero at the default parameters at others."""
         if index in self._violations:
             return
         system = samples.system
 
         @np.errstate(all="ignore")  # Values that are not finite decide nothing.
         def acts(state: FloatArray, parameters: FloatArray, negligible: float) -> bool:
-            value, size = row(state, parameters, negligible)
+            value, size = (each[of] for each in row(state, parameters, negligible))
             return bool(np.any(np.abs(value) > VISIBLE * size))
 
         family = Family(samples.manifold, samples.states)
@@ -238,66 +295,6 @@ class ByNumbers:
         """Returns the parameters for which an input acts on one of some constraints or outputs."""
         violations = (self._violations[i] for i in indices if i in self._violations)
         return next((violation.deciding for violation in violations), None)
-
-
-class _ChainRows:
-    """The action of inputs at a state, for values of all parameters."""
-
-    def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
-        self._system, self._scale = samples.system, samples.scale
-        self._elimination = elimination
-
-    def along(self, function: ca.SX, key: str) -> Row:
-        """The derivative of a function along g, h or h*."""
-        system = self._system
-        gradient = ca.jacobian(function, system.state)
-        trace = system.trace("sample", {"gradient": gradient}, often=False)
-
-        def row(state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
-            if key == "h*":
-                field, _ = self._eliminated(state, parameters, negligible)
-            else:
-                value = fields_at(system, state, parameters)[key]
-                field = value, np.abs(value)
-            gradients = trace(state, parameters)[0].reshape(1, -1)
-            return multiply(gradients, field, self._scale, negligible)
-
-        return row
-
-    def feedthrough(self, index: int) -> Row:
-        """A row of n*."""
-
-        def row(state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
-            value, size = self._eliminated(state, parameters, negligible)[1]
-            return value[index], size[index]
-
-        return row
-
-    def _eliminated(
-        self, state: FloatArray, parameters: FloatArray, negligible: float
-    ) -> tuple[Sized, Sized]:
-        """h* and n*."""
-        fields = fields_at(self._system, state, parameters)
-        gradient, matrix = map(as_matrix, self._factors(state, parameters))
-        try:
-            return eliminate_numbers(fields, gradient, matrix, self._scale, negligible)
-        except np.linalg.LinAlgError:
-            h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
-            return (h_star, h_star), (n_star * np.nan, n_star)
-
-    @cached_property
-    def _factors(self) -> TracedFunction:
-        assert self._elimination is not None
-        factors = {
-            "gradient": self._elimination.constraint_gradient,
-            "matrix": self._elimination.constraint_matrix,
-        }
-        return self._system.trace("sample", factors, often=False)
-
-
-def _acts(numbers: FloatArray) -> Booleans:
-    """The rows that are not zero, shape (a, samples), of numbers of shape (samples, a, k)."""
-    return np.asarray(numbers.any(axis=2)).T
 
 
 def _reached(fields: ca.SX, drift: ca.SX, expressions: ca.SX, state: ca.SX) -> Booleans:

@@ -256,11 +256,7 @@ class DaeSystem:
 
     @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
-        """Returns the same system with some parameters as exogenous signals.
-
-        Raises:
-            ModelError: No parameter has that name.
-        """
+        """Returns the same system with some parameters as exogenous signals."""
         for name in names:
             self.parameter_slice(name)
         return replace(self, parameters=moving(self.parameters, names))
@@ -276,22 +272,12 @@ class DaeSystem:
         Args:
             bounds: Name -> (low, high), each a number or one for each entry; the default lies
                 between them. Equal bounds fix the parameter; as an exogenous signal it is constant.
-
-        Raises:
-            ModelError: No parameter has that name, or bounds are not valid.
         """
         return self._with_parameters(bounded, bounds)
 
     @checked(ModelError)
     def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
-        """Returns the same system with other default values of some parameters.
-
-        Args:
-            values: Name -> its default, a number for all entries or one for each.
-
-        Raises:
-            ModelError: No parameter has that name, or a value does not fit.
-        """
+        """Returns the same system with other defaults of some parameters."""
         return self._with_parameters(valued, values)
 
     def _with_parameters(
@@ -321,10 +307,7 @@ class DaeSystem:
 
     @cached_property
     def scale(self) -> FloatArray:
-        """The typical size of each state, shape (n,): `state_scale`, or max(|nominal state|, 1).
-
-        Do not change the array.
-        """
+        """The typical size of each state: `state_scale`, or max(|nominal state|, 1)."""
         if self.state_scale is not None:
             return self.state_scale
         return np.maximum(np.abs(self.nominal_state), 1.0)
@@ -389,13 +372,7 @@ class DaeSystem:
         return finite > 0
 
     def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
-        """Checks a parameter vector, ordered as `parameter_symbol`; the default if None.
-
-        The array may be shared: do not change it.
-
-        Raises:
-            ModelError: The shape is wrong, or a number is not finite.
-        """
+        """Checks a parameter vector, the default if None; do not change the array."""
         if parameters is None:
             return self._defaults
         if (  # Called in each step of a simulation, so without a copy.
@@ -412,14 +389,7 @@ class DaeSystem:
         """Returns the parameter vector of this system with the values that another system has.
 
         Those are taken that have the same name and size in both, with their derivatives if they are
-        exogenous.
-
-        Args:
-            other: A system of the same robot, as that of a plant with a payload.
-            values: Its parameters, shape (k,) or (samples, k).
-
-        Raises:
-            ModelError: The shape is wrong.
+        exogenous. The values have shape (k,) or (samples, k).
         """
         values, size = numbers("values", values), other.parameter_symbol.numel()
         if values.ndim not in (1, 2) or values.shape[-1] != size:
@@ -443,18 +413,9 @@ class DaeSystem:
         return parameters
 
     def state_vector(self, state: ArrayLike) -> FloatArray:
-        """Checks a state and returns it as a new array of shape (n,).
-
-        Raises:
-            ModelError: The shape is wrong, or a number is not finite.
-        """
+        """Checks a state and returns it as a new array of shape (n,)."""
         return vector(f"{self.name}: a state", state, self.num_states)
 
-    @checked(ModelError)
     def parameter_slice(self, name: str) -> slice:
-        """Returns the slice of a parameter in the parameter vector.
-
-        Raises:
-            ModelError: No parameter has that name.
-        """
+        """Returns the slice of a parameter in the parameter vector."""
         return parameter_slice(self.name, self.parameters, name)

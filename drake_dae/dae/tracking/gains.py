@@ -86,17 +86,11 @@ class FeedbackGains:
 
     @checked(GainError)
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
-        """Returns the exact tracking error exp(E t) e(0) of (30), (31).
+        """Returns the exact tracking error exp(E t) e(0) of (30), (31), shape (k, p).
 
         Args:
             times: Times in s after the start, shape (k,).
             initial: Error coordinates at the start, shape (N,).
-
-        Returns:
-            The error of each output, shape (k, p).
-
-        Raises:
-            GainError: The number of error coordinates is wrong.
         """
         moments = vector("times", np.atleast_1d(times), None, GainError)
         coordinates = numbers("initial", initial, GainError)

@@ -180,11 +180,7 @@ class TrackingLaw:
         return self.layout.degrees
 
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
-        """Checks gains, or designs them, for the outputs of this law.
-
-        Raises:
-            GainError: The gains are for other outputs or degrees, or are no gains.
-        """
+        """Checks gains, or designs them, for the outputs of this law."""
         names = tuple(signal.name for signal in self.system.output_signals)
         degrees = self.integral.all_degrees
         designed = gains
@@ -204,13 +200,7 @@ class TrackingLaw:
     ) -> FloatArray:
         """Returns the parameters of `function`: those of the system, then the entries of K.
 
-        Args:
-            parameters: Values of the system's parameters; the defaults if None.
-            gains: Other gains than those of the law; its own if None. Only entries of K that are
-                nonzero in the law's own gains are used.
-
-        Raises:
-            GainError: The gains do not fit, or couple outputs that the law does not.
+        The gains are the law's own if None; others must be zero where the law's own are.
         """
         values = self.system.parameter_vector(parameters)
         if gains is not None and gains is self._last_gains[0]:  # As in most runs of a study.
@@ -258,9 +248,6 @@ class TrackingLaw:
             measured_force: v, shape (m,); exactly where the law takes it.
             integral: The integrals of the errors, shape (k,); zero if None.
             parameters: Values of all parameters; the defaults if None.
-
-        Returns:
-            u, shape (p,).
         """
         measured = [] if measured_force is None else [measured_force]
         if self.integral.outputs:
@@ -294,14 +281,9 @@ class TrackingLaw:
         parameters: ArrayLike | None = None,
         integral: ArrayLike | None = None,
     ) -> FloatArray:
-        """Returns the tracking error that the theory predicts after a start, shape (k, p).
+        """Returns the tracking error that the theory predicts at times after a start, shape (k, p).
 
-        Args:
-            times: Times in s after the start, shape (k,).
-            state: The state at the start, shape (n,).
-            reference: R at the start.
-            parameters: Values of all parameters; the defaults if None.
-            integral: The integrals of the errors at the start, shape (k,); zero if None.
+        The other arguments are those of `control` at the start; times are in s.
         """
         start = self.error_coordinates(state, reference, parameters, integral)
         errors = self.gains.error_response(times, start)

@@ -6,7 +6,8 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint
+from drake_dae.dae.manifold.manifold import coordinates
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.dae.zero_dynamics.stability import ROUNDED, balanced_matrix
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
@@ -62,63 +63,59 @@ class Equilibria:
 
         The state does not determine outputs of degree 0; they are chosen to minimize its rate.
         """
-        pinned, layout = self.pinned, self.pinned.layout
+        layout, scale = self.pinned.layout, self.pinned.system.scale
         reference = np.zeros(layout.reference_size)
-        chain = pinned.residual(state, reference, parameters)[-layout.chain_size :]
+        chain = self.pinned.at(reference, parameters).residual(state)[-layout.chain_size :]
         if layout.chain_size:
             reference[layout.lowest[layout.dynamic]] = chain[layout.heads]
-        if layout.direct.size and not self._clocks.any():
-            _, slopes = pinned.slopes(state, reference, parameters)
-            rate = pinned.rate(state, reference, parameters)
+        direct = layout.lowest[layout.direct]
+        if direct.size and not self._clocks.any():
+            pinned = self.pinned.at(reference, parameters)
+            still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
+            slopes, rate = pinned.slopes_along(state, still, by), pinned.rate(state)
             if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
-                scale = pinned.system.scale
                 nearest = -np.linalg.pinv(slopes / scale[:, None], DEPENDENT) @ (rate / scale)
-                reference[layout.lowest[layout.direct]] = nearest
+                reference[direct] = nearest
         return reference
 
-    def find(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> FloatArray:
+    def find(self, pinned: PinnedSet, guess: FloatArray) -> FloatArray:
         """Returns the equilibrium at which a search from a guess ends, shape (n,)."""
-        rest = self.search(reference, guess, parameters)
+        rest = self.search(pinned, guess)
         unrest = rest.unrest or ("the Jacobian is singular" if rest.degenerate else "")
         if unrest:
-            raise InconsistentStateError(self.none(reference, rest.state, unrest), rest.rate)
+            raise InconsistentStateError(self.none(pinned, rest.state, unrest), rest.rate)
         return rest.state
 
-    def none(self, reference: FloatArray, state: FloatArray, unrest: str) -> str:
+    def none(self, pinned: PinnedSet, state: FloatArray, unrest: str) -> str:
         """Returns in words that a search ended at a state that is no equilibrium."""
         return (
-            f"{self.pinned.system.name}: {self.pinned.describe(reference)} have no regular state "
-            f"at rest near the given one: the search ends at x = {show(state)}, where {unrest}"
+            f"{self.pinned.system.name}: {pinned.describe()} have no regular state at rest near "
+            f"the given one: the search ends at x = {show(state)}, where {unrest}"
         )
 
-    def search(self, reference: FloatArray, guess: FloatArray, parameters: FloatArray) -> Rest:
+    def search(self, pinned: PinnedSet, guess: FloatArray) -> Rest:
         """Searches by Newton's method for C(x) = 0 and T^T x' = 0.
 
         T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
         shortest step is taken.
         """
-        pinned = self.pinned
+        system, scale = self.pinned.system, self.pinned.system.scale
         if self._clocks.any():
-            signals = pinned.system.state_signals
             running = ", ".join(
-                f"{signals[i].name}' = {self._clocks[i]:g}" for i in self._clocks.nonzero()[0]
+                f"{system.state_signals[i].name}' = {self._clocks[i]:g}"
+                for i in self._clocks.nonzero()[0]
             )
             raise InconsistentStateError(
-                f"{pinned.system.name}: no state is an equilibrium, since {running} at all of "
+                f"{system.name}: no state is an equilibrium, since {running} at all of "
                 "them, as for a clock: time must not be a state. Take it out of the state, as an "
                 "exogenous signal, or judge the zero dynamics along a motion",
                 self._clocks,
             )
 
-        scale = pinned.system.scale
-
         def linearize(z: FloatArray) -> NewtonModel | None:
-            gradients = pinned.gradients(scale * z, parameters) * scale
-            onto = shortest_steps(
-                gradients, lambda z: pinned.residual(scale * z, reference, parameters)
-            )
-            slopes, _ = pinned.slopes(scale * z, reference, parameters)
-            slopes = slopes * scale / scale[:, None]
+            gradients = pinned.gradients(scale * z) * scale
+            onto = shortest_steps(gradients, lambda z: pinned.residual(scale * z))
+            slopes = pinned.slopes(scale * z) * scale / scale[:, None]
             if onto is None or not np.all(np.isfinite(slopes)):
                 return None
             tangent = scipy.linalg.null_space(gradients)
@@ -129,31 +126,26 @@ class Equilibria:
 
             def step(z: FloatArray) -> FloatArray:
                 across = onto.step(z)
-                rate = pinned.rate(scale * z, reference, parameters) / scale
-                return across - inner @ (rate + slopes @ across)
+                return across - inner @ (pinned.rate(scale * z) / scale + slopes @ across)
 
             return NewtonModel(step, onto.is_regular)
 
-        start = pinned.state(reference, guess, parameters)
-        z, converged = newton(start / scale, linearize)
-        point = pinned.point(scale * z, reference, parameters)
-        unrest = self.unrest(point, reference, parameters)
+        z, converged = newton(pinned.state(guess) / scale, linearize)
+        point = pinned.point(scale * z)
+        unrest = self.unrest(pinned, point)
         if not converged:
             unrest = unrest or "the rates are small and do not vanish"
-        if unrest:
-            return Rest(point.state, point.rate, unrest)
-        degenerate = self._degenerate(point.state, reference, parameters)
-        return Rest(point.state, point.rate, "", degenerate)
+        degenerate = 0 if unrest else self._degenerate(pinned, point.state)
+        return Rest(point.state, point.rate, unrest, degenerate)
 
-    def unrest(self, point: PinnedPoint, reference: FloatArray, parameters: FloatArray) -> str:
+    def unrest(self, pinned: PinnedSet, point: PinnedPoint) -> str:
         """Returns why a point is no regular state at rest, as text; empty if it is one.
 
         A state that a tiny change brings to rest, as in a fast system, does not count as changing.
         """
-        if flaw := self.pinned.flaw(point):
+        if flaw := pinned.flaw(point):
             return flaw
-        slopes, _ = self.pinned.slopes(point.state, reference, parameters)
-        slow = np.abs(point.rate) <= AT_REST * np.abs(slopes) @ self.sizes
+        slow = np.abs(point.rate) <= AT_REST * np.abs(pinned.slopes(point.state)) @ self.sizes
         unrest = np.where(slow, 0.0, point.unrest)
         worst = int(np.argmax(unrest))
         if unrest[worst] <= AT_REST:
@@ -161,21 +153,21 @@ class Equilibria:
         return f"{self.pinned.system.state_signals[worst].name}' = {point.rate[worst]:.3g}"
 
     @np.errstate(all="ignore")  # The domain may end near the state.
-    def _degenerate(self, state: FloatArray, reference: FloatArray, parameters: FloatArray) -> int:
+    def _degenerate(self, pinned: PinnedSet, state: FloatArray) -> int:
         """The number of directions on Z(R) in which the Jacobian isolates no equilibrium."""
-        pinned, scale = self.pinned, self.pinned.system.scale
-        free, moved = pinned.coordinates(state, parameters, scale)
+        scale = self.pinned.system.scale
+        free, moved = coordinates(pinned.gradients(state), scale)
 
         def slopes_at(x: FloatArray) -> FloatArray:
-            slopes = pinned.slopes(x, reference, parameters)[0] @ moved
+            slopes = pinned.slopes(x) @ moved
             return np.asarray(slopes[free] * scale[free] / scale[free][:, None])
 
         slopes = slopes_at(state)
-        rate = (pinned.rate(state, reference, parameters) / scale)[free]
+        rate = (pinned.rate(state) / scale)[free]
         if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate))):
             return free.size
         left, sizes, right = np.linalg.svd(slopes)
-        terms = pinned.sizes_of_slopes(state, reference, parameters) @ np.abs(state)
+        terms = pinned.sizes_of_slopes(state) @ np.abs(state)
         rates = np.abs(left.T @ rate) + ROUNDED * np.abs(left.T) @ (terms / scale)[free]
         count = 0
         for u, size, v, rest in zip(left.T, sizes, right, rates, strict=True):

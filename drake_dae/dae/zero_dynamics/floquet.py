@@ -14,8 +14,9 @@ import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, vector
+from drake_dae.dae.manifold.manifold import tangent
 from drake_dae.dae.zero_dynamics.pinned_motion import GROWN, PinnedMotion, TimeFunction
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedSet
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict, eigenvalues_of
 from drake_dae.errors import ModelError
 from drake_dae.trace.given import result_of
@@ -128,9 +129,12 @@ class PeriodicMotions:
         goal = np.ravel(result_of("reference", self._reference, time))
         return vector(f"reference({time:g})", goal, self._pinned.layout.reference_size)
 
+    def _at(self, time: float) -> PinnedSet:
+        return self._pinned.at(self._goal(time), self._parameters(time))
+
     def _onto(self, state: FloatArray, time: float) -> FloatArray:
         """Projects a state onto Z(R(t)), which must be near."""
-        projected, converged = self._pinned.project(state, self._goal(time), self._parameters(time))
+        projected, converged = self._at(time).project(state)
         is_near = np.abs(projected - state) <= 0.1 * (self._scale + np.abs(state))
         if not (converged and np.all(is_near)):
             raise _MotionLost
@@ -142,7 +146,7 @@ class PeriodicMotions:
         Newton's method for the distance from the start after a period, along the tangent space.
         """
         for _ in range(NEWTON_STEPS):
-            basis = self._pinned.tangent(state, self._parameters(begin), self._scale)
+            basis = tangent(self._at(begin).gradients(state), self._scale)
             later, columns = self._carry(state, basis, begin)
             scaled = (basis / self._scale[:, None]).T
             matrix = scaled @ (columns / self._scale[:, None])
@@ -173,7 +177,7 @@ class PeriodicMotions:
         self, state: FloatArray, columns: FloatArray, begin: float, end: float, most: int
     ) -> tuple[FloatArray, FloatArray, int]:
         """Integrates over a part of a period; also returns the number of steps."""
-        n, unit, pinned = state.size, self._scale[:, None], self._pinned
+        n, unit = state.size, self._scale[:, None]
 
         def split(both: FloatArray) -> tuple[FloatArray, FloatArray]:
             parts = both.reshape(-1, n).T * unit
@@ -183,15 +187,15 @@ class PeriodicMotions:
             return np.asarray((np.column_stack([first, rest]) / unit).T.reshape(-1))
 
         def rate(time: float, both: FloatArray) -> FloatArray:
-            (x, along), goal, p = split(both), self._goal(time), self._parameters(time)
-            moved = joined(pinned.rate(x, goal, p), pinned.slopes_along(x, goal, p, along))
+            (x, along), pinned = split(both), self._at(time)
+            moved = joined(pinned.rate(x), pinned.slopes_along(x, along))
             if not np.all(np.isfinite(moved)):
                 raise _MotionLost
             return moved
 
         def slopes(time: float, both: FloatArray) -> FloatArray:
             # Without second derivatives, for which the iteration of the integrator compensates.
-            matrix = pinned.slopes(split(both)[0], self._goal(time), self._parameters(time))[0]
+            matrix = self._at(time).slopes(split(both)[0])
             blocks = [matrix * self._scale / unit] * (1 + columns.shape[1])
             return np.asarray(scipy.linalg.block_diag(*blocks), dtype=np.float64)
 

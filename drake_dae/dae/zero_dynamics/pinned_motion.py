@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # SciPy loads its large parts when they are used.
 
 from drake_dae.arrays import FloatArray, numbers, show
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.given import result_of
 
@@ -139,13 +139,13 @@ class _Follower:
         self._times, self._time = times, times[0]
         self._remaining = MOST_STEPS + len(times)
         self._name = pinned.system.name
-        goal, when = self._goal(self._time), f"t = {self._time:.6g} s"
+        first, when = self._at(self._time), f"t = {self._time:.6g} s"
         try:
-            start = pinned.state(goal, guess, parameters(self._time))
+            start = first.state(guess)
         except InconsistentStateError as error:
             raise _Ended(EndCause.NO_START, self._time, f"{error} ({when})") from error
-        self._last = pinned.point(start, goal, parameters(self._time))
-        if pinned.flaw(self._last):
+        self._last = first.point(start)
+        if first.flaw(self._last):
             text = (
                 f"{self._name}: at the start, {when}, x = {show(start)}, A(x) or B(x) is singular, "
                 "or the domain of the system ends"
@@ -208,10 +208,10 @@ class _Follower:
         """An integrator of x' = f* + h* u from the last point."""
 
         def rate(time: float, state: FloatArray) -> FloatArray:
-            return self._pinned.rate(state, self._goal(time), self._parameters(time))
+            return self._at(time).rate(state)
 
         def slopes(time: float, state: FloatArray) -> FloatArray:
-            matrix = self._pinned.slopes(state, self._goal(time), self._parameters(time))[0]
+            matrix = self._at(time).slopes(state)
             if not np.all(np.isfinite(matrix)):
                 raise self._end(time - self._time)
             return matrix
@@ -227,8 +227,8 @@ class _Follower:
             first_step=step,
         )
 
-    def _goal(self, time: float) -> FloatArray:
-        """Returns R at a time; the motion ends where it is not finite."""
+    def _at(self, time: float) -> PinnedSet:
+        """Returns Z(R) at a time; the motion ends where R is not finite."""
         layout = self._pinned.layout
         try:
             value = result_of("reference", self._reference, time)
@@ -243,7 +243,7 @@ class _Follower:
         if not np.all(np.isfinite(goal)):
             text = f"{self._name}: the reference is not finite at t = {time:.6g} s"
             raise _Ended(EndCause.REFERENCE_NOT_FINITE, time, text)
-        return goal
+        return self._pinned.at(goal, self._parameters(time))
 
     def _reach(self, time: float, state: FloatArray) -> bool:
         """Moves to the projected state, unless it is on another branch; returns whether it did."""
@@ -252,15 +252,15 @@ class _Follower:
         if self._remaining < 0:
             text = f"after {MOST_STEPS} steps the motion is at t = {self._time:.6g} s: it is too"
             raise self._stop(EndCause.TOO_FAST, f"{text} fast to be followed")
-        goal, parameters = self._goal(time), self._parameters(time)
-        projected, converged = self._pinned.project(state, goal, parameters)
+        pinned = self._at(time)
+        projected, converged = pinned.project(state)
         near = JUMP * np.maximum(self._pinned.system.scale, np.abs(last.state)) + np.abs(
             state - last.state
         )
         if not converged or np.any(np.abs(projected - state) > near):
             return False
-        point = self._pinned.point(projected, goal, parameters)
-        if self._pinned.flaw(point) or point.signs != last.signs:
+        point = pinned.point(projected)
+        if pinned.flaw(point) or point.signs != last.signs:
             return False
         (a, b), (c, d) = self._largest, point.margins
         self._time, self._last, self._largest = time, point, (max(a, c), max(b, d))
@@ -296,11 +296,9 @@ class _Follower:
                 f"{show(last.state)}: the reference jumps, or the domain of the system ends",
             )
         ahead = min(ahead, self._times[-1] - self._time)
-        goal, parameters = self._goal(self._time + ahead), self._parameters(self._time + ahead)
-        beyond = any(
-            self._pinned.project(guess, goal, parameters)[1]
-            for guess in (last.state, last.state + ahead * last.rate)
-        )
+        pinned = self._at(self._time + ahead)
+        guesses = last.state, last.state + ahead * last.rate
+        beyond = any(pinned.project(guess)[1] for guess in guesses)
         matrix, when = "AB"[which], f"at t = {self._time:.6g} s"
         singular = (
             f"{matrix}(x) becomes singular, smallest singular value {last.margins[which]:.2g}"

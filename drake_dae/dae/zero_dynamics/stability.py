@@ -7,8 +7,9 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.manifold.manifold import coordinates
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedSet
 
 LINEARIZED = 1e-11
 """The error of a linearization, relative to the terms in each of its entries."""
@@ -45,22 +46,18 @@ class Stability:
 
 
 def linearized_eigenvalues(
-    pinned: PinnedOutputs,
-    scale: FloatArray,
-    state: FloatArray,
-    reference: FloatArray,
-    parameters: FloatArray,
+    pinned: PinnedSet, scale: FloatArray, state: FloatArray
 ) -> tuple[ComplexArray, FloatArray]:
     """Returns the eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), with errors.
 
     They come from round-off in the derivative, and from the error of the equilibrium, which is
     large if Newton's method converges slowly. Both in 1/s, largest real part first.
     """
-    slopes, _ = pinned.slopes(state, reference, parameters)
-    free, moved = pinned.coordinates(state, parameters, scale)
+    slopes = pinned.slopes(state)
+    free, moved = coordinates(pinned.gradients(state), scale)
     # The tangent directions are known to round-off, relative to the scale of the states.
     least = np.where(moved == 0.0, 0.0, ROUNDED / LINEARIZED * scale[:, None] / scale[free])
-    sizes = pinned.sizes_of_slopes(state, reference, parameters)
+    sizes = pinned.sizes_of_slopes(state)
     off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free]
     # The numbers of a model are rounded as well, such as the cosine of a right angle.
     units = scale[free][:, None] / scale[free]
@@ -70,7 +67,7 @@ def linearized_eigenvalues(
     values, errors = eigenvalues_of(matrix, off, rounded)
     along = moved @ (scale[free] * np.random.default_rng(0).standard_normal(free.size))
     along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
-    beside, _ = pinned.slopes(state + SHIFT * along, reference, parameters)
+    beside = pinned.slopes(state + SHIFT * along)
     if np.all(np.isfinite(beside)):
         shifted = (beside @ moved)[free] / units
         others, _ = eigenvalues_of(shifted, 0.0 * off)

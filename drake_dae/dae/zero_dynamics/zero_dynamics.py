@@ -19,7 +19,7 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, ISOLATED, Equilibria
 from drake_dae.dae.zero_dynamics.floquet import PeriodicMotions, StabilityAlong
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion, TimeFunction, follow
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedSet
 from drake_dae.dae.zero_dynamics.stability import (
     ComplexArray,
     Stability,
@@ -82,12 +82,10 @@ class ZeroDynamics:
 
         Raises:
             InconsistentStateError: Newton's method does not reach Z(R) from there.
-            ModelError: A shape is wrong, or a number is not finite.
         """
         goal = self._vector("reference", reference, self._pinned.layout.reference_size)
-        return self._pinned.state(
-            goal, self._guess(guess), self.system.parameter_vector(parameters)
-        )
+        pinned = self._pinned.at(goal, self.system.parameter_vector(parameters))
+        return pinned.state(self._guess(guess))
 
     @checked(ModelError)
     def motion(
@@ -136,12 +134,9 @@ class ZeroDynamics:
         Raises:
             InconsistentStateError: No state near the guess has these outputs; or there are such
                 states, but no equilibrium: `residual` is then x', shape (n,).
-            ModelError: A shape is wrong, or a number is not finite.
         """
-        goal = self._constant(outputs)
-        return self._equilibria.find(
-            goal, self._guess(guess), self.system.parameter_vector(parameters)
-        )
+        start, p = self._guess(guess), self.system.parameter_vector(parameters)
+        return self._equilibria.find(self._resting(start, outputs, p), start)
 
     @checked(ModelError)
     def eigenvalues(
@@ -150,7 +145,7 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> ComplexArray:
-        """Returns the eigenvalues of the zero dynamics, linearized at an equilibrium.
+        """Returns the eigenvalues at an equilibrium, in 1/s, largest real part first.
 
         The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; these are its
         eigenvalues there. In closed loop they stand beside the roots of (32). Those of a linear
@@ -162,16 +157,13 @@ class ZeroDynamics:
                 state does not determine, are those with the smallest x'. Give them if this
                 choice is not unique, as for a force that does not affect the motion.
 
-        Returns:
-            The eigenvalues in 1/s, largest real part first, shape (dimension,).
-
         Raises:
             ModelError: The state is not an equilibrium on N*.
         """
         x, p = self._guess(state), self.system.parameter_vector(parameters)
-        goal = self._goal(x, outputs, p)
-        onto, _ = self._pinned.project(x, goal, p)
-        unrest = self._equilibria.unrest(self._pinned.point(x, goal, p), goal, p)
+        pinned = self._resting(x, outputs, p)
+        onto, _ = pinned.project(x)
+        unrest = self._equilibria.unrest(pinned, pinned.point(x))
         off = np.any(np.abs(onto - x) > AT_REST * np.maximum(self.system.scale, np.abs(x)))
         if off or unrest:
             reason = "it is off N*, or its outputs change" if off else unrest
@@ -179,7 +171,7 @@ class ZeroDynamics:
                 f"{self.system.name}: x = {show(x)} is no regular equilibrium: {reason}. "
                 "Eigenvalues belong to an equilibrium; 'equilibrium' finds one"
             )
-        return linearized_eigenvalues(self._pinned, self._equilibria.sizes, x, goal, p)[0]
+        return linearized_eigenvalues(pinned, self._equilibria.sizes, x)[0]
 
     @checked(ModelError)
     def stability(
@@ -197,25 +189,22 @@ class ZeroDynamics:
 
         Raises:
             InconsistentStateError: The state is not near N*.
-            ModelError: A shape is wrong, or a number is not finite.
         """
         if self.dimension == 0:
             return without_dynamics(self.structure)
         p = self.system.parameter_vector(parameters)
         start = self.structure.manifold.project(self._guess(state), p)
-        goal = self._goal(start, outputs, p)
+        pinned = self._resting(start, outputs, p)
         try:
-            rest = self._equilibria.search(goal, start, p)
+            rest = self._equilibria.search(pinned, start)
         except InconsistentStateError as error:
             return Stability(Verdict.UNDECIDED, str(error))
         if rest.unrest:
-            reason = self._equilibria.none(goal, rest.state, rest.unrest)
+            reason = self._equilibria.none(pinned, rest.state, rest.unrest)
             return Stability(Verdict.UNDECIDED, reason)
-        values, errors = linearized_eigenvalues(
-            self._pinned, self._equilibria.sizes, rest.state, goal, p
-        )
+        values, errors = linearized_eigenvalues(pinned, self._equilibria.sizes, rest.state)
         where = "at rest" if rest.degenerate else "at the equilibrium"
-        place = f"{where} with {self._pinned.describe(goal)}"
+        place = f"{where} with {pinned.describe()}"
         return judge(values, errors, rest.state, place, rest.degenerate)
 
     @checked(ModelError)
@@ -225,18 +214,14 @@ class ZeroDynamics:
         parameters: ArrayLike | None = None,
         outputs: ArrayLike | None = None,
     ) -> FloatArray:
-        """Returns the equilibria with the same outputs that a search from several guesses finds.
+        """Returns the equilibria with the same outputs, found from guesses, shape (l, n).
 
         Args:
             guesses: States from which the search starts, shape (k, n); `structure.states` if None.
             outputs: z, shape (p,). If None those of the first guess, as in `stability`.
 
-        Returns:
-            The distinct states, in the order in which they are found, shape (l, n).
-
         Raises:
             InconsistentStateError: The first guess is not near N*.
-            ModelError: A shape is wrong, or a number is not finite.
         """
         name = self.system.name
         rows = numbers(f"{name}: guesses", self.structure.states if guesses is None else guesses)
@@ -245,11 +230,11 @@ class ZeroDynamics:
                 f"{name}: guesses must have shape (k, {self.system.num_states}), got {rows.shape}"
             )
         starts, p = [self._guess(row) for row in rows], self.system.parameter_vector(parameters)
-        goal = self._goal(self.structure.manifold.project(starts[0], p), outputs, p)
+        pinned = self._resting(self.structure.manifold.project(starts[0], p), outputs, p)
         distinct = np.zeros((0, self.system.num_states))
         for start in starts:
             try:
-                rest = self._equilibria.find(goal, start, p)
+                rest = self._equilibria.find(pinned, start)
             except InconsistentStateError:
                 continue
             sizes = np.maximum(self._equilibria.sizes, np.abs(rest))
@@ -273,10 +258,9 @@ class ZeroDynamics:
         disturbances of it, delta' = (dx'/dx) delta on Z(R(t)), through one period.
 
         Args:
-            reference: The function t -> R(t).
+            reference, exogenous: As for `motion`.
             motion: The result of `motion` for this reference.
             period: The period of R(t) and of the exogenous signals, in s.
-            exogenous: The references of the exogenous signals, as for `motion`.
 
         Raises:
             ModelError: A shape is wrong, a number is not finite, or the period is not one.
@@ -335,15 +319,13 @@ class ZeroDynamics:
         state = self.system.nominal_state if guess is None else guess
         return self._vector("state", state, self.system.num_states)
 
-    def _goal(
+    def _resting(
         self, state: FloatArray, outputs: ArrayLike | None, parameters: FloatArray
-    ) -> FloatArray:
-        """Returns R with constant outputs; with those of the state if None."""
+    ) -> PinnedSet:
+        """Returns Z(R) with constant outputs; with those of the state if None."""
         if outputs is None:
-            return self._equilibria.constant_outputs(state, parameters)
-        return self._constant(outputs)
-
-    def _constant(self, outputs: ArrayLike) -> FloatArray:
-        """Returns R with constant outputs."""
-        values = self._vector("outputs", outputs, self.system.num_outputs)
-        return self._pinned.layout.constant(values)
+            goal = self._equilibria.constant_outputs(state, parameters)
+        else:
+            values = self._vector("outputs", outputs, self.system.num_outputs)
+            goal = self._pinned.layout.constant(values)
+        return self._pinned.at(goal, parameters)

@@ -22,6 +22,7 @@ from drake_dae.errors import ModelError
 from drake_dae.pictures.scene.arrows import ConstraintForceVisualizer, ForceArrows, path_of
 from drake_dae.pictures.scene.floor import Floor, floor_below
 from drake_dae.pictures.scene.framing import ViewAngles, direction_of, framed
+from drake_dae.pictures.scene.small_meshes import shrink_meshes
 from drake_dae.pictures.scene.surroundings import (
     DrawnSurface,
     scene_extent,
@@ -174,7 +175,8 @@ def view_of_links(
 ) -> Diagram | None:
     """Returns a diagram that draws a robot's links in Meshcat for its input, the link state (q, v).
 
-    The links' MultibodyPlant computes the poses of the links, and is not simulated.
+    The links' MultibodyPlant computes the poses of the links, and is not simulated. What is drawn
+    on request goes into a page, with coarser meshes if these are large.
 
     Args:
         plant: The robot.
@@ -190,6 +192,8 @@ def view_of_links(
         return None
     builder = DiagramBuilder()
     scene = builder.AddSystem(scene_graph.Clone())
+    if period == _ON_REQUEST:
+        shrink_meshes(scene, links.get_source_id())
     pose = builder.AddSystem(MultibodyPositionToGeometryPose(links, input_multibody_state=True))
     builder.ExportInput(pose.get_input_port(), "link_state")
     builder.Connect(pose.get_output_port(), scene.get_source_pose_port(links.get_source_id()))

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from drake_dae.arguments import checked
 from drake_dae.arrays import positive
 from drake_dae.dae.system.signals import Parameter
 from drake_dae.errors import ModelError
@@ -73,7 +72,6 @@ def friction_parameters(
     return parameters
 
 
-@checked(ModelError)
 @dataclass(frozen=True)
 class FrictionCone:
     """The bound |tangential force| <= limit * normal force of a contact that must not slide.

@@ -9,19 +9,16 @@ from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, positive, show, vector
 from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import ModelError
-from drake_dae.files import check_file
+from drake_dae.files import MESHES, check_file, read_mesh
 from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.robots.surfaces.surface import Pair, Surface, Vector, tangents, triple, unit_vector
-
-MESHES = (".obj", ".stl", ".ply", ".off", ".dae", ".gltf", ".glb")
-"""Kinds of meshes that are read: none of them is packed."""
 
 CELLS, BEYOND = 16, 3
 """The default number of bells along the longer side; bells beyond each edge, for a fit there."""
@@ -75,12 +72,10 @@ class MeasuredSurface(Surface):
         object.__setattr__(self, "point", triple("point", self.point))
         object.__setattr__(self, "normal", unit_vector("normal", self.normal))
         if self.size is not None:
-            size = vector("size", self.size, 2)
-            object.__setattr__(self, "size", (float(size[0]), float(size[1])))
-        for name, number in (("scale", self.scale), ("resolution", self.resolution)):
-            positive(name, 1.0 if number is None else number)
-        for length in self.size or ():
-            positive("size", length)
+            object.__setattr__(self, "size", tuple(vector("size", self.size, 2).tolist()))
+        for name in ("size", "scale", "resolution"):
+            for length in np.ravel(1.0 if (value := getattr(self, name)) is None else value):
+                positive(name, length)
         if (self.heights is None) == (self.file is None):
             raise ModelError("give either heights, row by row, or a file with them")
         if self.heights is not None:
@@ -129,10 +124,8 @@ class MeasuredSurface(Surface):
     def _piece(
         self, center: FloatArray, size: float, places: tuple[FloatArray, FloatArray]
     ) -> FloatArray:
-        x, y = (
-            side.mean() + np.ptp(side) * part
-            for side, part in zip(self.extent.T, places, strict=True)
-        )
+        sides = zip(self.extent.T, places, strict=True)
+        x, y = (side.mean() + np.ptp(side) * part for side, part in sides)
         along, across = tangents(self.normal)
         level = x[:, None, None] * along + y[:, None] * across
         return level + self.fit.heights(x, y).T[..., None] * np.array(self.normal)
@@ -167,10 +160,8 @@ class _Fit:
 
     def heights(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """h on a grid, shape (len(y), len(x))."""
-        a, b = (
-            _bells(values, self.places[i], self.widths[i]) @ self.factors[i]
-            for i, values in enumerate((x, y))
-        )
+        bells = zip((x, y), self.places, self.widths, self.factors, strict=True)
+        a, b = (_bells(values, places, width) @ factors for values, places, width, factors in bells)
         return self.plane[0] + self.plane[1] * x + self.plane[2] * y[:, None] + b @ a.T
 
 
@@ -189,10 +180,8 @@ def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
             raise ModelError("a table of heights needs its size, two lengths in m")
         rows = surface.heights if surface.file is None else _read_table(Path(surface.file))
         heights = surface.scale * np.array(rows)
-        x, y = (
-            length * np.linspace(-0.5, 0.5, count)
-            for length, count in zip(surface.size, heights.shape[::-1], strict=True)
-        )
+        counts = zip(surface.size, heights.shape[::-1], strict=True)
+        x, y = (length * np.linspace(-0.5, 0.5, count) for length, count in counts)
         distance = max(x[1] - x[0], y[1] - y[0], max(surface.size) / CELLS)
     if not (largest := float(np.max(np.abs(heights)))) <= MOST_LENGTH:
         raise ModelError(f"heights of up to {largest:.3g} m are no surface; is the scale right?")
@@ -203,15 +192,18 @@ def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
     for side in (x, y):
         length = side[-1] - side[0]
         count = max(ceil(length / (surface.resolution or distance) - 1e-9), 1)
-        width = float(length / count)
-        place = side[0] + width * np.arange(-BEYOND, count + BEYOND + 1)
+        widths.append(width := float(length / count))
+        places.append(place := side[0] + width * np.arange(-BEYOND, count + BEYOND + 1))
         around = np.linspace(place[0] - 3 * width, place[-1] + 3 * width, 3 * place.size)
-        places.append(place)
-        widths.append(width)
         at.append(_bells(side, place, width))
         beyond.append(_bells(around, place, width))
+    spectra = [np.linalg.svd(bells, full_matrices=False) for bells in at]
     for least in LEAST:
-        (basis_x, to_x), (basis_y, to_y) = (_spanned(bells, least) for bells in at)
+        # Orthonormal values at the data, and the bells' factors for them.
+        kept = [sizes > least * sizes[0] for _, sizes, _ in spectra]
+        pairs = list(zip(spectra, kept, strict=True))
+        basis_x, basis_y = (values[:, k] for (values, _, _), k in pairs)
+        to_x, to_y = (factors[k].T / sizes[k] for (_, sizes, factors), k in pairs)
         shares = basis_y.T @ rest @ basis_x
         outside = beyond[1] @ (to_y @ shares @ to_x.T) @ beyond[0].T
         if np.max(np.abs(outside)) <= CALM * np.ptp(rest):
@@ -223,19 +215,11 @@ def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
     # A few terms are often enough: a wave along one axis takes one. The others are smaller than the
     # residual of the fit, or than round-off.
     rms = float(np.sqrt(np.mean((rest - terms_b @ terms_a.T) ** 2)))
-    negligible = max(0.1 * rms, 1e-10 * float(np.ptp(rest)))
     added = np.max(np.abs(terms_a), axis=0) * np.max(np.abs(terms_b), axis=0)
-    n = int(np.sum(np.cumsum(added[::-1])[::-1] > negligible))
+    n = int(np.sum(np.cumsum(added[::-1])[::-1] > max(0.1 * rms, 1e-10 * float(np.ptp(rest)))))
     largest = float(np.max(np.abs(rest - terms_b[:, :n] @ terms_a[:, :n].T)))
     extent = np.column_stack([x[[0, -1]], y[[0, -1]]])
     return _Fit(extent, plane, places, widths, (a[:, :n], b[:, :n]), largest)
-
-
-def _spanned(bells: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
-    """The space of bells: orthonormal values at the data, and the bells' factors for them."""
-    values, sizes, factors = np.linalg.svd(bells, full_matrices=False)
-    kept = sizes > least * sizes[0]
-    return values[:, kept], factors[kept].T / sizes[kept]
 
 
 def _read_table(file: Path) -> FloatArray:
@@ -247,12 +231,10 @@ def _read_table(file: Path) -> FloatArray:
             data: Any = np.loadtxt(text.splitlines(), delimiter=mark, ndmin=2)
         else:
             with file.open("rb") as stream:  # NumPy leaves a damaged archive open.
-                if stream.peek(2)[:2] == b"PK":
-                    with np.load(stream, allow_pickle=False) as archive:
-                        (name,) = archive.files
-                        data = archive[name]
-                else:
-                    data = np.load(file, mmap_mode="r", allow_pickle=False)
+                data = np.load(stream, allow_pickle=False)
+                if not isinstance(data, np.ndarray):
+                    (name,) = data.files
+                    data = data[name]
     except Exception as error:  # NumPy, whose headers are Python, raises many kinds.
         text = f"'{file.name}' is no table of heights (.csv, .npy, .npz) and no mesh"
         raise ModelError(f"{text} ({', '.join(MESHES)}): {brief(str(error))}") from None
@@ -282,31 +264,28 @@ def _mesh_heights(
     if not np.all((lengths > 0.0) & (lengths < MOST_LENGTH)):
         raise ModelError(f"the mesh is {show(lengths)} m wide, which is no surface of a robot")
     distance = float(np.max(lengths)) / CELLS
-    counts = (2 * max(ceil(n / (surface.resolution or distance)), 4) + 1 for n in lengths)
-    x, y = (
-        middle + length * np.linspace(-0.5, 0.5, count)
-        for middle, length, count in zip((low + high) / 2, lengths, counts, strict=True)
-    )
+    counts = [2 * max(ceil(n / (surface.resolution or distance)), 4) + 1 for n in lengths]
+    sides = zip((low + high) / 2, lengths, counts, strict=True)
+    x, y = (middle + length * np.linspace(-0.5, 0.5, count) for middle, length, count in sides)
     corners, extent = vertices[triangles], float(np.max(np.ptp(vertices, axis=0)))
     edges = corners[:, 1:] - corners[:, :1]
     areas = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
     facing = areas * np.linalg.det(axes) / extent**2  # A reflection turns all triangles.
     seen = facing > 1e-12 if np.any(facing > 1e-12) else facing < -1e-12
-    least, slack = corners[..., :2].min(axis=1) - 1e-9 * extent, 2e-9 * extent
-    most = corners[..., :2].max(axis=1) + slack
-    lowest = np.full((len(y), len(x)), np.inf)
-    highest = -lowest
+    least = corners[..., :2].min(axis=1) - 1e-9 * extent
+    most = corners[..., :2].max(axis=1) + 2e-9 * extent
+    lowest, highest = (np.full((len(y), len(x)), end) for end in (np.inf, -np.inf))
     for k in np.flatnonzero(seen):
         columns = slice(*np.searchsorted(x, [least[k, 0], most[k, 0]]))
         rows = slice(*np.searchsorted(y, [least[k, 1], most[k, 1]]))
         across, up = np.meshgrid(x[columns] - corners[k, 0, 0], y[rows] - corners[k, 0, 1])
         one, other = edges[k]
-        s, t = (across * other[1] - up * other[0]), (one[0] * up - one[1] * across)
-        s, t = s / areas[k], t / areas[k]
+        s = (across * other[1] - up * other[0]) / areas[k]
+        t = (one[0] * up - one[1] * across) / areas[k]
         inside = (s > -1e-9) & (t > -1e-9) & (s + t < 1 + 1e-9)
         height = corners[k, 0, 2] + s * one[2] + t * other[2]
-        lowest[rows, columns][inside] = np.minimum(lowest[rows, columns], height)[inside]
-        highest[rows, columns][inside] = np.maximum(highest[rows, columns], height)[inside]
+        for kept, extreme in ((lowest, np.minimum), (highest, np.maximum)):
+            kept[rows, columns][inside] = extreme(kept[rows, columns], height)[inside]
     for bad, what in (
         (~np.isfinite(lowest), "has a hole; give a size that it covers"),
         (highest - lowest > 1e-6 * extent, "overlaps itself; choose another normal or size"),
@@ -315,27 +294,3 @@ def _mesh_heights(
             row, column = np.argwhere(bad)[np.count_nonzero(bad) // 2]
             raise ModelError(f"at {show([x[column], y[row]])} m across the normal the mesh {what}")
     return x, y, highest, distance
-
-
-def read_mesh(file: Path) -> tuple[FloatArray, NDArray[np.int64]]:
-    """The vertices of a mesh, shape (n, 3), in its unit, and its triangles, shape (k, 3).
-
-    Raises:
-        ModelError: It cannot be read, or the package trimesh is not installed.
-    """
-    check_file(file, ModelError)
-    if file.suffix.lower() not in MESHES:
-        raise ModelError(f"'{file.name}' is none of the meshes that are read: {', '.join(MESHES)}")
-    try:
-        import trimesh
-    except ImportError:
-        raise ModelError(f"'{file.name}': pip install 'drake_dae[meshes]' to read meshes") from None
-    try:
-        mesh: Any = trimesh.load(file, force="mesh")
-        vertices, triangles = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
-        corners = vertices[triangles]
-        if not (corners.size and corners.shape[1:] == (3, 3) and np.all(np.isfinite(corners))):
-            raise ValueError("it has no triangles, or no numbers")
-    except Exception as error:  # trimesh has no exceptions of its own.
-        raise ModelError(f"no mesh in '{file.name}': {brief(str(error))}") from None
-    return vertices, triangles

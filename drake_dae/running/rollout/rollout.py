@@ -27,6 +27,7 @@ from drake_dae.running.rollout.program import MAKING, RolloutProgram, program_of
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
+from drake_dae.simulation.diagnosis import explained
 from drake_dae.simulation.records.record import (
     Record,
     RecordAfter,
@@ -44,6 +45,10 @@ STAGES_PER_SECOND = 500
 
 FASTER = 0.05
 """The time that runs side by side save per evaluation, over that of an interpreted one."""
+
+
+DIAGNOSED = 8
+"""The most failed runs of one call whose cause is looked for, which takes up to a second each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +130,22 @@ def rollout(
     Warns:
         MachineCodeWarning: Machine code was requested, or would pay, and cannot be made.
     """
-    return run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
+    found = run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
+    if not isinstance(loop, ClosedLoop) or sum(r.failure is not None for r in found) > DIAGNOSED:
+        return found
+    return [diagnosed(loop, one) for one in found]
+
+
+def diagnosed(loop: ClosedLoop, rollout: Rollout) -> Rollout:
+    """A rollout whose failure says its cause, if that is a singular state or the reference."""
+    if rollout.failure is None or not rollout.record.time.size:
+        return rollout
+    reference = None if loop.generator is None else loop.generator.reference
+    start = float(rollout.record.time[0]), rollout.record["state"][0]
+    structure = loop.controller.law.structure
+    return replace(
+        rollout, failure=explained(rollout.failure, loop.plant, structure, reference, start)
+    )
 
 
 def run_loop(

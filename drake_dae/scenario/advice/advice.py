@@ -18,7 +18,7 @@ from drake_dae.scenario.advice.sensed import (
     sensed_contact,
 )
 from drake_dae.scenario.advice.touch import Touching, reaction_time, rounded
-from drake_dae.scenario.completion.completion import Completed
+from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts import parts as parts

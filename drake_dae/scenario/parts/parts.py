@@ -221,7 +221,8 @@ class Judgement:
     """What counts in the verdict of a run.
 
     Attributes:
-        tolerances: Output name -> the tolerated error in its unit. For others it is 1 % of the
+        tolerances: Output name -> the tolerated error in its unit; null if its error does not
+            count, as for joints that complete the outputs. For others it is 1 % of the
             range of the references in their unit.
         friction_cones: Contacts that must not slide, such as grips: `analyze` and the verdict say
             where their forces leave these cones.
@@ -229,9 +230,14 @@ class Judgement:
             with the reason.
     """
 
-    tolerances: dict[str, float] = field(default_factory=dict)
+    tolerances: dict[str, float | None] = field(default_factory=dict)
     friction_cones: list[FrictionCone] = field(default_factory=list)
     may_diverge: bool = False
+
+    @property
+    def tolerated(self) -> dict[str, float]:
+        """Output name -> the tolerated error; infinite if it does not count."""
+        return {name: np.inf if e is None else e for name, e in self.tolerances.items()}
 
 
 @dataclass(frozen=True)
@@ -245,11 +251,14 @@ class Start:
     Attributes:
         positions: Joint name -> position near which the robot starts, in rad or m; by default that
             of the robot's file.
+        velocities: Velocity name -> its value in rad/s or m/s, for a start in motion; the others
+            follow from the constraints.
         errors: Output name -> z - r at the start, in the output's unit; 0 by default. Errors of
             forces are possible only if actuators have dynamics.
     """
 
     positions: dict[str, float] = field(default_factory=dict)
+    velocities: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
 
 

@@ -74,7 +74,12 @@ class CommandedReferences(ReferenceGenerator):
                 "references with parameters cannot be commanded: write the numbers of "
                 f"{', '.join(self.reference_parameters)} into the expressions"
             )
+        self._base = base = reference_block(self.references, self.degrees, {})
         self.commands = tuple(signals)
+        if len(self.commands) != len(self.degrees):
+            raise ReferenceSignalError(
+                f"{len(self.degrees)} degrees have {len(self.commands)} signals"
+            )
         command = ca.SX.sym("c", len(self.commands))
         states, rates, rows = list[ca.SX](), list[ca.SX](), list[ca.SX]()
         for i, (degree, signal) in enumerate(zip(degrees, self.commands, strict=True)):
@@ -89,7 +94,6 @@ class CommandedReferences(ReferenceGenerator):
                 rows.append(change)
                 if order < degree:
                     change = ca.jtimes(change, y, rate)
-        self._base = base = reference_block(self.references, self.degrees, {})
         block = replace(
             base,
             outputs={"reference": base.outputs["reference"] + stacked(rows)},

@@ -81,7 +81,7 @@ class TrackingController(ParameterizedSystem, Controller):
     ) -> None:
         count = len(law.integral.outputs)
         largest = np.asarray(integral_limits, dtype=float)
-        if count and (largest.shape not in ((), (count,)) or not np.all(largest > 0.0)):
+        if largest.shape not in ((), (count,)) or not np.all(largest > 0.0):
             raise ModelError(
                 f"integral_limits must be a positive number or shape ({count},), got "
                 f"{integral_limits!r}"

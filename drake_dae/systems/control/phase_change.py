@@ -2,11 +2,7 @@
 
 from dataclasses import dataclass
 
-from drake_dae.arguments import checked
-from drake_dae.errors import ModelError
 
-
-@checked(ModelError)
 @dataclass(frozen=True)
 class PhaseChange:
     """The start of a phase of a task.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
+from drake_dae.arrays import FloatArray, all_finite, numbers, unknown_name, vector
 from drake_dae.blocks.block import TIME, Block, BlockFunction, Requirement, stacked
 from drake_dae.blocks.failures import simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
@@ -100,7 +100,6 @@ class ReferenceGenerator(TracedSystem):
     def _function(self) -> BlockFunction:
         return BlockFunction(self._base, "", {"R": self._base.outputs["reference"]})
 
-    @checked(ReferenceSignalError)
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of its references in a context.
 
@@ -118,8 +117,10 @@ class ReferenceGenerator(TracedSystem):
             raise ReferenceSignalError(error)
         size = self.reference_parameters[name].size
         given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
-        if given.shape not in ((), (size,)):
-            raise ReferenceSignalError(f"parameter '{name}' has {size} entries, got {value!r}")
+        if given.shape not in ((), (size,)) or not all_finite(given):
+            raise ReferenceSignalError(
+                f"parameter '{name}' takes {size} finite numbers, got {value!r}"
+            )
         values = context.get_numeric_parameter(0).CopyToVector()
         values[self.places(name)] = given
         context.get_mutable_numeric_parameter(0).SetFromVector(values)

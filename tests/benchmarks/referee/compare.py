@@ -138,9 +138,9 @@ def page(
     """The tables, and what each engine solves, in Markdown."""
     lines = [
         "# Constraint forces of mechanisms: correct digits\n",
-        "Made by `make referee`. Each number is -log10 of the largest error of all constraint",
-        "forces of the mechanism, in the size of the largest one, rounded down; doubles hold 15 or",
-        "16. What each engine solves, at the best settings found:\n",
+        "Made by `make table NAME=referee`. Each number is -log10 of the largest error of all",
+        "constraint forces of the mechanism, in the size of the largest one, rounded down; doubles",
+        "hold 15 or 16. What each engine solves, at the best settings found:\n",
         *(f"- **{engine.NAME}**: {engine.NOTE}." for engine in engines),
         *(f"- {sentence}" for sentence in missing),
         "\n## At the stated state\n",

@@ -114,7 +114,7 @@ def test_a_sampled_scenario_knows_the_latency_of_its_law(monkeypatch):
     assert law.damped_structure is law.structure
     _, late = off_prediction(LATE, DAMPED)
     assert late < 2.0 * undamped
-    monkeypatch.setattr("drake_dae.scenario.loop.latency_of", lambda *_: 0.0)
+    monkeypatch.setattr("drake_dae.scenario.build.latency_of", lambda *_: 0.0)
     assert off_prediction(LATE, DAMPED)[1] > 5.0 * late
 
 
@@ -146,5 +146,5 @@ def test_a_plant_that_steps_damps_by_the_speed_after_the_step(monkeypatch):
     assert latency == 0.002
     assert without_sampling < 1e-4
     assert sampled < 1e-4
-    monkeypatch.setattr("drake_dae.scenario.loop.latency_of", lambda *_: 0.0)
+    monkeypatch.setattr("drake_dae.scenario.build.latency_of", lambda *_: 0.0)
     assert off("sampling=null")[1] > 5e-4

@@ -7,7 +7,7 @@ from runs import some
 
 from drake_dae import build_scenario, complete_scenario, load_scenario
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.completion.of_task import BEFORE
+from drake_dae.scenario.completion import BEFORE
 from drake_dae.scenario.files import save_scenario
 
 TEXT = """

@@ -1,0 +1,131 @@
+"""`drake-dae new`, `analyze`: a scenario for a robot of one's own, and one that is examined."""
+
+import argparse
+import json
+import logging
+import re
+import shlex
+import sys
+import time
+import warnings
+from pathlib import Path
+
+from pydrake.systems.framework import Context
+
+from drake_dae.arrays import number_in
+from drake_dae.commands.parser import Parser, program, waiting
+from drake_dae.errors import DrakeDaeError, GeometryWarning, ScenarioError, SimulationError
+from drake_dae.files import check_unwritten
+from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.judging import find_feasibility, judge_run
+from drake_dae.scenario.new import new_scenario
+from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
+from drake_dae.scenario.start import start_scenario
+from drake_dae.simulation.simulate import simulate
+
+_LONGEST = 20.0
+"""The time in s by the clock after which a new scenario is no longer checked."""
+
+
+def _new_options(parser: Parser) -> None:
+    parser.add_argument("robot", help="a URDF, SDFormat, MJCF or model-directives file")
+    surfaces = ("plane", "cylinder", "sphere")
+    parser.add_argument(
+        "--surface", choices=surfaces, default="plane", help="the surface (default: plane)"
+    )
+    parser.add_argument(
+        "--tip",
+        default="",
+        metavar="LINK[:x,y,z]",
+        help="the link or frame in contact, and the contact point in it in m (default: the end of "
+        "the longest chain)",
+    )
+    parser.out("FILE", "the file (default: <robot>_<surface>.yaml)")
+
+
+def _new(options: argparse.Namespace) -> int:
+    """Writes a scenario for a robot of which only the file is known.
+
+    It finds base, chain and tip, locks grippers and wheels, places a surface within good reach of
+    the tip, and makes the tip circle and press there within the limits. Comments give the reasons.
+    A run checks it: the exit code is 0 if that is GOOD, and 2 otherwise.
+    """
+    out = options.out or Path(f"{Path(options.robot).name.split('.')[0]}_{options.surface}.yaml")
+    check_unwritten([out], options.force)
+    # The simulation reports what it leaves out, and Drake's parser warns of every tag.
+    logging.getLogger("drake").setLevel(logging.ERROR)
+    began = time.perf_counter()
+
+    def tell(text: str) -> None:
+        print(f"{time.perf_counter() - began:4.1f} s: {text}", file=sys.stderr, flush=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", GeometryWarning)
+        tip, point = _tip(options.tip)
+        where = options.robot, options.surface, tip, point, out.parent
+        _, text = new_scenario(*where, progress=tell)
+        out.write_text(text, encoding="utf-8")
+        print(f"written: {out}", flush=True)
+        tell("checking it by a run")
+        verdict = _check(load_scenario(out), began + _LONGEST)
+    print(f"checked: {verdict}\nnow run: {program()} simulate {shlex.quote(str(out))}")
+    return 0 if verdict.startswith("GOOD") else 2
+
+
+def _check(scenario: Scenario, end: float) -> str:
+    """The verdict of a run of a new scenario, or why there is none before an end by the clock."""
+
+    def look(context: Context) -> None:
+        if time.perf_counter() > end:
+            now = context.get_time()
+            text = f"not to its end: the run takes long, and came to {now:.3g} s without a fault"
+            raise SimulationError(text, now, [])
+
+    try:
+        completed, loop = build_completed(scenario)
+        context = start_scenario(completed.scenario, loop)
+        config = completed.scenario.integrator
+        run = simulate(loop.diagram, context, scenario.duration, config, look=look)
+        summary = judge_run(completed.scenario, loop, context, loop.record(context), run)
+    except DrakeDaeError as error:
+        return str(error)
+    return str(summary.judgement)
+
+
+def _tip(text: str) -> tuple[str, Vector]:
+    """The frame and the point in a text "LINK" or "LINK:x,y,z"."""
+    match = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
+    if match is None:
+        return text, (0.0, 0.0, 0.0)
+    numbers = [number for word in match[2].split(",") if (number := number_in(word)) is not None]
+    if len(numbers) != 3 or match[2].count(",") != 2:
+        form = "LINK or LINK:x,y,z with three numbers in m"
+        raise ScenarioError(("--tip", f"expected {form}, got '{text}'"))
+    return match[1], (numbers[0], numbers[1], numbers[2])
+
+
+def _analyze_options(parser: Parser) -> None:
+    parser.scenario(DEFAULT_SCENARIO)
+    parser.json("print the report")
+    parser.epilog = "exit code: 0, or 2 if a problem was found (the lines PROBLEM)"
+
+
+def _analyze(options: argparse.Namespace) -> int:
+    """Examines the robot of a scenario and what its reference takes.
+
+    Of the robot: relative degrees, index, Assumptions (1)-(5), zero dynamics. Of the reference: the
+    nearest singularity, control and joint forces against their limits, contact forces, joint
+    limits, and when it leaves what the robot can reach.
+    """
+    path = find_scenario(options.scenario)
+    with waiting(f"analyzing {path.stem}"):
+        report = find_feasibility(load_scenario(path, options.settings))
+    as_json = {"scenario": path.stem, **report.to_dict()}
+    print(json.dumps(as_json, indent=2) if options.json else f"{path.stem}\n\n{report}")
+    return 2 if report.problems else 0
+
+
+COMMANDS = {"new": (_new_options, _new), "analyze": (_analyze_options, _analyze)}

@@ -1,0 +1,553 @@
+"""Makes a scenario for a robot from nothing but its file."""
+
+import os
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import product
+from math import ceil, log10, pi
+from pathlib import Path
+from time import process_time
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.parsing import GetScopedFrameByName
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    JacobianWrtVariable,
+    Joint,
+    PrismaticJoint,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+    RigidBody,
+    RpyFloatingJoint,
+    WeldJoint,
+)
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.errors import DrakeDaeError, ModelError, RobotFileWarning, ScenarioError
+from drake_dae.references import CircleReference, SinusoidReference
+from drake_dae.robots.constraints import PointOnSurface
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.constraints.plant_constraints import couplings_of
+from drake_dae.robots.links.frames import joint_names, unique_names
+from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots.surfaces.surface import Surface, Vector
+from drake_dae.robots.surfaces.surfaces import Cylinder, Plane, Sphere
+from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.forms.typed_yaml import dump_yaml
+from drake_dae.scenario.model import NOTHING_FOUND, completed_model
+from drake_dae.scenario.parts.parts import Start
+from drake_dae.scenario.postures import Posture, Postures, tool_axis
+from drake_dae.scenario.robot_file.changes import finalize
+from drake_dae.scenario.robot_file.links import robot_links
+from drake_dae.scenario.robot_file.loops import actuators_of, closing_joints, joints_of
+from drake_dae.scenario.robot_file.reading import parts_to_leave_out, read_robot, unknown_packages
+from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
+from drake_dae.scenario.scenario import Scenario, scenario_data
+
+SurfaceKind = Literal["plane", "cylinder", "sphere"]
+
+_NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
+"""Names of joints of grippers and wheels: they are locked, if others are left."""
+
+# A hand may be the link that the last joint of an arm turns, a finger not.
+_FINGER = re.compile(r"finger|thumb|jaw|knuckle|inner|outer", re.IGNORECASE)
+
+_TOOLS = [
+    re.compile(word, re.IGNORECASE)
+    for word in ("tcp", "tool", "end_?effector|eef|(^|_)ee(_|$)", "flange", "tip")
+]
+"""Vendors' names of the frame at the end of an arm, the best first."""
+
+# A table, walls around, and a ceiling: axis of the normal, its sign, and the preference.
+_NORMALS = (
+    *((2, 1.0, 1.0), (0, -1.0, 0.8), (1, -1.0, 0.7)),
+    *((0, 1.0, 0.6), (1, 1.0, 0.6), (2, -1.0, 0.4)),
+)
+
+_TRIES, _PATIENCE, _SLANTED = 40, 8, 0.3
+"""The postures that are tried for each normal; after how many without a tool along it the normal is
+given up; and the weight of a posture with a tool that is not along it."""
+
+_SHARE = 0.3
+"""The share of speed limits that a path may use; half of it of effort limits by the force."""
+
+_RADIUS, _BEND, _FORCE, _SHORTEST = 0.08, 0.4, 20.0, 5.0
+"""The radii of the circle and of a curved surface, relative to the robot's size; the largest force,
+N; and the shortest period, s."""
+
+_FRACTIONS, _PLACES = (1.0, 0.5, 0.2), 4
+"""The fractions of the usual circle and force that are tried, each at so many places."""
+
+
+@checked(lambda text: ScenarioError(("", text)))
+def new_scenario(
+    file: str,
+    surface: SurfaceKind = "plane",
+    tip: str = "",
+    point: Vector = (0.0, 0.0, 0.0),
+    folder: str | Path | None = None,
+    progress: Callable[[str], object] = lambda text: None,
+    seconds: float = 15.0,
+) -> tuple[Scenario, str]:
+    """Makes a scenario in which a robot presses on a surface and moves in a circle on it.
+
+    The base is the free root body of the file. The working chain is the longest one without mimic
+    joints, grippers and wheels, or the one that ends at `tip`; all other joints are locked. If the
+    last joint does not move the tip, the far end of its link is the tip. The surface is placed
+    where the tip reaches it with its axis along the normal, and the directions of the task are most
+    independent. Circle and force keep a margin to the limits of the joints. `complete_scenario`
+    finds nothing in the way along the circle.
+
+    Args:
+        file: The robot's file, as a scenario has it.
+        surface: The surface: "plane", "cylinder" or "sphere".
+        tip: The frame in contact; found if empty.
+        point: The point in that frame, m, shape (3,).
+        folder: The folder in which the text will be saved: a robot's file below it gets a name
+            relative to it. Without one the name is absolute, and the text may be saved anywhere.
+        progress: Called with a phrase on each step.
+        seconds: After this processor time no further place is tried.
+
+    Returns:
+        The scenario, and its text with a comment on each choice; `load_scenario` reads the same
+        scenario from it.
+
+    Raises:
+        ScenarioError: The file cannot be read or has no such tip, or no place is reached; the
+            message lists the places that were tried.
+    """
+    progress("reading the robot")
+    end = process_time() + seconds
+    is_url = file.startswith("package://")
+    with at("robot.file"):
+        robot, tip, point, why = _robot(
+            file if is_url or not file else os.path.realpath(file), tip, point
+        )
+    read = robot_links(robot, SceneGraph(), drawn=False)
+    links, tried = read[0], list[str]()
+    progress("looking for a place")
+    if not any(point) and "point" in why:
+        point = _far_end(links, tip)
+    places, names = _places(links, tip, point), [s.name for s in links.position_signals]
+    for fraction, place in product(_FRACTIONS, places[:_PLACES]):
+        scenario = _scenario(robot, tip, point, place, names, surface, fraction)
+        name, center = scenario.constraints[0].name, place.center
+        if tried and process_time() > end:
+            break
+        progress(f"trying a {name} at {center} m")
+        try:
+            completed, _, _ = completed_model(scenario, None, robot=read)
+            problem = next((n for n in completed.notes if n.startswith(NOTHING_FOUND)), "")
+        except DrakeDaeError as error:
+            problem = str(error)
+        if not problem:
+            return scenario, _text(scenario, {**why, "surface": place.why}, folder)
+        tried.append(f"{name} at {center} m, {scenario.description}: {problem[:160]}")
+    text = (
+        f"no place was found where '{tip}' can move along a {surface}. Tried: "
+        + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
+        + ". Give another tip, or copy a shipped scenario"
+    )
+    raise ScenarioError(("robot", text))
+
+
+def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, dict[str, str]]:
+    """The robot with its base, locked joints and drives; the tip; and key -> why it is so."""
+    plant, robot = _read(file)
+    why = {"packages": "where package://<name>/ leads", "leave_out": "what no equation has"}
+    names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    joints, bodies = (
+        joints_of(plant),
+        [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())],
+    )
+    above = {joint.child_body().index(): joint for joint in joints}
+    body_of = dict(zip(unique_names(plant, bodies), bodies, strict=True))
+    # The base.
+    floating = QuaternionFloatingJoint | RpyFloatingJoint
+    for joint in joints:
+        if not isinstance(joint, WeldJoint | RevoluteJoint | PrismaticJoint | floating):
+            raise ModelError(
+                f"joint '{joint.name()}' ({joint.type_name()}) neither turns about one axis nor "
+                "slides along one; a new scenario can neither drive nor lock it"
+            )
+    free = {joint.child_body().index() for joint in joints if isinstance(joint, floating)}
+    roots = [name for name, body in body_of.items() if body.index() in free]
+    if len(roots) > 1:
+        raise ModelError(
+            f"{len(roots)} bodies are held by nothing ({', '.join(roots[:8])}), and a new scenario "
+            "holds one; copy a shipped scenario with several bodies, as two_arms_free_box, and "
+            "write robot.base or robot.free"
+        )
+    if roots:
+        robot, why["base"] = replace(robot, base=RobotPlacement(roots[0])), "nothing holds it"
+    # The chain: joints that can work, from the base to the tip.
+    couplings = couplings_of(plant) if plant.num_constraints() else []
+    coupled = {name for c in couplings for name in (c.follower, c.leader)}
+    works = [j for j in joints if _has_room(j) and names[j.index()] not in coupled]
+    if not works:
+        mimics = (
+            f"; joints that mimic, or are mimicked: {', '.join(sorted(coupled))}" if coupled else ""
+        )
+        raise ModelError(
+            f"no joint turns or slides for itself, so that there is nothing to drive{mimics}; "
+            "write a scenario by hand, in which robot.actuators names what is driven"
+        )
+
+    def path(body: RigidBody) -> list[Joint]:
+        found = []
+        while body.index() in above:
+            found.append(above[body.index()])
+            body = found[-1].parent_body()
+        return found[::-1]
+
+    if tip:
+        try:
+            body = GetScopedFrameByName(plant, tip).body()
+        except RuntimeError:
+            raise ModelError(unknown_name("tip", tip, body_of)) from None
+        chain = [joint for joint in path(body) if joint in works]
+        if not chain:
+            raise ModelError(f"no joint that turns or slides for itself moves the tip '{tip}'")
+    else:
+        arms = [j for j in works if not _NOT_OF_AN_ARM.search(j.name())]
+        arms = [j for j in arms if not _FINGER.search(j.child_body().name())]
+        of_arms = [[j for j in path(body) if j in arms] for body in bodies]
+        every = [[j for j in path(body) if j in works] for body in bodies]
+        chain = max(of_arms, key=len) or max(every, key=len)
+        tip = _tip(plant, chain, {name: path(body) for name, body in body_of.items()})
+    why["frame"] = f"the end of the {'' if tip else 'longest '}chain, of {len(chain)} joints"
+    # All else is locked, at zero or the nearest limit; what mimics follows.
+    skipped = {names[joint.index()] for joint in chain} | {c.follower for c in couplings}
+    locked = {}
+    for joint in joints:
+        if (
+            isinstance(joint, RevoluteJoint | PrismaticJoint)
+            and names[joint.index()] not in skipped
+        ):
+            low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+            locked[names[joint.index()]] = float(min(max(0.0, low), high))
+    why["locked"] = "m or rad; all that is not of the chain, or mimics"
+    driven = {actuator.joint().index() for actuator in actuators_of(plant)}
+    is_driven = all(joint.index() in driven for joint in chain)
+    # Motors that Drake does not read are no loss where the scenario names the driven joints.
+    is_driven &= parts_to_leave_out(replace(robot, actuators=None)) == robot.leave_out
+    actuators = None if is_driven else "all"
+    why["actuators"] = "that are not locked: the file drives not all of them"
+    directions = _directions(plant, chain, tip, point)
+    if not any(point) and directions < min(len(chain), 3):
+        why["point"] = "m, in that frame: its far end, where no frame of the file is"
+    elif directions < 2:
+        moves = "in one direction alone" if directions else "nowhere"
+        raise ModelError(
+            f"the tip '{tip}' moves {moves} by {len(chain)} joints "
+            f"({', '.join(names[joint.index()] for joint in chain)}), and a contact takes one "
+            "direction to press and another to move along; give another tip, as --tip LINK:x,y,z"
+        )
+    return replace(robot, locked=locked, actuators=actuators), tip, point, why
+
+
+def _read(file: str) -> tuple[MultibodyPlant, Robot]:
+    """The plant of a robot, with what must be left out of its file."""
+    robot = Robot(file, _folders_above(file), actuators="all")
+
+    def read() -> MultibodyPlant:
+        plant, _ = read_robot(robot)
+        if closing := closing_joints(plant):
+            raise ModelError(
+                f"joints close loops ({', '.join(joint.name() for joint in closing)}), and a new "
+                "scenario has none; write one by hand, as the shipped five_bar"
+            )
+        finalize(plant)
+        return plant
+
+    with warnings.catch_warnings():  # The scenario's own robot reports it.
+        warnings.simplefilter("ignore", RobotFileWarning)
+        robot = replace(robot, leave_out=parts_to_leave_out(robot))
+        plant = read()
+        if not any(map(_has_room, joints_of(plant))):
+            robot = replace(robot, leave_out=[*robot.leave_out, "empty_limits"])
+            plant = read()
+    return plant, robot
+
+
+def _folders_above(file: str) -> dict[str, str]:
+    """Unknown packages -> folders of that name above the file or beside it."""
+    folders: dict[str, str] = {}
+    with suppress(ModelError, ScenarioError, OSError, RuntimeError):  # The reader reports it.
+        above = [*Path(file).resolve().parents]
+        for name in unknown_packages(Robot(file)):
+            beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
+            found = [*(folder for folder in above if folder.name == name), *beside]
+            folders.update({name: str(found[0])} if found else {})
+    return folders
+
+
+def _has_room(joint: Joint) -> bool:
+    """Whether a joint turns or slides between limits."""
+    one = isinstance(joint, RevoluteJoint | PrismaticJoint)
+    return one and bool(joint.position_upper_limits()[0] > joint.position_lower_limits()[0])
+
+
+def _tip(plant: MultibodyPlant, chain: Sequence[Joint], paths: dict[str, list[Joint]]) -> str:
+    """The vendor's frame at the end of a chain, otherwise the outermost one."""
+    context = plant.CreateDefaultContext()
+    origin = chain[-1].frame_on_child().CalcPoseInWorld(context).translation()
+    distances = {}
+    for name, path in paths.items():
+        if sum(joint in chain for joint in path) == len(chain):
+            pose = GetScopedFrameByName(plant, name).CalcPoseInWorld(context)
+            distances[name] = float(np.linalg.norm(pose.translation() - origin))
+    for word in _TOOLS:
+        named = [n for n in distances if word.search(n) and not _FINGER.search(n)]
+        if named:
+            return max(named, key=lambda name: distances[name])
+    return max(distances, key=lambda name: distances[name])
+
+
+def _directions(plant: MultibodyPlant, chain: Sequence[Joint], tip: str, point: Vector) -> int:
+    """The number of directions in which a chain of joints moves a point, in most postures."""
+    context, world = plant.CreateDefaultContext(), plant.world_frame()
+    random, frame, most = np.random.default_rng(0), GetScopedFrameByName(plant, tip), 0
+    columns = [joint.velocity_start() for joint in chain]
+    for _ in range(4):
+        q = plant.GetPositions(context)
+        for joint in chain:
+            low = max(joint.position_lower_limits()[0], -1.0)
+            high = max(min(joint.position_upper_limits()[0], 1.0), low)
+            q[joint.position_start()] = random.uniform(low, high)
+        plant.SetPositions(context, q)
+        J = plant.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kV, frame, np.array(point), world, world
+        )[:, columns]
+        values = np.linalg.svd(J, compute_uv=False)
+        most = max(most, int(np.count_nonzero(values > 1e-6 * max(values[0], 0.1))))
+    return most
+
+
+def _far_end(links: MultibodyExpressions, tip: str) -> Vector:
+    """The middle of the face of the box around a link that is farthest from its joint, m.
+
+    Without geometry it is beyond the center of mass, at the end of an equivalent rod.
+    """
+    plant = links.plant
+    frame = GetScopedFrameByName(plant, tip)
+    body = frame.body()
+    joint = next(joint for joint in joints_of(plant) if joint.child_body().index() == body.index())
+    origin = joint.frame_on_child().GetFixedPoseInBodyFrame()
+    axis = origin.rotation() @ joint.revolute_axis() if isinstance(joint, RevoluteJoint) else None
+    points = [o.points for o in links.outlines if o.name == body.name() and len(o.points) > 1]
+    faces = [2.0 * body.default_com() - origin.translation()]
+    if points:
+        low, high = np.vstack(points).min(axis=0), np.vstack(points).max(axis=0)
+        sides = product(range(3), (low, high))
+        faces = [np.where(np.arange(3) == k, side, (low + high) / 2.0) for k, side in sides]
+
+    def distance(place: FloatArray) -> float:
+        lever = place - origin.translation()
+        return float(np.linalg.norm(lever if axis is None else np.cross(axis, lever)))
+
+    x, y, z = (float(value) + 0.0 for value in np.round(max(faces, key=distance), 4))
+    return (x, y, z)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A place for a surface: its center in m, and normal, for a tip in a posture q.
+
+    `ways` are the axes of the world along the surface in which the tip can move; `speed` and
+    `force` are the largest ones within the limits of joints, in m/s and N.
+    """
+
+    center: Vector
+    normal: Vector
+    ways: tuple[int, ...]
+    q: FloatArray
+    quality: float
+    directions: int
+    speed: float
+    force: float
+    size: float
+
+    @property
+    def why(self) -> str:
+        """How good it is."""
+        free = f"{self.directions} directions of motion are free of each other there"
+        return f"where {free} by {self.quality:.2g} (1 is best, 0 singular)"
+
+
+def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place]:
+    """The best place of a surface for each direction of its normal, the best place first.
+
+    Each is the best of some postures, if possible with the tool normal to the surface. A posture is
+    good if the task's directions are independent, joints are away from their limits, all bodies are
+    on the free side, the base is beside the tip, and gravity takes less than half of the torques.
+    """
+    touch = PointOnSurface(tip, Plane((0, 0, 0), (0, 0, 1)), point).touch(links)
+    column, sign_out = tool_axis(links, touch)
+    R, place = links.rotation(tip), links.position(tip, point)
+    # The tip's position, and of each axis of the world the two components across the tool.
+    across = [k for k in range(3) if k != column]
+    rows = ca.vertcat(place, *[R[k, across].T for k in range(3)])
+    postures = Postures(links, ConstraintSet(()), rows, ca.SX(0, 0), [], {})
+    bodies = ca.horzsplit(links.landmarks())
+    still = [body for body in bodies if not ca.depends_on(body, links.q)]
+    moving = [place, *(body for body in bodies if ca.depends_on(body, links.q))]
+    weight = ca.substitute(links.bias, links.v, ca.SX.zeros(links.v.numel()))
+    parameters = [p.symbol for p in links.parameters]
+    outputs = [sign_out * R[:, column], ca.horzcat(*moving), ca.horzcat(*still), weight]
+    function = ca.Function("places", [links.q, ca.vertcat(*parameters)], outputs)
+    values = np.concatenate([p.value for p in links.parameters])
+    speeds, efforts = links.velocity_limits[1], np.full(links.v.numel(), np.inf)
+    speeds = np.where(np.isfinite(speeds) & (speeds > 0.0), speeds, np.inf)
+    efforts[np.argmax(np.abs(links.actuation_matrix), axis=0)] = links.effort_limits
+    efforts = np.where(efforts > 0.0, efforts, np.inf)
+    guesses, size = postures.guesses(_TRIES), postures.size
+    slanted = [postures.at(guess) for guess in guesses]
+    seen = {id(p): [v.full() for v in function(p.q, values)] for p in slanted}
+    found = list[tuple[float, _Place]]()
+    for axis in range(3):
+        tilts, aligned = [3 + 2 * axis, 4 + 2 * axis], list[Posture]()
+        for count, guess in enumerate(guesses):
+            if count == _PATIENCE and not aligned:
+                break  # A planar robot cannot rotate its tool about some axes.
+            if (q := postures.solve(tilts, np.zeros(2), guess)) is not None:
+                aligned.append(postures.at(q))
+        seen |= {id(p): [v.full() for v in function(p.q, values)] for p in aligned}
+        ways = [k for k in range(3) if k != axis]
+        for sign, preference in ((s, p) for k, s, p in _NORMALS if k == axis):
+            best: tuple[float, list[int], Posture] | None = None
+            for posture, factor in [
+                *((p, 1.0) for p in aligned),
+                *((p, _SLANTED) for p in slanted),
+            ]:
+                outward, moved, base, gravity = seen[id(posture)]
+                at_tip, roots = posture.rows[:3], base.mean(axis=1)
+                beside = at_tip - roots
+                beside[axis] = 0.0
+                disadvantages = (
+                    np.min(sign * (moved[axis] - at_tip[axis])) < -0.02 * size,
+                    sign * outward[axis, 0] > -0.5,
+                    # A table may be as high as the base; a wall must not cut it.
+                    axis != 2 and sign * (roots[axis] - at_tip[axis]) < 0.1 * size,
+                    axis == 2 and np.linalg.norm(beside) < 0.2 * size,
+                    np.any(np.abs(gravity[:, 0]) > 0.5 * efforts),
+                )
+                factor *= postures.margin(posture.q) * 0.1 ** sum(map(bool, disadvantages))
+                if best is not None and factor * 5 <= best[0]:
+                    continue  # No independence is above 1.
+                rows_at = posture.independent([], [axis, *ways, *tilts], posture.q.size)
+                if axis in rows_at and {*rows_at} & {*ways}:
+                    score = factor * posture.independence(rows_at) * len(rows_at)
+                    if best is None or score > best[0]:
+                        best = score, rows_at, posture
+            if best is None:
+                continue
+            score, rows_at, posture = best
+            free = tuple(row for row in rows_at if row in ways)
+            inverse = np.linalg.pinv(posture.gradients[rows_at])[:, 1 : 1 + len(free)]
+            fastest = np.max(np.abs(inverse) / speeds[:, None], initial=1e-9)
+            torque = np.max(np.abs(posture.gradients[axis]) / efforts, initial=1e-9)
+            decimals = 2 if size > 0.3 else 3
+            x, y, z = (round(float(value), decimals) + 0.0 for value in posture.rows[:3])
+            i, j, k = (sign * (n == axis) + 0.0 for n in range(3))
+            place_of = _Place(
+                (x, y, z),
+                (i, j, k),
+                free,
+                posture.q,
+                score / len(rows_at),
+                len(rows_at),
+                _SHARE / fastest,
+                _SHARE / 2 / torque,
+                size,
+            )
+            found.append((score * preference, place_of))
+    return [place_of for _, place_of in sorted(found, key=lambda entry: -entry[0])]
+
+
+def _scenario(
+    robot: Robot,
+    tip: str,
+    point: Vector,
+    place: _Place,
+    names: Sequence[str],
+    kind: SurfaceKind,
+    fraction: float,
+) -> Scenario:
+    """A circle at a place, or a line, with a fraction of the usual radius and force."""
+    center, normal, size = np.array(place.center), np.array(place.normal), place.size
+    radius = _round_number(fraction * _RADIUS * size)
+    force = _round_number(fraction * min(_FORCE, place.force))
+    period = max(_SHORTEST, float(ceil(2 * pi * radius / place.speed)))
+    decimals = 2 if size > 0.3 else 3
+    bend = round(_BEND * size, decimals)
+    x, y, z = (float(value) + 0.0 for value in np.round(center - bend * normal, decimals))
+    axis = int(np.argmax(np.abs(normal)))
+    surface: Surface = Plane(place.center, place.normal)
+    name = ("ceiling" if normal[2] < 0.0 else "table") if axis == 2 else "wall"
+    if kind == "sphere":
+        name, surface = "ball", Sphere((x, y, z), bend)
+    elif kind == "cylinder":
+        # A planar robot moves around the cylinder, others also along it.
+        along = place.ways[-1] if len(place.ways) > 1 else 3 - axis - place.ways[0]
+        i, j, k = np.eye(3)[along].tolist()
+        name, surface = "pipe", Cylinder((x, y, z), (i, j, k), bend)
+    middle = [place.center[way] for way in place.ways]
+    path: Any
+    if len(middle) > 1:
+        path = CircleReference(middle, radius, period=period)
+    else:
+        path = SinusoidReference(middle[0], [radius], [round(2 * pi / period, 4)])
+    axes = "".join("xyz"[way] for way in place.ways)
+    near = dict(zip(names, (np.round(place.q, 4) + 0.0).tolist(), strict=True))
+    shape = "circle" if len(middle) > 1 else "line"
+    return Scenario(
+        description=f"a {shape} of {radius:g} m in {period:g} s on a {name}",
+        robot=robot,
+        constraints=[PointOnSurface(tip, surface, point, name)],
+        # On a strongly curved surface an axis fixed to the normal hinders motion along it.
+        tool_axis="normal" if kind == "plane" else "fixed",
+        references={f"{tip}.{axes}": path, f"{name}.force": force},
+        start=Start(positions=near),
+        duration=2 * period,
+    )
+
+
+def _round_number(value: float) -> float:
+    """The largest of 1, 2, 3, 5, 8 times a power of ten that is not above a value."""
+    power = 10.0 ** int(np.floor(log10(value)))
+    return max(float(f"{k * power:.3g}") for k in (1, 2, 3, 5, 8) if k * power <= value * 1.001)
+
+
+def _text(scenario: Scenario, why: dict[str, str], folder: str | Path | None) -> str:
+    """The text of a new scenario, with a comment on each choice."""
+    data = {**scenario_data(scenario), "duration": scenario.duration}
+    file = Path(data["robot"]["file"])
+    if folder is not None and file.is_relative_to(saved := os.path.realpath(folder)):
+        data["robot"]["file"] = file.relative_to(saved).as_posix()
+    contact, force = (
+        scenario.constraints[0].name,
+        "N, at most 20, and a sixth of what efforts allow",
+    )
+    why = {**why, "tool_axis": "kept where it starts", "positions": "near there, in rad or m"}
+    why |= {"duration": "s, two rounds", f"{contact}.force": force}
+    lines = [
+        "# Written by `drake-dae new`, to be changed. Units: m, rad, s, N, N m.",
+        "# Outputs beside the tool's path, gains (poles at -4 1/s) and an exact start are added by",
+        "# `drake-dae simulate FILE`; --meshcat shows it. `drake-dae analyze FILE` tells margins.",
+    ]
+    for line in dump_yaml(data).splitlines():
+        note = why.get(line.strip(" -").partition(":")[0], "")
+        fits = len(line) + len(note) < 97
+        indent = line[: len(line) - len(line.lstrip(" "))]
+        lines += [f"{line}  # {note}"] if note and fits else [f"{indent}# {note}"] * bool(note)
+        lines += [line] * (not (note and fits))
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,322 @@
+"""Configurations of a robot on its constraints, by inverse kinematics, and their quality."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from pydrake.multibody.parsing import GetScopedFrameByName
+from pydrake.multibody.tree import WeldJoint
+
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.robots.constraints.constraint import Touch
+from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots.links.links import Links
+from drake_dae.robots.links_behind import LinkDepths
+from drake_dae.robots.loop_state import LoopState
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
+
+INDEPENDENT = 0.02
+"""Rows with an `independence` below this are dependent or nearly so."""
+
+EXACT = 1e-9
+"""The allowed residual of equations in m, rad or 1."""
+
+NEAR_LIMIT = 0.1
+"""A joint within this fraction of its range from a limit counts as close to it."""
+
+_NEWTON_STEPS = 25
+"""The largest number of Newton steps from a guess; a good guess takes six."""
+
+
+@dataclass(frozen=True, eq=False)
+class Posture:
+    """A configuration q, shape (nq,), with the values of its rows: functions of q, c of them.
+
+    Attributes:
+        q: The configuration.
+        rows: The values of the rows, shape (c,).
+        gradients, constraints: The rates of rows and constraints per unit of v, (c, nv), (m, nv).
+        forces: S of the force outputs, shape (s, m).
+        mass: M(q), shape (nv, nv).
+        actuation: The generalized force per unit of each control, shape (nv, nu).
+        normals: The unit normal of each surface at its contact, shape (contacts, 3).
+        leans: The cosine between the outward axis of each tool and its surface's normal.
+        depth: The largest depth of a link behind a surface, in m.
+    """
+
+    q: FloatArray
+    rows: FloatArray
+    gradients: FloatArray
+    constraints: FloatArray
+    forces: FloatArray
+    mass: FloatArray
+    actuation: FloatArray
+    normals: FloatArray
+    leans: FloatArray
+    depth: float
+
+    def independence(self, rows: Sequence[int]) -> float:
+        """How independently the controls act on some rows and the force outputs, from 0 to 1.
+
+        It is the smallest singular value of B(x) of (16), in coordinates M^(1/2) v and M^(-1/2) B_u
+        in place of v and B_u. Each row is divided by its length without constraints, so that units
+        and lever lengths do not matter. It is 1 for fully independent rows, and 0 if B is singular.
+        """
+        of_rows, of_forces = self._control
+        B = np.vstack([of_rows[list(rows)], of_forces])
+        if len(B) > B.shape[1]:
+            return 0.0
+        return float(np.min(np.linalg.svd(B, compute_uv=False), initial=1.0))
+
+    @cached_property
+    def _control(self) -> tuple[FloatArray, FloatArray]:
+        """The rows of B(x) of `independence`: of all rows, and of the force outputs."""
+
+        def one_long(rows: FloatArray, scaled: FloatArray) -> FloatArray:
+            length = np.linalg.norm(rows, axis=1, keepdims=True)
+            return scaled / np.where(length > 1e-9, length, np.inf)
+
+        right = np.vstack([self.constraints, self.gradients, self.actuation.T]).T
+        weighted = np.linalg.solve(np.linalg.cholesky(self.mass), right).T
+        J, P, drives = np.split(weighted, np.cumsum([len(self.constraints), len(self.gradients)]))
+        Q = np.linalg.qr(drives.T)[0]
+        inverse = np.linalg.pinv(J, 1e-9)  # J^T (J M^-1 J^T)^-1 in these units.
+        F = self.forces @ inverse.T
+        return one_long(P, P - P @ inverse @ J) @ Q, one_long(F, F) @ Q
+
+    def independent(self, rows: Sequence[int], more: Iterable[int], count: int) -> list[int]:
+        """The first rows of `more`, at most `count`, independent of `rows` and of each other."""
+        chosen: list[int] = []
+        for row in more:
+            if len(chosen) < count and self.independence([*rows, *chosen, row]) > INDEPENDENT:
+                chosen.append(row)
+        return chosen
+
+    def most_independent(self, rows: Sequence[int], more: Sequence[int], count: int) -> list[int]:
+        """`count` rows of `more`, each the most independent of those before it."""
+        chosen: list[int] = []
+        for _ in range(count):
+            rest = [row for row in more if row not in chosen]
+            chosen.append(max(rest, key=lambda row: self.independence([*rows, *chosen, row])))
+        return sorted(chosen)
+
+
+class Postures:
+    """The configurations of a robot with constraints.
+
+    Args:
+        links, bound: The robot and its constraints.
+        rows: h(q), shape (c, 1).
+        forces: S of the force outputs, shape (s, m).
+        touches: The contacts with a free side, with the outward axis of the tool in the world,
+            shape (3, 1).
+        values: Parameter name -> value, for the parameters that differ from their defaults.
+
+    Attributes:
+        low, high: The limits of q, shape (nq,) each.
+        size: The largest distance between its bodies, in m, in its default configuration.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        bound: ConstraintSet,
+        rows: ca.SX,
+        forces: ca.SX,
+        touches: Sequence[tuple[Touch, ca.SX]],
+        values: Mapping[str, FloatArray],
+    ) -> None:
+        parameters = (*links.parameters, *bound.parameters)
+        kinematics = links.kinematics()
+        residual, rate = bound.residual(links), kinematics.value(bound.rate(kinematics))
+        equations = ca.vertcat(residual, rows)
+        inputs = {"q": links.q, "parameters": ca.vertcat(*[p.symbol for p in parameters])}
+        # Newton's method needs neither M nor the bodies.
+        self._equations = TracedFunction("equations of postures", inputs, {"values": equations})
+        slopes = ca.jacobian(equations, links.q)
+        self._slopes = TracedFunction("slopes of postures", inputs, {"slopes": slopes})
+        self._count = residual.numel()
+        drives = ca.SX(ca.DM(links.actuation_matrix)), LoopState.of(bound, links).motors
+        outputs = {
+            "rows": rows,
+            "gradients": ca.mtimes(slopes[self._count :, :], links.velocity_map),
+            "constraints": ca.jacobian(rate, links.v),
+            "forces": forces,
+            "mass": links.mass_matrix,
+            "actuation": ca.horzcat(*drives),
+            "normals": ca.horzcat(ca.SX(3, 0), *[touch.normal for touch, _ in touches]).T,
+            "leans": ca.vertcat(ca.SX(0, 1), *[ca.dot(t.normal, axis) for t, axis in touches]),
+        }
+        self._shapes = {name: value.shape for name, value in outputs.items()}
+        self._function = TracedFunction("postures", inputs, outputs)
+        by_place = {str(place): touch for place, (touch, _) in enumerate(touches)}
+        self._depths = LinkDepths(links, by_place, inputs["parameters"])
+        chosen = [np.atleast_1d(values.get(p.name, p.value)) for p in parameters]
+        for p, value in zip(parameters, chosen, strict=True):
+            if value.size not in (1, p.value.size):
+                raise ModelError(f"{p.name}: {p.value.size} numbers are needed, got {value.size}")
+        pairs = zip(chosen, parameters, strict=True)
+        sized = [np.broadcast_to(value, (p.value.size,)) for value, p in pairs]
+        self._parameters = np.concatenate([np.zeros(0), *sized])
+        self.low, self.high = links.position_limits
+        _, self._fastest = links.velocity_limits
+        self._turns = np.array([signal.unit == "rad" for signal in links.position_signals])
+        places = ca.Function("places", [*inputs.values()], [links.landmarks()])
+        points = places(links.default_positions, self._parameters).full()
+        self.size = float(np.max(np.ptp(points, axis=1))) or 1.0
+
+    def at(self, q: FloatArray) -> Posture:
+        """The posture of a configuration."""
+        values = zip(self._shapes.items(), self._function(q, self._parameters), strict=True)
+        shaped = {name: value.reshape(shape) for (name, shape), value in values}
+        for name in ("rows", "leans"):
+            shaped[name] = shaped[name].ravel()
+        depths = self._depths.at(q, self._parameters).values()
+        depth = max((float(np.max(of_links)) for of_links in depths), default=0.0)
+        return Posture(q=q, depth=depth, **shaped)
+
+    def solve(
+        self, rows: Sequence[int], wanted: FloatArray, guess: FloatArray
+    ) -> FloatArray | None:
+        """A configuration on the constraints in which some rows have given values, near a guess.
+
+        Args:
+            rows: The rows.
+            wanted: Their values.
+            guess: The initial guess of Newton's method, shape (nq,).
+
+        Returns:
+            q, shape (nq,); None if none is found, or it is outside of the limits of joints.
+        """
+        residual, slopes = self._residual(rows, wanted)
+
+        def linearize(q: FloatArray) -> NewtonModel | None:
+            return shortest_steps(slopes(q), residual)
+
+        q = newton(guess, linearize, _NEWTON_STEPS)[0]
+        turned = self._turned_back(q)
+        for found in (turned, q):  # Where a row is the position of a joint, turns matter.
+            left = np.max(np.abs(residual(found)), initial=0.0)
+            if left < EXACT and np.all(self._room(found) >= -EXACT):
+                return found
+        return None
+
+    def nearest(
+        self, rows: Sequence[int], wanted: FloatArray, guesses: Iterable[FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """The configuration within limits nearest to given values of rows, and what is left.
+
+        Of the constraints a hundredth is left of what is left of rows.
+        """
+        from scipy.optimize import least_squares  # Imported here, since few runs need it.
+
+        residual, slopes = self._residual(rows, wanted)
+        weights = np.concatenate([np.full(self._count, 100.0), np.ones(len(rows))])
+        low, high = self.low, np.maximum(self.high, self.low + 1e-6)
+
+        def weighted(q: FloatArray) -> FloatArray:
+            return np.nan_to_num(weights * residual(q), nan=1e6, posinf=1e6, neginf=-1e6)
+
+        def gradient(q: FloatArray) -> FloatArray:
+            return weights[:, None] * slopes(q)
+
+        inside = [np.clip(q, low, high) for q in guesses]
+        tried = sorted(inside, key=lambda q: float(np.sum(weighted(q) ** 2)))[:3]
+        fits = [least_squares(weighted, q, gradient, (low, high), max_nfev=50) for q in tried]
+        q = min(fits, key=lambda fit: float(fit.cost)).x
+        return q, residual(q)
+
+    def _residual(self, rows: Sequence[int], wanted: FloatArray):  # type: ignore[no-untyped-def]
+        """The equations of `solve`, shape (k + len(rows),), and their slopes."""
+        chosen = np.concatenate([np.arange(self._count), self._count + np.array(rows, dtype=int)])
+        goal, parameters = np.concatenate([np.zeros(self._count), wanted]), self._parameters
+
+        def residual(q: FloatArray) -> FloatArray:
+            return self._equations.evaluate(q, parameters)[0][chosen] - goal
+
+        def slopes(q: FloatArray) -> FloatArray:
+            return self._slopes.evaluate(q, parameters)[0].reshape(-1, q.size)[chosen]
+
+        return residual, slopes
+
+    def _turned_back(self, q: FloatArray) -> FloatArray:
+        """Removes whole turns from a configuration, as far as the limits permit."""
+        turned = q - 2 * np.pi * np.round(q / (2 * np.pi)) * self._turns
+        for shift in (-2 * np.pi, 2 * np.pi):
+            moved = turned + shift * self._turns
+            is_better = (self._room(turned) < 0.0) & (self._room(moved) >= 0.0)
+            turned = np.where(is_better, moved, turned)
+        is_fine = (self._room(q) >= 0.0) & np.isfinite(self.high - self.low)
+        return np.where(is_fine, q, turned)
+
+    def _room(self, q: FloatArray) -> FloatArray:
+        """The distance of each position from its nearer limit, shape (nq,)."""
+        return np.minimum(q - self.low, self.high - q)
+
+    def margin(self, q: FloatArray) -> float:
+        """1 if no joint is close to a limit, 0 if one is at it or beyond."""
+        span = self.high - self.low
+        bounded = np.isfinite(span) & (span > 0.0)
+        share = self._room(q)[bounded] / (NEAR_LIMIT * span[bounded])
+        return float(np.clip(np.min(share, initial=1.0), 0.0, 1.0))
+
+    def quality(self, posture: Posture, rows: Sequence[int]) -> float:
+        """The quality of a posture for a task: `independence` of the rows times `margin`.
+
+        A link behind a surface, or a tool that points away from its surface, reduces it to a tenth.
+        """
+        quality = posture.independence(rows) * self.margin(posture.q)
+        if posture.depth > 0.0:
+            quality *= 0.1
+        if np.max(posture.leans, initial=-1.0) > 0.0:
+            quality *= 0.1
+        return quality
+
+    def is_too_fast(self, posture: Posture, rows: Sequence[int], rates: FloatArray) -> bool:
+        """Whether a joint exceeds its speed limit where rows have given rates, shape (len(rows),).
+
+        Without limits of speed none does.
+        """
+        slopes = np.vstack([posture.constraints, posture.gradients[list(rows)]])
+        wanted = np.concatenate([np.zeros(len(posture.constraints)), rates])
+        v = np.linalg.lstsq(slopes, wanted, rcond=None)[0]
+        return bool(np.any(np.abs(v) > self._fastest))
+
+    def guesses(self, count: int) -> FloatArray:
+        """Random configurations within the limits, shape (count, nq); the same in each call."""
+        random = np.random.default_rng(0)
+        reach = np.where(self._turns, np.pi, self.size)
+        low, high = np.maximum(self.low, -reach), np.minimum(self.high, reach)
+        empty = low > high  # Limits wider than a turn.
+        low, high = np.where(empty, self.low, low), np.where(empty, self.high, high)
+        inset = 0.5 * NEAR_LIMIT * (high - low)
+        return random.uniform(low + inset, high - inset, (count, low.size))
+
+
+def tool_axis(links: Links, touch: Touch) -> tuple[int, float]:
+    """The axis (0, 1, 2) of the touching frame along which the tool sticks out, and its sign.
+
+    It is the axis closest to the line from the last joint that moves to the touching point; z where
+    the point is at the joint, which is what vendors mean by it.
+    """
+    plant = links.plant
+    if plant is None:
+        return 2, 1.0
+    frame = GetScopedFrameByName(plant, touch.frame)
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    above = {joint.child_body().index(): joint for joint in joints}
+    body = frame.body()
+    while isinstance(above.get(body.index()), WeldJoint):
+        body = above[body.index()].parent_body()
+    joint = above.get(body.index())
+    origin = body.body_frame() if joint is None else joint.frame_on_child()
+    context = plant.CreateDefaultContext()
+    offset = np.array(touch.point) - origin.CalcPose(context, frame).translation()
+    largest = int(np.argmax(np.abs(offset)))
+    if abs(offset[largest]) < 1e-6:
+        return 2, 1.0
+    return largest, float(np.sign(offset[largest]))

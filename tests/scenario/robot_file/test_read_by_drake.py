@@ -1,0 +1,292 @@
+"""The tables of what Drake reads of robot files, fed through Drake part by part."""
+
+from copy import deepcopy
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import pytest
+from pydrake.multibody.inverse_kinematics import AddMultibodyPlantConstraints
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
+from pydrake.multibody.tree import FrameIndex
+from pydrake.solvers import MathematicalProgram
+
+from drake_dae.errors import ModelError
+from drake_dae.scenario.robot_file.changes import finalize
+from drake_dae.scenario.robot_file.read_by_drake import READ_BY_DRAKE
+from drake_dae.scenario.robot_file.reading import parts_to_leave_out, read_robot
+from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.robot_file.xml_tree import read_xml, write_xml
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::drake_dae.errors.RobotFileWarning"),
+    pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning"),
+]
+
+# Files in which each part that Drake reads has a value that is not its default.
+INERTIAL = (
+    '<inertial><origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/><mass value="2"/><inertia ixx="0.3" '
+    'iyy="0.4" izz="0.5" ixy="0.01" ixz="0.02" iyz="0.03"/></inertial>'
+)
+JOINT = (
+    '<joint name="{0}" type="{1}"><origin xyz="0.1 0.2 0.3" rpy="0.3 0.2 0.1"/>'
+    '<parent link="{2}"/><child link="{3}"/><axis xyz="0.6 0 0.8"/>{4}'
+    '<limit lower="-1" upper="2" velocity="3" effort="4" drake:acceleration="5"/>'
+    '<dynamics damping="0.5"/></joint>'
+)
+URDF = f"""<robot name="r" xmlns:drake="http://drake.mit.edu">
+<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+<link name="base"/><link name="a">{INERTIAL}</link><link name="b">{INERTIAL}</link>
+<link name="c">{INERTIAL}</link><link name="d">{INERTIAL}</link>
+<joint name="hold" type="fixed"><parent link="world"/><child link="base"/></joint>
+{JOINT.format("j", "revolute", "base", "a", "")}
+{JOINT.format("k", "prismatic", "a", "b", '<mimic joint="j" multiplier="2" offset="0.1"/>')}
+{JOINT.format("p", "planar", "b", "c", "").replace('"0.5"', '"0.1 0.2 0.3"')}
+{JOINT.format("l", "continuous", "c", "d", "")}
+<transmission><type>SimpleTransmission</type><joint name="j"/><actuator name="m">
+<drake:rotor_inertia value="0.1"/><drake:gear_ratio value="3"/></actuator></transmission>
+<frame name="tip" link="a" xyz="1 0 0"/>
+<drake:ball_constraint><drake:ball_constraint_body_A name="a"/><drake:ball_constraint_body_B
+name="c"/><drake:ball_constraint_p_AP value="0 0 1"/><drake:ball_constraint_p_BQ value="0 0 1"/>
+</drake:ball_constraint></robot>"""
+SDF_INERTIAL = (
+    "<inertial><pose>0.1 0.2 0.3 0.1 0.2 0.3</pose><mass>2</mass><inertia><ixx>0.3</ixx>"
+    "<iyy>0.4</iyy><izz>0.5</izz><ixy>0.01</ixy><ixz>0.02</ixz><iyz>0.03</iyz></inertia></inertial>"
+)
+SDF_JOINT = (
+    '<joint name="{0}" type="{1}"><parent>{2}</parent><child>{3}</child><pose>0.1 0.2 0.3 0 0 0'
+    "</pose><axis><xyz>0.6 0 0.8</xyz><limit><lower>-1</lower><upper>2</upper>"
+    "<velocity>3</velocity><effort>4</effort><drake:acceleration>5</drake:acceleration></limit>"
+    "<dynamics><damping>0.5</damping><spring_stiffness>6</spring_stiffness>"
+    "<spring_reference>0.2</spring_reference></dynamics></axis>{4}</joint>"
+)
+SDF = f"""<sdf version="1.9" xmlns:drake="http://drake.mit.edu"><model name="r">
+<link name="base">{SDF_INERTIAL}</link><link name="a"><pose>1 0 0 0.1 0.2 0.3</pose>{SDF_INERTIAL}
+</link><link name="b"><pose>2 0 0 0 0 0</pose>{SDF_INERTIAL}</link>
+<frame name="tip"><pose>1 0 0 0 0 0</pose></frame>
+<joint name="hold" type="fixed"><parent>world</parent><child>base</child></joint>
+{
+    SDF_JOINT.format(
+        "j",
+        "revolute",
+        "base",
+        "a",
+        "<drake:rotor_inertia>0.1</drake:rotor_inertia><drake:gear_ratio>3</drake:gear_ratio>",
+    )
+}
+{
+    SDF_JOINT.format(
+        "k", "prismatic", "a", "b", '<drake:mimic joint="j" multiplier="2" offset="0.1"/>'
+    )
+}</model></sdf>"""
+MJCF = """<mujoco model="r"><compiler angle="radian" eulerseq="zyx"/><option gravity="0 1 -3"/>
+<worldbody><body name="a" pos="1 0 0" euler="0.1 0.2 0.3"><inertial pos="0.1 0.2 0.3"
+quat="0.9 0.1 0.2 0.3" mass="2" diaginertia="0.3 0.4 0.5"/><joint name="j" pos="0.1 0 0"
+axis="0.6 0 0.8" range="-1 2" damping="0.5" ref="0.1" armature="0.2"/>
+<body name="b" pos="1 0 0" axisangle="0 1 0 0.4"><inertial pos="0 0 0" mass="1"
+fullinertia="0.3 0.4 0.5 0.01 0.02 0.03"/><joint name="k" type="slide" axis="0 0 1"/>
+<body name="c" xyaxes="0 1 0 -1 0 0"><geom type="box" size="0.1 0.2 0.3" pos="0.1 0 0" mass="3"/>
+<geom type="capsule" fromto="0 0 0 1 0 0" size="0.1" density="100"/><joint name="l"/>
+<body name="d" zaxis="1 0 1"><freejoint/><geom size="0.1"/></body></body></body></body></worldbody>
+<actuator><motor name="m" joint="j" gear="2" ctrlrange="-3 3" forcerange="-4 4"/>
+<motor name="n" joint="k" forcerange="-4 4"/></actuator>
+<equality><connect body1="a" body2="c" anchor="0 0 1"/></equality></mujoco>""".replace(
+    '<body name="d" zaxis="1 0 1"><freejoint/>', '<body name="d" zaxis="1 0 1"><joint name="f"/>'
+)
+WHOLE = {".urdf": URDF, ".sdf": SDF, ".xml": MJCF}
+
+DRAWN = {"robot/material", "material/name", "material/color", "color/rgba", "sdf/version"}
+DRAWN |= {"motor/gear"}  # The inertia of a rotor at its joint is the armature, whatever the gear.
+"""Parts of these files that no equation of Drake's has."""
+
+
+def facts(text: str, kind: str) -> tuple:
+    """What Drake makes of a file: accelerations, limits, names and numbers of things."""
+    free, held = MultibodyPlant(0.0), MultibodyPlant(0.001)
+    held.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
+    for plant in (free, held):
+        Parser(plant).AddModelsFromString(text, kind)
+        for key in plant.GetConstraintIds() if plant is free else ():
+            plant.RemoveConstraint(key)  # Continuous plants have none.
+        plant.Finalize()
+    context = free.CreateDefaultContext()
+    found = [free.GetPositions(context), free.GetEffortUpperLimits()]
+    found += [free.GetPositionLowerLimits(), free.GetPositionUpperLimits()]
+    found += [free.GetVelocityUpperLimits(), free.GetAccelerationUpperLimits()]
+    random = np.random.default_rng(0)
+    q = random.normal(size=free.num_positions())
+    free.SetPositions(context, q)
+    free.SetVelocities(context, random.normal(size=free.num_velocities()))
+    free.get_actuation_input_port().FixValue(context, random.normal(size=free.num_actuators()))
+    found.append(free.EvalTimeDerivatives(context).CopyToVector())
+    program = MathematicalProgram()
+    variables = program.NewContinuousVariables(q.size)
+    kept = held.CreateDefaultContext()  # The constraints point to it.
+    AddMultibodyPlantConstraints(held, variables, program, kept)
+    for binding in program.GetAllConstraints():
+        own = binding.evaluator()
+        values = q[[program.FindDecisionVariableIndex(one) for one in binding.variables()]]
+        found.append(own.Eval(values) - own.lower_bound())
+    names = [free.get_joint(index).name() for index in free.GetJointIndices()]
+    names += [free.get_joint_actuator(i).name() for i in free.GetJointActuatorIndices()]
+    names += [free.get_frame(FrameIndex(i)).name() for i in range(free.num_frames())]
+    return tuple(np.round(np.clip(np.concatenate(found), -1e6, 1e6), 9).tolist()), *names
+
+
+def parts(root: Element) -> list[tuple[Element, str]]:
+    """The owners and names of all attributes and elements of a file."""
+    found = [(node, name) for node in root.iter() for name in node.attrib if ":" not in name]
+    return found + [(node, child.tag) for node in root.iter() for child in node]
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+def test_each_part_that_the_table_has_is_one_that_drake_reads(kind: str, tmp_path: Path):
+    """Without it Drake makes another robot of the file, or none: wherever it is, or somewhere."""
+    (tmp_path / "whole").write_text(WHOLE[kind])
+    whole = read_xml(tmp_path / "whole")
+    before, table = facts(write_xml(whole), kind), READ_BY_DRAKE[kind]
+    found: dict[str, bool] = {}
+    for number, (owner, name) in enumerate(parts(whole)):
+        if not table.get(owner.tag, {}).get(name, (False, ""))[0] or owner.tag == "mujoco":
+            continue
+        root = deepcopy(whole)
+        node = parts(root)[number][0]
+        if name in node.attrib:
+            del node.attrib[name]
+        else:
+            node.remove(next(child for child in node if child.tag == name))
+        try:
+            changes = facts(write_xml(root), kind) != before
+        except (RuntimeError, ValueError, SystemExit):
+            changes = True
+        part = f"{owner.tag}/{name}"
+        found[part] = found.get(part, False) or changes
+    assert {part for part, changes in found.items() if not changes} <= DRAWN
+    assert len(found) > 25
+
+
+LOST = {
+    ".urdf": {
+        "dynamics/friction": ('damping="0.5"/>', 'damping="0.5" friction="0.3"/>'),
+        "robot/loop": ("</robot>", '<loop name="x"/></robot>'),
+        "robot/constraint": ("</robot>", '<constraint name="x"/></robot>'),
+        "robot/loop_joint": ("</robot>", '<loop_joint name="x"/></robot>'),
+        "gazebo/joint": ("</robot>", '<gazebo><joint name="x"/></gazebo></robot>'),
+        "gazebo/gravity": ("</robot>", "<gazebo><gravity>false</gravity></gazebo></robot>"),
+        "gazebo/turnGravityOff": (
+            "</robot>",
+            "<gazebo><turnGravityOff>true</turnGravityOff></gazebo></robot>",
+        ),
+        "link/gravity": ("</link>", "<gravity>0</gravity></link>"),
+        "contact/inertia_scaling": (
+            "</link>",
+            '<contact><inertia_scaling value="3.0"/></contact></link>',
+        ),
+        "joint/joint_properties": ("<axis", '<joint_properties damping="1"/><axis'),
+        "transmission/type": ("SimpleTransmission", "DifferentialTransmission"),
+        "limit/current": ("<limit", '<limit current="2"'),
+        "inertia": ('ixx="0.3"', 'ixx="30"'),
+        "empty_limits": ('lower="-1"', 'lower="9"'),
+    },
+    ".sdf": {
+        "dynamics/friction": ("</damping>", "</damping><friction>0.3</friction>"),
+        "link/gravity": ("</link>", "<gravity>false</gravity></link>"),
+        "link/enable_wind": ("</link>", "<enable_wind>true</enable_wind></link>"),
+        "velocity_decay/linear": (
+            "</link>",
+            "<velocity_decay><linear>0.1</linear></velocity_decay></link>",
+        ),
+        "axis/mimic": ("</limit>", '</limit><mimic joint="k"><multiplier>2</multiplier></mimic>'),
+        "world/gravity": (
+            ("<model", "</model>"),
+            ('<world name="w"><gravity>0 0 -1.6</gravity><model', "</model></world>"),
+        ),
+        "inertial/fluid_added_mass": (
+            "<mass>",
+            "<fluid_added_mass><xx>1</xx></fluid_added_mass><mass>",
+        ),
+        "inertia": ("<ixx>0.3</ixx>", "<ixx>30</ixx>"),
+    },
+    ".xml": {
+        "joint/stiffness": ('<joint name="l"', '<joint name="l" stiffness="3" springref="1"'),
+        "joint/springdamper": ('<joint name="l"', '<joint name="l" springdamper="1 1"'),
+        "joint/frictionloss": (
+            "<worldbody>",
+            '<default><joint frictionloss="1"/></default><worldbody>',
+        ),
+        "joint/actuatorfrcrange": ('<joint name="l"', '<joint name="l" actuatorfrcrange="-1 1"'),
+        "joint/armature": ('<joint name="l"', '<joint type="ball" armature="0.1"'),
+        "body/gravcomp": ('<body name="b"', '<body name="b" gravcomp="1"'),
+        "body/frame": ("<geom", "<frame><body/></frame><geom"),
+        "mujoco/tendon": ("<equality>", '<tendon><fixed name="t"/></tendon><equality>'),
+        "equality/joint": ("<equality>", '<equality><joint joint1="j" joint2="k"/>'),
+        "equality/weld": ("<equality>", '<equality><weld body1="a" body2="c"/>'),
+        "option/density": ("<option", '<option density="1000"'),
+        "flag/gravity": ("<worldbody>", '<option><flag gravity="disable"/></option><worldbody>'),
+        "actuator/general": ("<actuator>", '<actuator><general joint="k" gainprm="3"/>'),
+        "motor/tendon": ("</actuator>", '<motor tendon="t"/></actuator>'),
+        "motor/forcerange": ('forcerange="-4 4"', 'forcerange="-4 9"'),
+        "compiler/settotalmass": ("<compiler", '<compiler settotalmass="3"'),
+        "inertia": ('"0.3 0.4 0.5"', '"3 0.4 0.5"'),
+    },
+}
+CASES = [(kind, part, *change) for kind, lost in LOST.items() for part, change in lost.items()]
+
+
+@pytest.mark.parametrize(("kind", "part", "old", "new"), CASES)
+def test_what_is_lost_is_an_error_with_its_name_until_it_is_left_out(
+    kind: str, part: str, old: str | tuple[str, ...], new: str | tuple[str, ...], tmp_path: Path
+):
+    text = WHOLE[kind]
+    pairs = [(old, new)] if isinstance(old, str) else zip(old, new, strict=True)
+    for before, after in pairs:
+        assert before in text
+        text = text.replace(before, after, 1)
+    file = tmp_path / f"robot{kind}"
+    file.write_text(text)
+    robot = Robot(str(file))
+    assert parts_to_leave_out(robot) == [part]
+    with pytest.raises(ModelError, match=rf"leave_out: \[{part}\]"):
+        read_robot(robot)
+    finalize(read_robot(Robot(str(file), leave_out=[part]))[0])
+    if "/" not in part or part in ("motor/forcerange", "joint/armature"):
+        return  # Drake refuses it, or reads it in part.
+    try:
+        assert facts(text, kind) == facts(WHOLE[kind], kind) or part.startswith("transmission")
+    except (RuntimeError, ValueError):
+        assert part == "robot/loop_joint"
+
+
+HARMLESS = {
+    ".urdf": [
+        ('damping="0.5"/>', 'damping="0.5" friction="0.0"/>'),
+        (
+            "</link>",
+            '<gravity>1</gravity><self_filter/><contact><stiffness value="3"/></contact></link>',
+        ),
+        ("</robot>", "<gazebo><sensor/><gravity>true</gravity><mu1>0.3</mu1></gazebo></robot>"),
+        ("<axis", '<safety_controller k_velocity="1"/><calibration rising="0"/><axis'),
+        ("</robot>", "<ros2_control><joint/></ros2_control></robot>"),
+    ],
+    ".sdf": [
+        ("</damping>", "</damping><friction>0</friction>"),
+        ("</link>", "<gravity>1</gravity><sensor name='s' type='imu'/></link>"),
+        ("</model>", "<plugin name='p' filename='f'/></model>"),
+    ],
+    ".xml": [
+        ("<option", '<option timestep="0.01" density="0" integrator="RK4"'),
+        ('<joint name="l"', '<joint name="l" stiffness="0" solreflimit="0.1 1" margin="1"'),
+        ("<worldbody>", '<default><joint stiffness="0"/></default><sensor/><worldbody><light/>'),
+        ("<equality>", '<equality><joint joint1="j" joint2="k" active="false"/>'),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "old", "new"), [(kind, *one) for kind, some in HARMLESS.items() for one in some]
+)
+def test_what_changes_no_equation_passes(kind: str, old: str, new: str, tmp_path: Path):
+    assert old in WHOLE[kind]
+    (tmp_path / f"robot{kind}").write_text(WHOLE[kind].replace(old, new, 1))
+    finalize(read_robot(Robot(str(tmp_path / f"robot{kind}")))[0])
