@@ -82,14 +82,13 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     path = library(source, function.n_instructions(), compiled, make)
     if path is None:
         return None
-    with _warned(make):
+    with _warned(make):  # Which makes it None.
         try:
             return ca.external(function.name(), str(path))
         except RuntimeError as error:
             lines = [line for line in str(error).splitlines() if line.strip()] or [""]
             why = f"compiled code cannot be loaded: {brief(lines[-1])}"
             raise MachineCodeError(why) from None
-    return None
 
 
 def library(
@@ -101,7 +100,7 @@ def library(
         MachineCodeWarning: Machine code is requested and cannot be made.
     """
     more = tuple(options)
-    with _warned(make):
+    with _warned(make):  # Which makes it None.
         compiler = find_compiler()
         for level in ("-O1", "-O0") if compiled == "auto" else ("-O1",):
             path = files.find(_key(source, compiler, level, more))
@@ -119,12 +118,11 @@ def library(
                 give_up(compiler, error)
                 raise
             return files.store(_key(source, compiler, level, more), folder / "code.so")
-    return None
 
 
 @contextmanager
 def _warned(make: bool) -> Iterator[None]:
-    """Turns a MachineCodeError into a warning, if machine code was requested."""
+    """Ends with a warning, if machine code was requested, where a MachineCodeError is raised."""
     try:
         yield
     except MachineCodeError as error:
