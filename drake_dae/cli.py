@@ -58,6 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is not None:
         return _main(arguments)
     gc.set_threshold(YOUNG)
+    os.environ["MPLBACKEND"] = "agg"  # No window is opened; what the shell names may not exist.
+    # A shell can close them, as with >&-.
+    nothing = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 (until the process ends)
+    sys.stdout, sys.stderr = sys.stdout or nothing, sys.stderr or nothing
     try:
         return _main(sys.argv[1:])
     finally:

@@ -22,12 +22,15 @@ def load_run(path: Path) -> Record:
     """Reads the record of a run: of its folder, or a file.
 
     Raises:
-        ModelError: There is no record.
+        ModelError: There is no record, or it has no rows.
     """
     names = [name for name in (RECORD, PART) if (path / name).is_file()]
     if path.is_dir() and not names:
         raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
-    return Record.load(path / names[0] if names else path)
+    record = Record.load(path / names[0] if names else path)
+    if not record.time.size:
+        raise ModelError(f"the record of '{path}' has no rows: its run ended before its first step")
+    return record
 
 
 def runs_by_name(paths: Sequence[Path]) -> dict[str, Path]:

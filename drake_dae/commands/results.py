@@ -85,7 +85,10 @@ def _run_again(folder: Path) -> tuple[ClosedLoop, Context, Record]:
     if not (folder / SCENARIO).is_file():
         raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
     record = load_run(folder)
-    return *build_scenario(load_scenario(folder / SCENARIO)), record
+    loop, context = build_scenario(load_scenario(folder / SCENARIO))
+    if missing := [name for name in loop.signals if name not in record]:
+        raise ModelError(f"the record of '{folder}' lacks {', '.join(missing)} of its scenario")
+    return loop, context, record
 
 
 def _play_options(parser: Parser) -> None:

@@ -3,6 +3,8 @@
 import gc
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -244,3 +246,47 @@ def test_all_is_there_but_an_animation_that_finds_no_port(tmp_path, monkeypatch,
     assert error_line(capsys) == f"error: {tmp_path}/animation.html: {reason}"
     left = ["record.npz", "scenario.yaml", "summary.txt"]
     assert sorted(path.name for path in tmp_path.iterdir()) == left
+
+
+def test_a_record_without_rows_or_signals_is_told(tmp_path, capsys):
+    """As a run leaves it that is killed at its start."""
+    scenario = find_scenario("two_link_wall").read_text()
+    for name, record in (
+        ("empty", Record(np.zeros(0), {})),
+        ("bare", Record(np.arange(3.0), {})),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "scenario.yaml").write_text(scenario)
+        record.save(folder / "record.npz")
+        for words in ([], ["--all"], ["--film"], ["--errors"]):
+            out = [] if words == ["--all"] else [f"--out={tmp_path / 'drawn.png'}"]
+            assert main(["plot", str(folder), *words, *out]) == 1
+            assert name in error_line(capsys) or name == "bare"
+    assert not (tmp_path / "drawn.png").exists()
+
+
+NO_HOME = """
+import os, pwd, sys
+def unknown(uid): raise KeyError(uid)
+pwd.getpwuid = unknown
+from drake_dae.cli import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.slow
+def test_neither_a_home_nor_a_backend_nor_an_open_stdout_is_needed(tmp_path):
+    words = ["simulate", "two_link_wall", "--out", tmp_path / "run", *SHORT]
+    words += ["--set", "write.animation=false", "--set", "write.plots=true"]
+    others = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME")}
+    shell = f'"{sys.executable}" -c "$0" "$@" >&-'
+    done = subprocess.run(
+        ["sh", "-c", shell, NO_HOME, *map(str, words)],
+        env=others | {"MPLBACKEND": "nonsense", "MPLCONFIGDIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / PLOTS[0]).exists()

@@ -136,7 +136,7 @@ def _package_name(folder: Path) -> str:
 
 def _drake_folders() -> list[Path]:
     """The folders of Drake's packages, installed and downloaded."""
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return [Path(GetDrakePath()), Path(cache) / "drake" / "package_map"]
 
 
