@@ -58,10 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is not None:
         return _main(arguments)
     gc.set_threshold(YOUNG)
-    os.environ["MPLBACKEND"] = "agg"  # No window is opened; what the shell names may not exist.
-    # A shell can close them, as with >&-.
-    nothing = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 (until the process ends)
-    sys.stdout, sys.stderr = sys.stdout or nothing, sys.stderr or nothing
+    os.environ["MPLBACKEND"] = "agg"  # No command opens a window of Matplotlib's.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 (as long as the process)
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     try:
         return _main(sys.argv[1:])
     finally:

@@ -22,14 +22,14 @@ def load_run(path: Path) -> Record:
     """Reads the record of a run: of its folder, or a file.
 
     Raises:
-        ModelError: There is no record, or it has no rows.
+        ModelError: There is no record.
     """
     names = [name for name in (RECORD, PART) if (path / name).is_file()]
     if path.is_dir() and not names:
         raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
     record = Record.load(path / names[0] if names else path)
     if not record.time.size:
-        raise ModelError(f"the record of '{path}' has no rows: its run ended before its first step")
+        raise ModelError(f"the record in '{path}' has no rows")
     return record
 
 

@@ -86,8 +86,9 @@ def _run_again(folder: Path) -> tuple[ClosedLoop, Context, Record]:
         raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
     record = load_run(folder)
     loop, context = build_scenario(load_scenario(folder / SCENARIO))
-    if missing := [name for name in loop.signals if name not in record]:
-        raise ModelError(f"the record of '{folder}' lacks {', '.join(missing)} of its scenario")
+    if missing := loop.record(context).signals.keys() - record.signals.keys():
+        names = ", ".join(sorted(missing))
+        raise ModelError(f"the record in '{folder}' has not the signals of its loop: {names}")
     return loop, context, record
 
 

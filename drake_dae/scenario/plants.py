@@ -202,17 +202,14 @@ class OwnPlant(ScenarioPlant):
         with at("plant.maker"):
             try:
                 kind = getattr(import_module(module), name)
-            except Exception as error:  # The module is the user's.
-                reason = f"{type(error).__name__}: {error}"
-                raise ModelError(f"'{self.maker}' cannot be loaded: {reason}") from error
-            if not (isinstance(kind, type) and issubclass(kind, Plant)):
-                raise ModelError(
-                    f"'{self.maker}' is no class that keeps the contract of drake_dae.Plant"
-                )
-            try:
-                return kind(robot.model, robot.structure)
+                plant = kind(robot.model, robot.structure)
             except DrakeDaeError:
                 raise
             except Exception as error:
-                reason = f"{type(error).__name__}: {error}"
-                raise ModelError(f"'{self.maker}' cannot be made: {reason}") from error
+                what = f"{type(error).__name__}: {error}"
+                raise ModelError(f"'{self.maker}' cannot be loaded and made: {what}") from error
+            if not isinstance(plant, Plant):
+                raise ModelError(
+                    f"'{self.maker}' makes no plant that keeps the contract of drake_dae.Plant"
+                )
+            return plant

@@ -248,22 +248,25 @@ def test_all_is_there_but_an_animation_that_finds_no_port(tmp_path, monkeypatch,
     assert sorted(path.name for path in tmp_path.iterdir()) == left
 
 
-def test_a_record_without_rows_or_signals_is_told(tmp_path, capsys):
-    """As a run leaves it that is killed at its start."""
-    scenario = find_scenario("two_link_wall").read_text()
-    for name, record in (
-        ("empty", Record(np.zeros(0), {})),
-        ("bare", Record(np.arange(3.0), {})),
-    ):
-        folder = tmp_path / name
-        folder.mkdir()
-        (folder / "scenario.yaml").write_text(scenario)
-        record.save(folder / "record.npz")
-        for words in ([], ["--all"], ["--film"], ["--errors"]):
-            out = [] if words == ["--all"] else [f"--out={tmp_path / 'drawn.png'}"]
-            assert main(["plot", str(folder), *words, *out]) == 1
-            assert name in error_line(capsys) or name == "bare"
-    assert not (tmp_path / "drawn.png").exists()
+@pytest.mark.parametrize("rows", [0, 3])
+@pytest.mark.parametrize("kind", ["--film", "--all", "--errors"])
+def test_a_record_without_rows_or_the_signals_of_its_loop_is_one_line(kind, rows, tmp_path, capsys):
+    (tmp_path / "scenario.yaml").write_text(find_scenario("two_link_wall").read_text())
+    Record(np.arange(float(rows)), {}).save(tmp_path / "record.npz")
+    assert (
+        main(["plot", kind, str(tmp_path), *[f"--out={tmp_path}/a.png"] * (kind != "--all")]) == 1
+    )
+    assert error_line(capsys)
+
+
+@pytest.mark.parametrize("text", ["1 / 0", "class P:\n    def __init__(self, *_):\n        1 / 0"])
+def test_a_plant_of_ones_own_that_fails_is_one_line(text, tmp_path, monkeypatch, capsys):
+    name = f"plants_{abs(hash(text))}"
+    (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    own = ["--set", f"plant=!OwnPlant {{maker: '{name}:P'}}"]
+    assert main(["simulate", "two_link_wall", *own, "--out", str(tmp_path / "run")]) == 1
+    assert "ZeroDivisionError" in error_line(capsys)
 
 
 NO_HOME = """

@@ -69,32 +69,24 @@ def contact_gains(
 ) -> ContactGains:
     """Returns gains of a law with integrals, damping and observer for a contact.
 
-    All gains follow from one rate w. Positions have Butterworth's poles at the distance p = 1.5 w,
-    so that 3 w is the gain of the velocity where they are integrated: a triple pole at -w has the
-    same gain, but here slow model errors leave rate / p^3, which is 3.4 times less, and the complex
-    pair has a damping ratio of 1/2.
+    All gains follow from one rate w, the smaller of two. A delay tau = (delay + 1/2) sample_time
+    costs the phase 3 w tau at the crossover frequency, of which 0.3 rad are allowed. White velocity
+    noise n makes the acceleration jump, through law and observer, by the standard deviation
 
-    w is the smaller of two. First, a delay tau = (delay + 1/2) sample_time costs the phase 3 w tau
-    at the crossover frequency, of which 0.3 rad are allowed. Second, white velocity noise n makes
-    the acceleration jump by 3 w n_k through the law, and by k_o n_(k-1) through the observer, one
-    sample later. From sample to sample the standard deviation is
+        n sqrt((3 w)^2 + (k_o - 3 w)^2 + k_o^2)
 
-        n sqrt((3 w)^2 + (k_o - 3 w)^2 + k_o^2),
+    from sample to sample, sqrt(14) w n for k_o = 2 w; 0.08 rad/s^2 are allowed. Positions have
+    Butterworth's poles at p = 1.5 w. Friction is identified at the rate k_o / 4, so that the
+    observer reacts to a change first.
 
-    which is sqrt(14) w n for both k_o = w and k_o = 2 w, so k_o = 2 w is taken. 0.08 rad/s^2 are
-    allowed. At 1 kHz, one sample of delay and 1e-3 rad/s this gives w = 21.4 1/s. Friction is
-    identified at the rate k_o / 4, so that the observer reacts to a change first.
-
-    Noise reaches the force through the damping c and the observer's rate k_n in the normal
-    direction, since both act on phi'. The integral K_i reduces the damping of the contact, s^3 + c
-    s^2 + A k s + A k K_i = (s + K_i) (s^2 + (c - K_i) s + A k) nearly, so that
+    Noise n_phi of phi' reaches the force through the damping c and the observer's rate k_n:
 
         standard deviation of the force = (c + k_n) n_phi sqrt(k T / (2 A (c - K_i))),
 
-    with the noise n_phi of phi'. A model error delta in N leaves the error delta'' / (k_n K_i), and
-    a changing reference leaves c lambda' / (A k). For a given k_n K_i the noise is least at k_n =
-    K_i = c / 3; soft contacts need a smaller c. So k_n = w, c = 2.3 w or the value of
-    `contact_damping` if that is smaller, and K_i = 0.4 c, which is stable (Routh: K_i < c).
+    where the integral K_i reduces the damping. A model error delta in N leaves delta'' / (k_n K_i),
+    and a changing reference c lambda' / (A k). For given k_n K_i the noise is least at k_n = K_i =
+    c / 3. So k_n = w, c = 2.3 w or `contact_damping` if that is smaller, and K_i = 0.4 c, which is
+    stable (Routh: K_i < c).
 
     Args:
         stiffness: k of the contact in N/m, positive.

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import lie_derivative
-from drake_dae.dae.extension.extension import Extension, integrated, nominal_controls, refuse_metric
+from drake_dae.dae.extension.extension import Extension, by_control, integrated, refuse_metric
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import InputActions
@@ -70,7 +70,8 @@ def dynamic_extension(
     refuse_metric(system)
     limit = system.num_states if max_integrators is None else max_integrators
     check_whole_number(f"{system.name}: max_integrators", limit, 0)
-    chain = _Chain(system, nominal_controls(system, nominal_control), spread)
+    nominal = by_control(system, "nominal_control", nominal_control or {})
+    chain = _Chain(system, nominal, spread)
     while True:
         try:
             structure, _ = examine_structure(chain.near_nominal(), spread=chain.spread)

@@ -49,13 +49,7 @@ class Extension:
     def original_control(
         self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """Returns the control u of the original system, shape (p,).
-
-        Args:
-            state: x_e, the state of the extended system.
-            control: w of the extended system, shape (p,).
-            parameters: Values of all parameters; the defaults if None.
-        """
+        """Returns the control u of the original system for x_e and w of the extended one."""
         return self._control(state, control, self.original.parameter_vector(parameters))[0]
 
     @cached_property
@@ -83,11 +77,6 @@ def extend(
         nominal_control: Values of controls at the nominal state, for the integrators that hold
             them; zero where not given. B(x) is often singular at zero.
 
-    A control must not have the name of a state; rename one of them.
-
-    Returns:
-        The system with the states (x, u_i, u_j, ..., u_i', ...).
-
     Raises:
         ModelError: A control is unknown, a number of integrators is below 1, or the system has a
             `control_metric`.
@@ -95,11 +84,12 @@ def extend(
     refuse_metric(system)
     if not isinstance(integrators, Mapping):
         integrators = dict.fromkeys(integrators, 1)
-    bad = {name: count for name, count in integrators.items() if not _is_count(count)}
-    if bad:
-        raise ModelError(f"{system.name}: integrators must be whole numbers from 1, got {bad}")
-    nominal = nominal_controls(system, nominal_control)
-    _check_names(system, integrators, "integrators")
+    if any(type(count) is not int or count < 1 for count in integrators.values()):
+        raise ModelError(
+            f"{system.name}: integrators must be whole numbers from 1, got {dict(integrators)}"
+        )
+    nominal = by_control(system, "nominal_control", nominal_control or {})
+    by_control(system, "integrators", integrators)
     base = system.control_signals
     for order in range(max(integrators.values(), default=0)):
         columns = [i for i, signal in enumerate(base) if integrators.get(signal.name, 0) > order]
@@ -162,23 +152,13 @@ def integrated(
     )
 
 
-def nominal_controls(system: DaeSystem, values: Mapping[str, float] | None) -> FloatArray:
-    """Returns the controls at the nominal state, shape (p,), from their names; 0 for others."""
-    values = values or {}
-    _check_names(system, values, "nominal_control")
-    controls = [values.get(s.name, 0.0) for s in system.control_signals]
-    return vector(f"{system.name}: nominal_control", controls, system.num_controls)
-
-
-def _check_names(system: DaeSystem, numbers: Mapping[str, float], what: str) -> None:
+def by_control(system: DaeSystem, what: str, values: Mapping[str, float]) -> FloatArray:
+    """Returns numbers by the names of controls as an array, shape (p,); 0 for others."""
     names = [signal.name for signal in system.control_signals]
-    unknown = [name for name in numbers if name not in names]
+    unknown = [name for name in values if name not in names]
     if unknown:
         raise ModelError(
             f"{system.name}: {what} names {', '.join(unknown)}, but the controls are "
             f"{', '.join(names) or 'none'}"
         )
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+    return vector(f"{system.name}: {what}", [values.get(n, 0.0) for n in names], len(names))
