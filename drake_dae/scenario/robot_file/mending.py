@@ -272,7 +272,8 @@ class Mender:
                     self.efforts[model, name] = effort
                 elif "effort" in limit.attrib:  # Many authors write 0 for an unknown limit.
                     still.add(name)
-        joints, count = {joint.get("name") for joint in root.iterfind("joint")}, Counter[str]()
+        moving = [joint for joint in root.iterfind("joint") if joint.get("type") != "fixed"]
+        joints, count = {joint.get("name") for joint in moving}, Counter[str]()
         for transmission in root.findall("transmission"):
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
