@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, log10, pi
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 from typing import Any, Literal
 
 import casadi as ca
@@ -114,7 +114,7 @@ def new_scenario(
         folder: The folder in which the text will be saved: a robot's file below it gets a name
             relative to it. Without one the name is absolute, and the text may be saved anywhere.
         progress: Called with a phrase on each step.
-        seconds: After this time by the clock no further place is tried.
+        seconds: After this processor time no further place is tried.
 
     Returns:
         The scenario, and its text with a comment on each choice; `load_scenario` reads the same
@@ -125,7 +125,7 @@ def new_scenario(
             message lists the places that were tried.
     """
     progress("reading the robot")
-    end = perf_counter() + seconds
+    end = process_time() + seconds
     is_url = file.startswith("package://")
     with at("robot.file"):
         robot, tip, point, why = _robot(
@@ -140,7 +140,7 @@ def new_scenario(
     for fraction, place in product(_FRACTIONS, places[:_PLACES]):
         scenario = _scenario(robot, tip, point, place, names, surface, fraction)
         name, center = scenario.constraints[0].name, place.center
-        if tried and perf_counter() > end:
+        if tried and process_time() > end:
             break
         progress(f"trying a {name} at {center} m")
         try:

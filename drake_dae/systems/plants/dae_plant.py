@@ -1,6 +1,6 @@
 """Any DaeSystem as a LeafSystem."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -108,15 +108,12 @@ class DaePlant(ParameterizedSystem, Plant):
         super().__init__(system, block, system.exogenous.degrees(*values))
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
 
-    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
-        """Sets the state on N* next to a guess, shape (n,), and returns it.
-
-        Raises:
-            InconsistentStateError: None is found near the guess.
-        """
+    def set_consistent_state(
+        self, context: Context, guess: ArrayLike | Mapping[str, float], fixed: Sequence[str] = ()
+    ) -> FloatArray:
         self.check_context(context)
         values = self._values(context)
-        state = self.structure.manifold.settle(guess, values)
+        state = self._consistent(guess, fixed, values)
         self._check_left_out(state, values)
         self.set_state(context, state)
         return state
