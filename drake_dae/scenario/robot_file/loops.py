@@ -142,7 +142,7 @@ def _cut(
         plant.RemoveJoint(joint)
     except RuntimeError as error:
         raise ModelError(
-            f"joint '{name}' closes a loop, and cannot be cut: {error} Springs of the file stop it: "
+            f"joint '{name}' closes a loop, and cannot be cut: {error} Springs stop it: "
             "robot.leave_out takes them out, as [dynamics/spring_stiffness]"
         ) from None
     return cut

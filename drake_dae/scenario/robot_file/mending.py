@@ -235,7 +235,9 @@ class Mender:
         for mimic in [part for part in joint if part.tag == tag]:
             ratio = number_in(mimic.get("multiplier", "1"))
             offset = number_in(mimic.get("offset", "0"))
-            if ratio == 0.0 and offset is not None:
+            if joint.get("type") in ("planar", "floating", "universal", "ball"):
+                self.lost[f"joint/{tag}"].append(f"joint '{name}'")
+            elif ratio == 0.0 and offset is not None:
                 self.changed["joints that follow others with multiplier 0 stand"] += [f"'{name}'"]
                 self.standing[model, name] = offset
                 joint.remove(mimic)
@@ -278,7 +280,9 @@ class Mender:
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
             if driven & still and self.drives:
-                self.lost["transmission/joint"].append(f"{', '.join(map(str, driven))}: effort 0")
+                self.lost["transmission/joint"] += [
+                    f"joint '{joint}': effort 0" for joint in driven
+                ]
             if not has_type or not driven & joints:
                 root.remove(transmission)
                 continue
