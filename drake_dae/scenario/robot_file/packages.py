@@ -50,7 +50,7 @@ class RobotFiles:
                     packages.Add(name, folder)
                 except RuntimeError as error:
                     raise ModelError(f"no package in '{folder}': {error}") from None
-        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         self.folders = [FOLDER / "models", *map(Path, robot.packages.values())]
         self.folders += [Path(GetDrakePath()), Path(cache) / "drake" / "package_map"]
         main = Path(robot.file)
