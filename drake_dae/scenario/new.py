@@ -48,7 +48,7 @@ from drake_dae.scenario.postures import Posture, Postures, tool_axis
 from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.loops import actuators_of, closing_joints, joints_of
-from drake_dae.scenario.robot_file.reading import parts_to_leave_out, read_robot, unknown_packages
+from drake_dae.scenario.robot_file.reading import needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
@@ -238,7 +238,7 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
     is_driven = all(joint.index() in driven for joint in chain)
     # Motors that Drake does not read are no loss where the scenario names the driven joints.
-    is_driven &= parts_to_leave_out(replace(robot, actuators=None)) == robot.leave_out
+    is_driven &= not needs_of(replace(robot, actuators=None))[1]
     actuators = None if is_driven else "all"
     why["actuators"] = "that are not locked: the file drives not all of them"
     directions = _directions(plant, chain, tip, point)
@@ -271,7 +271,7 @@ def _read(file: str) -> tuple[MultibodyPlant, Robot]:
 
     with warnings.catch_warnings():  # The scenario's own robot reports it.
         warnings.simplefilter("ignore", RobotFileWarning)
-        robot = replace(robot, leave_out=parts_to_leave_out(robot))
+        robot = replace(robot, leave_out=needs_of(robot)[1])
         plant = read()
         if not any(map(_has_room, joints_of(plant))):
             robot = replace(robot, leave_out=[*robot.leave_out, "empty_limits"])
@@ -284,7 +284,7 @@ def _folders_above(file: str) -> dict[str, str]:
     folders: dict[str, str] = {}
     with suppress(ModelError, ScenarioError, OSError, RuntimeError):  # The reader reports it.
         above = [*Path(file).resolve().parents]
-        for name in unknown_packages(Robot(file)):
+        for name in needs_of(Robot(file))[0]:
             beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
             found = [*(folder for folder in above if folder.name == name), *beside]
             folders.update({name: str(found[0])} if found else {})

@@ -3,6 +3,8 @@
 import gc
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -265,3 +267,29 @@ def test_a_plant_of_ones_own_that_fails_is_one_line(text, tmp_path, monkeypatch,
     own = ["--set", f"plant=!OwnPlant {{maker: '{name}:P'}}"]
     assert main(["simulate", "two_link_wall", *own, "--out", str(tmp_path / "run")]) == 1
     assert "ZeroDivisionError" in error_line(capsys)
+
+
+NO_HOME = """
+import os, pwd, sys
+def unknown(uid): raise KeyError(uid)
+pwd.getpwuid = unknown
+from drake_dae.cli import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.slow
+def test_neither_a_home_nor_a_backend_nor_an_open_stdout_is_needed(tmp_path):
+    words = ["simulate", "two_link_wall", "--out", tmp_path / "run", *SHORT]
+    words += ["--set", "write.animation=false", "--set", "write.plots=true"]
+    others = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME")}
+    shell = f'"{sys.executable}" -c "$0" "$@" >&-'
+    done = subprocess.run(
+        ["sh", "-c", shell, NO_HOME, *map(str, words)],
+        env=others | {"MPLBACKEND": "nonsense", "MPLCONFIGDIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / PLOTS[0]).exists()

@@ -141,7 +141,10 @@ def _cut(
     try:
         plant.RemoveJoint(joint)
     except RuntimeError as error:
-        raise ModelError(f"joint '{name}' closes a loop, and cannot be cut: {error}") from None
+        raise ModelError(
+            f"joint '{name}' closes a loop, and cannot be cut: {error} Springs stop it: "
+            "robot.leave_out takes them out, as [dynamics/spring_stiffness]"
+        ) from None
     return cut
 
 

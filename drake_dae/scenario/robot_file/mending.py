@@ -9,7 +9,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -37,22 +36,6 @@ _EMPTY = "shapes of size 0 are left out"
 _WITH_COMMA = re.compile(r"[-+.\deE\s]*\d,\d[-+.\deE,\s]*")
 
 
-class FloatingJoint(NamedTuple):
-    """A link that moves freely relative to a pose in its parent.
-
-    Attributes:
-        model: Its model, as in `Mender`.
-        name, parent, child: Of the joint and its links.
-        origin: The pose: a position in m, and roll, pitch and yaw in rad, shape (6,).
-    """
-
-    model: str
-    name: str
-    parent: str
-    child: str
-    origin: FloatArray
-
-
 @dataclass
 class Mender:
     """Makes mended copies of files, and collects what is to be known of them.
@@ -73,7 +56,8 @@ class Mender:
         armatures: (model, joint) -> rotor inertia at the joint, kg m^2 or kg.
         followers: (model, joint) -> the joint that it follows, the ratio, and the offset.
         standing: (model, joint) -> the position that a coupling gives it, in rad or m.
-        floating: The floating joints.
+        floating: Model, name, parent, child and pose of floating joints: x, y and z in m, and
+            roll, pitch and yaw in rad.
         crossed: (model, link) of which visual geometry is left out.
         parent_frames: (model, joint) -> the parent that an SDFormat file names.
         count: The number of files that were read.
@@ -94,7 +78,7 @@ class Mender:
     armatures: dict[tuple[str, str], float] = field(default_factory=dict)
     followers: dict[tuple[str, str], tuple[str, float, float]] = field(default_factory=dict)
     standing: dict[tuple[str, str], float] = field(default_factory=dict)
-    floating: list[FloatingJoint] = field(default_factory=list)
+    floating: list[tuple[str, str, str, str, FloatArray]] = field(default_factory=list)
     crossed: set[tuple[str, str]] = field(default_factory=set)
     parent_frames: dict[tuple[str, str], str] = field(default_factory=dict)
     count: int = 0
@@ -195,20 +179,20 @@ class Mender:
         drawn, why = path, ""
         if path is None:
             why = (
-                "is in a package that is neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH"
-                ", and whose folder robot.packages can name"
+                "is in a package neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH "
+                "(robot.packages can name its folder)"
             )
         elif not path.is_file():
             why = "is not there"
         elif not all_within(path, self.folders):
-            why = "is outside of the model's folder or package, and of those in robot.packages"
+            why = "is outside of the model's folder or package (robot.packages can name its folder)"
         elif kinds and (drawn := drawable(path, kinds)) is None:
-            why = "cannot be converted; pip install 'drake_dae[meshes]' converts more"
+            why = "cannot be converted (pip install 'drake_dae[meshes]' converts more)"
         elif collides and drawn is not None and not has_hull(drawn):
             why = "cannot be read by Drake"
         if not why:
             return drawn
-        items = self.omitted[f"geometry is left out, which no equation needs, since it {why}"]
+        items = self.omitted[f"geometry that {why} is left out; no equation needs it"]
         items.append(f"'{name if path is None else Path(name).name}'")
         return None
 
@@ -230,18 +214,12 @@ class Mender:
                 link.remove(shape)
             for owner, key in meshes if self.has_geometry else ():
                 text = _text(owner, key)
-                path, kinds = self.find(text, file), DRAWN
-                if path is not None and path.suffix.lower() == ".dae" and drawable(path) is None:
-                    kinds = ()  # Meshcat draws it.
-                path = self._mesh(
-                    path, text, not is_visual, kinds if is_visual and self.drawn else ()
-                )
-                if path is not None:
-                    _set_text(owner, key, str(path))
-                    continue
-                link.remove(shape)
-                if is_visual:
-                    self.crossed.add((model, name))
+                kinds = DRAWN if is_visual and self.drawn else ()
+                path = self._mesh(self.find(text, file), text, not is_visual, kinds)
+                _set_text(owner, key, str(path))
+                if path is None:
+                    link.remove(shape)
+                    self.crossed |= {(model, name)} if is_visual else set()
             for owner, key in _files(shape, "material", ("texture", "drake:diffuse_map")):
                 path = self.find(_text(owner, key), file)
                 if path is not None and path.is_file() and all_within(path, self.folders):
@@ -257,7 +235,9 @@ class Mender:
         for mimic in [part for part in joint if part.tag == tag]:
             ratio = number_in(mimic.get("multiplier", "1"))
             offset = number_in(mimic.get("offset", "0"))
-            if ratio == 0.0 and offset is not None:
+            if joint.get("type") in ("planar", "floating", "universal", "ball"):
+                self.lost[f"joint/{tag}"].append(f"joint '{name}'")
+            elif ratio == 0.0 and offset is not None:
                 self.changed["joints that follow others with multiplier 0 stand"] += [f"'{name}'"]
                 self.standing[model, name] = offset
                 joint.remove(mimic)
@@ -284,24 +264,26 @@ class Mender:
                 numbers = [number_in(word) for word in text.split()]
                 if len(numbers) != 6 or None in numbers:
                     raise ModelError(f"joint '{name}': its origin is six numbers, got '{text}'")
-                where = np.array(numbers, float)
-                self.floating.append(FloatingJoint(model, name, parent, child, where))
+                self.floating.append((model, name, parent, child, np.array(numbers, float)))
             if kind == "fixed":
                 _remove(joint, "mimic")
             self._follow(model, joint, "mimic")
             for limit in joint.iterfind("limit"):
-                effort = number_in(limit.get("effort", ""))
-                if effort:  # Many authors write 0 for an unknown limit.
+                effort = number_in(limit.get("effort", "")) or 0.0
+                if effort > 0.0:
                     self.efforts[model, name] = effort
-                elif effort == 0.0:
+                elif "effort" in limit.attrib:  # Many authors write 0 for an unknown limit.
                     still.add(name)
-        joints, count = {joint.get("name") for joint in root.iterfind("joint")}, Counter[str]()
+        moving = [joint for joint in root.iterfind("joint") if joint.get("type") != "fixed"]
+        joints, count = {joint.get("name") for joint in moving}, Counter[str]()
         for transmission in root.findall("transmission"):
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
             if driven & still and self.drives:
-                self.lost["transmission/joint"].append(f"{', '.join(map(str, driven))}: effort 0")
-            if not has_type or (driven and not driven & joints):
+                self.lost["transmission/joint"] += [
+                    f"joint '{joint}': effort 0" for joint in driven
+                ]
+            if not has_type or not driven & joints:
                 root.remove(transmission)
                 continue
             for actuator in transmission.iterfind("actuator"):  # Their names may be equal.
@@ -368,7 +350,7 @@ class Mender:
             elif mjcf.ARMATURE not in self.leave_out:
                 self.lost[mjcf.ARMATURE].append(f"{file.name}: of a joint that no motor can drive")
         for name, joint in mjcf.floating_bodies(root, placed):
-            self.floating.append(FloatingJoint(model, joint, "world", name, np.zeros(6)))
+            self.floating.append((model, joint, "world", name, np.zeros(6)))
 
 
 def _check_values(root: Element, place: Callable[[Element], str]) -> None:

@@ -112,18 +112,15 @@ def has_hull(mesh: Path) -> bool:
 
 
 def drawable(mesh: Path, kinds: tuple[str, ...] = DRAWN) -> Path | None:
-    """A mesh, or its copy, of a kind that is drawn; None if there is none.
-
-    Copies are removed when Python exits.
-    """
+    """A mesh, or a copy until Python exits, of a kind that is drawn; None if there is none."""
     if mesh.suffix.lower() in kinds:
         return mesh
     try:
         name, changed, size = check_file(mesh.resolve(), ModelError)
         is_scene = mesh.suffix.lower() == ".dae" and ".gltf" in kinds
         return _converted(Path(name), ".gltf" if is_scene else ".obj", changed, size)
-    except ModelError:
-        return None
+    except ModelError:  # Meshcat draws a .dae.
+        return mesh if mesh.suffix.lower() == ".dae" and ".gltf" in kinds else None
 
 
 @cache

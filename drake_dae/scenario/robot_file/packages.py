@@ -26,7 +26,7 @@ class RobotFiles:
         main: The file.
         packages: The packages of Drake's parser.
         folders: The folders from which geometry is read: those of the model and its packages.
-        missing: Package that is not found -> a file that names it.
+        missing: The packages that are not found.
 
     Args:
         robot: The key `robot` of the scenario.
@@ -37,7 +37,7 @@ class RobotFiles:
     """
 
     def __init__(self, robot: Robot, packages: PackageMap) -> None:
-        self.missing: dict[str, Path] = {}
+        self.missing: set[str] = set()
         self.packages = packages
         self._places = [
             *(Path(part) for part in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)),
@@ -50,19 +50,17 @@ class RobotFiles:
                     packages.Add(name, folder)
                 except RuntimeError as error:
                     raise ModelError(f"no package in '{folder}': {error}") from None
-        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
         self.folders = [FOLDER / "models", *map(Path, robot.packages.values())]
         self.folders += [Path(GetDrakePath()), Path(cache) / "drake" / "package_map"]
-        main: Path | None = Path(robot.file)
+        main = Path(robot.file)
         if robot.description:
             with at("robot.description"):
                 main, described = described_robot(robot.description)
                 self.folders += described[:2]
                 self._places += described
         elif "://" in robot.file:
-            main = self.find(robot.file, Path())
-        if main is None:
-            raise ModelError(self.unknown_packages())
+            main = self.needed(robot.file, Path())
         try:
             is_there = main.is_file()
         except (OSError, ValueError):  # A null byte.
@@ -91,7 +89,7 @@ class RobotFiles:
         if not self.packages.Contains(package):
             folder = self._folder_of(package, file)
             if folder is None:
-                self.missing.setdefault(package, file)
+                self.missing.add(package)
                 return None
             self.packages.Add(package, str(folder))
             self.folders.append(folder)
@@ -113,16 +111,18 @@ class RobotFiles:
         inside = (place / package for place in self._places if str(place) != ".")
         return next((folder for folder in inside if folder.is_dir()), None)
 
-    def unknown_packages(self) -> str:
-        """The message for packages that are not found."""
-        name, file = next(iter(self.missing.items()))
-        others = f" (nor are {', '.join(list(self.missing)[1:])})" if len(self.missing) > 1 else ""
-        return (
-            f"unknown package '{name}': it is neither beside '{file.name or name}', as a folder "
-            f"with a package.xml, nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH{others}; name its "
-            f"folder under robot.packages, as packages: {{{name}: <folder>}}, so that "
-            f"package://{name}/a is <folder>/a"
-        )
+    def needed(self, name: str, file: Path) -> Path:
+        """The path of a URL or a name in a file."""
+        path = self.find(name, file)
+        if path is None:
+            package = name.split("://")[-1].split("/")[0]
+            raise ModelError(
+                f"unknown package '{package}' in '{name}': it is neither beside the file, as a "
+                "folder with a package.xml, nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; name its "
+                f"folder under robot.packages, as packages: {{{package}: <folder>}}, so that "
+                f"package://{package}/a is <folder>/a"
+            )
+        return path
 
 
 def _package_name(folder: Path) -> str:

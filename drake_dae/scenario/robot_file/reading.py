@@ -69,8 +69,9 @@ def read_robot(
     parser = Parser(plant)
     files = RobotFiles(robot, parser.package_map())
     with TemporaryDirectory() as folder:
-        mender = _mender(robot, files, Path(folder).resolve())
+        mender = Mender(files.find, files.folders, robot.leave_out, robot.actuators is None)
         mender.has_geometry, mender.drawn = scene_graph is not None, drawn
+        mender.folder = Path(folder).resolve()
         with drake_errors(mender.originals):
             models = _mended(robot, files, mender)
             if mender.lost:
@@ -100,27 +101,13 @@ def read_robot(
     return plant, mender
 
 
-def parts_to_leave_out(robot: Robot) -> list[str]:
-    """What `robot.leave_out` needs to name, so that the robot's file can be read."""
-    return [*robot.leave_out, *_looked_at(robot)[1].lost]
-
-
-def unknown_packages(robot: Robot) -> list[str]:
-    """The packages that the robot's file names, and that are not found."""
-    return list(_looked_at(robot)[0].missing)
-
-
-def _looked_at(robot: Robot) -> tuple[RobotFiles, Mender]:
+def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
+    """The packages that a robot's file names and that are not found, and what is lost of it."""
     files = RobotFiles(robot, Parser(MultibodyPlant(0.0)).package_map())
-    mender = _mender(robot, files, None)
+    mender = Mender(files.find, files.folders, robot.leave_out, robot.actuators is None)
     with drake_errors():
         _mended(robot, files, mender)
-    return files, mender
-
-
-def _mender(robot: Robot, files: RobotFiles, folder: Path | None) -> Mender:
-    is_driven = robot.actuators is not None
-    return Mender(files.find, files.folders, robot.leave_out, not is_driven, folder=folder)
+    return list(files.missing), list(mender.lost)
 
 
 def _mended(robot: Robot, files: RobotFiles, mender: Mender) -> Path | ModelDirectives:
@@ -136,9 +123,7 @@ def _mended(robot: Robot, files: RobotFiles, mender: Mender) -> Path | ModelDire
     for directive in directives.directives:
         if (model := directive.add_model) is None:
             continue
-        file = files.find(model.file, files.main)
-        if file is None:
-            raise ModelError(files.unknown_packages())
+        file = files.needed(model.file, files.main)
         links = [link.removeprefix(f"{model.name}::") for link in placed]
         model.file = mender.copy(file, model.name, links).as_uri()
     return directives
@@ -151,9 +136,7 @@ def _find_packages(files: RobotFiles, file: Path, within: tuple[Path, ...]) -> N
         raise ModelError(f"'{file.name}' includes itself: {names}")
     for directive in LoadModelDirectives(str(file)).directives:
         if directive.add_directives is not None:
-            inner = files.find(directive.add_directives.file, file)
-            if inner is None:
-                raise ModelError(files.unknown_packages())
+            inner = files.needed(directive.add_directives.file, file)
             _find_packages(files, inner, (*within, file))
 
 
@@ -199,22 +182,20 @@ def _add_floating_joints(plant: MultibodyPlant, mender: Mender) -> None:
 
     No constraint force keeps the length of a quaternion at 1.
     """
-    for joint in mender.floating:
-        models = _instance(plant, joint.model)
-        is_world = joint.parent == "world"
-        parent = plant.world_body() if is_world else plant.GetBodyByName(joint.parent, *models)
-        body = plant.GetBodyByName(joint.child, *models)
+    for model, name, parent, child, pose in mender.floating:
+        models = _instance(plant, model)
+        is_world = parent == "world"
+        above = plant.world_body() if is_world else plant.GetBodyByName(parent, *models)
+        body = plant.GetBodyByName(child, *models)
         start = plant.GetDefaultFloatingBaseBodyPose(body)
-        pose = RigidTransform(RollPitchYaw(joint.origin[3:]), joint.origin[:3])
+        origin = RigidTransform(RollPitchYaw(pose[3:]), pose[:3])
         frame = plant.AddFrame(
-            FixedOffsetFrame(
-                f"{joint.name}_origin", parent.body_frame(), pose, body.model_instance()
-            )
+            FixedOffsetFrame(f"{name}_origin", above.body_frame(), origin, body.model_instance())
         )
-        added = plant.AddJoint(RpyFloatingJoint(joint.name, frame, body.body_frame()))
+        joint = plant.AddJoint(RpyFloatingJoint(name, frame, body.body_frame()))
         if is_world:
-            added.SetDefaultPose(start)
+            joint.SetDefaultPose(start)
         mender.changed[
             "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place "
             "of a quaternion, and must not pitch by 90 degrees"
-        ].append(f"'{joint.name}'")
+        ].append(f"'{name}'")

@@ -360,7 +360,7 @@ def test_a_transmission_without_effort_needs_actuators(tmp_path):
     (tmp_path / "arm.yaml").write_text(FRICTION)
     links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
     np.testing.assert_array_equal(links.effort_limits, [np.inf])
-    with pytest.raises(ScenarioError, match=r"robot\.file: .*\(j: .*robot\.actuators"):
+    with pytest.raises(ScenarioError, match=r"robot\.file: .*'j'.*robot\.actuators"):
         scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.actuators=null"]))
 
 
