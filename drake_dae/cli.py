@@ -58,6 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is not None:
         return _main(arguments)
     gc.set_threshold(YOUNG)
+    os.environ["MPLBACKEND"] = "agg"  # No command opens a window of Matplotlib's.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 (as long as the process)
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     try:
         return _main(sys.argv[1:])
     finally:

@@ -61,7 +61,7 @@ def simulation_error(
         case FailureKind.OVERFLOW:
             return NonFiniteError(
                 f"{failure.function}: its input {bad} is beyond all measure {where}: it grows "
-                "without bound. Check the gains and the errors of the model",
+                "without bound",
                 time,
                 state,
             )

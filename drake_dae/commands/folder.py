@@ -27,7 +27,10 @@ def load_run(path: Path) -> Record:
     names = [name for name in (RECORD, PART) if (path / name).is_file()]
     if path.is_dir() and not names:
         raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
-    return Record.load(path / names[0] if names else path)
+    record = Record.load(path / names[0] if names else path)
+    if not record.time.size:
+        raise ModelError(f"the record in '{path}' has no rows")
+    return record
 
 
 def runs_by_name(paths: Sequence[Path]) -> dict[str, Path]:

@@ -26,8 +26,8 @@ class Parser(argparse.ArgumentParser):
         """Adds a file or a folder; "", as from an unset variable of the shell, is refused."""
 
         def made(given: str) -> Path:
-            if not given:
-                raise argparse.ArgumentTypeError("a name is needed, got ''")
+            if not given or "\0" in given:
+                raise argparse.ArgumentTypeError(f"a name is needed, got {given!r}")
             return Path(given)
 
         self.add_argument(name, type=made, metavar=metavar, help=text, **more)

@@ -85,7 +85,11 @@ def _run_again(folder: Path) -> tuple[ClosedLoop, Context, Record]:
     if not (folder / SCENARIO).is_file():
         raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
     record = load_run(folder)
-    return *build_scenario(load_scenario(folder / SCENARIO)), record
+    loop, context = build_scenario(load_scenario(folder / SCENARIO))
+    if missing := loop.record(context).signals.keys() - record.signals.keys():
+        names = ", ".join(sorted(missing))
+        raise ModelError(f"the record in '{folder}' has not the signals of its loop: {names}")
+    return loop, context, record
 
 
 def _play_options(parser: Parser) -> None:

@@ -61,9 +61,11 @@ class RobotModel:
         links: The links, which provide M, H and the frames.
         constraints: The constraints phi in their order; none for a robot in free motion. Those of
             the links' MultibodyPlant are appended: see `plant_constraints`.
-        outputs: The position outputs h_1 in their order.
+        outputs: The position outputs h_1 in their order; None for a robot that is only simulated,
+            without force outputs unless `forces` names them.
         nominal_positions: A configuration of the robot at work, shape (nq,), near which the
-            structure is examined; `links.default_positions` if None.
+            structure is examined; `links.default_positions` if None, or, if no configuration on the
+            constraints is near them, a random one that is.
         name: The robot's name in messages.
         actuation: The stages from the joints toward the motor; none for rigid joints.
         forces: The force outputs z_2, in their order: names of constraint forces, and combinations
@@ -100,8 +102,8 @@ class RobotModel:
     def __init__(
         self,
         links: Links,
-        constraints: Sequence[Constraint],
-        outputs: Sequence[PositionOutput],
+        constraints: Sequence[Constraint] = (),
+        outputs: Sequence[PositionOutput] | None = None,
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
@@ -115,12 +117,12 @@ class RobotModel:
         self.links = links
         all_constraints = (*constraints, *plant_constraints(links))
         self.constraints = tuple(constraint.moving(exogenous) for constraint in all_constraints)
-        self.outputs = tuple(outputs)
+        self.outputs = tuple(outputs or ())
         self.name = name
         self.known_forces = tuple(known_forces)
         bound = ConstraintSet(self.constraints)
-        if forces is None and not (links.actuator_signals or bound.motors):
-            forces = ()  # The robot has no actuators and is only simulated.
+        if forces is None and (outputs is None or not (links.actuator_signals or bound.motors)):
+            forces = ()  # The robot is only simulated.
         self.forces = force_outputs(forces, bound)
         S = force_rows(self.forces, bound, links)  # (40)
         self._num_forces = S.shape[0]
@@ -172,6 +174,11 @@ class RobotModel:
         self.placing = StaticPlacement(self.dae, links.q, phi, h_1)
         chosen = self.dae.m[h_1.numel() :, :]
         self.balance = StaticBalance(self.dae, links, chosen, bool(self.stages))
+        if nominal_positions is None:
+            self.nominal_positions = nominal = self._on_constraints(nominal)
+            nominal_state = self.dae.nominal_state.copy()
+            nominal_state[: nominal.size] = nominal
+            self.dae = replace(self.dae, nominal_state=nominal_state)
         if self.stages:
             self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
 
@@ -179,8 +186,8 @@ class RobotModel:
     def from_multibody(
         cls,
         plant: MultibodyPlant,
-        constraints: Sequence[Constraint],
-        outputs: Sequence[PositionOutput],
+        constraints: Sequence[Constraint] = (),
+        outputs: Sequence[PositionOutput] | None = None,
         nominal_positions: ArrayLike | None = None,
         name: str = "robot",
         actuation: Sequence[Stage] = (),
@@ -319,6 +326,19 @@ class RobotModel:
     def _nominal(self, positions: ArrayLike | None) -> FloatArray:
         nominal = self.links.default_positions if positions is None else positions
         return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
+
+    def _on_constraints(self, default: FloatArray) -> FloatArray:
+        """The default configuration, or a random one if none on the constraints is near it."""
+        low, high = np.clip(self.links.position_limits, default - np.pi, default + np.pi)
+        random = np.random.default_rng(0)
+        for guess in (default, *random.uniform(low, np.maximum(low, high), (20, default.size))):
+            with suppress(InconsistentStateError):
+                q = self.configuration(None, guess)
+                return default if guess is default else q
+        raise ModelError(
+            f"{self.name}: no configuration on the constraints is found from the default one, nor "
+            "from 20 random ones; give nominal_positions near one, or check the constraints"
+        )
 
     def _nominal_rest(self, nominal: FloatArray) -> FloatArray:
         """The state at rest on the constraints, with unstrained shafts."""

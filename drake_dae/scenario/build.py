@@ -25,11 +25,10 @@ from drake_dae.references import Reference
 from drake_dae.robots.known_forces import ScaledForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.advice.advice import advised
-from drake_dae.scenario.advice.sticking import sticking_before
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.controllers.task_controller import check_task, task_controller
 from drake_dae.scenario.forms.keys import at, each, violated
+from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, references_of
 from drake_dae.scenario.parts.parts import Poles
@@ -141,8 +140,7 @@ def build_completed(
         with at(" or ".join(keys) or "start.positions"):
             loop = make_closed_loop(plant, law, references, settings, **drawn)
     loop.memory["gains"] = {repr(scenario.law.gains): None}  # Those of the law.
-    notes = [*completed.notes, *chosen.notes, sticking_before(scenario, model, structure)]
-    return Completed(scenario, tuple(filter(None, notes))), loop
+    return Completed(scenario, (*completed.notes, *chosen.notes)), loop
 
 
 def make_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> Plant:

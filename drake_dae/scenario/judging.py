@@ -33,11 +33,10 @@ from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.links_behind import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.advice.advice import advised
-from drake_dae.scenario.advice.sticking import sticking_note
 from drake_dae.scenario.build import tracking_law
 from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
 from drake_dae.scenario.robot_file.links import RobotLinks
@@ -84,7 +83,6 @@ class Feasibility:
         is_resolved: Whether the times resolve the reference; otherwise values between them are not
             known.
         behind: Links that move behind a contact surface.
-        sticking: A sentence if fixed steps are too long for a contact to stick, else empty.
         gains: Why no gains can be computed where they are left out, else empty.
         slowing: How much slower the references keep all limits; None where they keep them.
     """
@@ -94,7 +92,6 @@ class Feasibility:
     ranges: tuple[SignalRange, ...] = ()
     is_resolved: bool = True
     behind: tuple[LinkBehind, ...] = ()
-    sticking: str = ""
     gains: str = ""
     slowing: LimitsAlong | None = None
 
@@ -146,7 +143,6 @@ class Feasibility:
             "resolved": self.is_resolved,
             **{key: [r.to_dict() for r in ranges] for key, ranges in groups.items()},
             "behind": [asdict(link) for link in self.behind],
-            "sticking": self.sticking,
             "slowing": None if self.slowing is None else asdict(self.slowing),
             "problems": list(self.problems),
         }
@@ -177,8 +173,6 @@ class Feasibility:
                     "known. A shorter duration takes them closer together."
                 )
             parts.append([text])
-        if self.sticking:
-            parts.append([self.sticking])
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])
         return parts
 
@@ -272,7 +266,6 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
         limits.ranges(motion.times, values),
         is_resolved,
         links_behind(model, motion.times, motion.states, motion.parameters),
-        sticking_note(scenario, model, motion.states, motion.constraint_inputs),
         gains,
         slowing,
     )

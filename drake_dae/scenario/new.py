@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, log10, pi
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 from typing import Any, Literal
 
 import casadi as ca
@@ -48,7 +48,7 @@ from drake_dae.scenario.postures import Posture, Postures, tool_axis
 from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.robot_file.loops import actuators_of, closing_joints, joints_of
-from drake_dae.scenario.robot_file.reading import parts_to_leave_out, read_robot, unknown_packages
+from drake_dae.scenario.robot_file.reading import needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
@@ -114,7 +114,7 @@ def new_scenario(
         folder: The folder in which the text will be saved: a robot's file below it gets a name
             relative to it. Without one the name is absolute, and the text may be saved anywhere.
         progress: Called with a phrase on each step.
-        seconds: After this time by the clock no further place is tried.
+        seconds: After this processor time no further place is tried.
 
     Returns:
         The scenario, and its text with a comment on each choice; `load_scenario` reads the same
@@ -125,7 +125,7 @@ def new_scenario(
             message lists the places that were tried.
     """
     progress("reading the robot")
-    end = perf_counter() + seconds
+    end = process_time() + seconds
     is_url = file.startswith("package://")
     with at("robot.file"):
         robot, tip, point, why = _robot(
@@ -140,7 +140,7 @@ def new_scenario(
     for fraction, place in product(_FRACTIONS, places[:_PLACES]):
         scenario = _scenario(robot, tip, point, place, names, surface, fraction)
         name, center = scenario.constraints[0].name, place.center
-        if tried and perf_counter() > end:
+        if tried and process_time() > end:
             break
         progress(f"trying a {name} at {center} m")
         try:
@@ -236,7 +236,10 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, dict
             locked[names[joint.index()]] = float(min(max(0.0, low), high))
     why["locked"] = "m or rad; all that is not of the chain, or mimics"
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
-    actuators = None if all(joint.index() in driven for joint in chain) else "all"
+    is_driven = all(joint.index() in driven for joint in chain)
+    # Motors that Drake does not read are no loss where the scenario names the driven joints.
+    is_driven &= not needs_of(replace(robot, actuators=None))[1]
+    actuators = None if is_driven else "all"
     why["actuators"] = "that are not locked: the file drives not all of them"
     directions = _directions(plant, chain, tip, point)
     if not any(point) and directions < min(len(chain), 3):
@@ -267,7 +270,7 @@ def _read(file: str) -> tuple[MultibodyPlant, Robot]:
 
     with warnings.catch_warnings():  # The scenario's own robot reports it.
         warnings.simplefilter("ignore", RobotFileWarning)
-        robot = replace(robot, leave_out=parts_to_leave_out(robot))
+        robot = replace(robot, leave_out=needs_of(robot)[1])
         plant = read()
         if not any(map(_has_room, joints_of(plant))):
             robot = replace(robot, leave_out=[*robot.leave_out, "empty_limits"])
@@ -280,7 +283,7 @@ def _folders_above(file: str) -> dict[str, str]:
     folders: dict[str, str] = {}
     with suppress(ModelError, ScenarioError, OSError, RuntimeError):  # The reader reports it.
         above = [*Path(file).resolve().parents]
-        for name in unknown_packages(Robot(file)):
+        for name in needs_of(Robot(file))[0]:
             beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
             found = [*(folder for folder in above if folder.name == name), *beside]
             folders.update({name: str(found[0])} if found else {})

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import brief
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.errors import ModelError
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.robot import Payload
@@ -202,10 +202,14 @@ class OwnPlant(ScenarioPlant):
         with at("plant.maker"):
             try:
                 kind = getattr(import_module(module), name)
-            except (ImportError, AttributeError) as error:
-                raise ModelError(f"'{self.maker}' cannot be loaded: {error}") from error
-            if not (isinstance(kind, type) and issubclass(kind, Plant)):
+                plant = kind(robot.model, robot.structure)
+            except DrakeDaeError:
+                raise
+            except Exception as error:
+                what = f"{type(error).__name__}: {error}"
+                raise ModelError(f"'{self.maker}' cannot be loaded and made: {what}") from error
+            if not isinstance(plant, Plant):
                 raise ModelError(
-                    f"'{self.maker}' is no class that keeps the contract of drake_dae.Plant"
+                    f"'{self.maker}' makes no plant that keeps the contract of drake_dae.Plant"
                 )
-            return kind(robot.model, robot.structure)
+            return plant

@@ -55,7 +55,11 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
             of_law = _of_law(loop, parameters)
             state = start_state(scenario, model, outputs, parameters, of_law)
             moving = _in_motion(loop, context, outputs, state) if scenario.exogenous else state
-            plant.set_consistent_state(at_plant, moving)
+            moving, speeds = moving.copy(), model.links.velocity_signals
+            for name, value in scenario.start.velocities.items():
+                with at("start.velocities"):
+                    moving[model.links.q.numel() + index_of(name, speeds, "velocity")] = value
+            plant.set_consistent_state(at_plant, moving, [*scenario.start.velocities])
     if loop.sensor is not None:
         force = model.rest_forces(state[: model.links.q.numel()], forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)

@@ -37,8 +37,8 @@ from drake_dae import (
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import DrakeDaeError
 from drake_dae.scenario import plants
-from drake_dae.scenario.advice.advice import advised
 from drake_dae.scenario.build import build_completed, make_plant
+from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.start import start_scenario
 

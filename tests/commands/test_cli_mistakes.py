@@ -3,6 +3,8 @@
 import gc
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -244,3 +246,50 @@ def test_all_is_there_but_an_animation_that_finds_no_port(tmp_path, monkeypatch,
     assert error_line(capsys) == f"error: {tmp_path}/animation.html: {reason}"
     left = ["record.npz", "scenario.yaml", "summary.txt"]
     assert sorted(path.name for path in tmp_path.iterdir()) == left
+
+
+@pytest.mark.parametrize("rows", [0, 3])
+@pytest.mark.parametrize("kind", ["--film", "--all", "--errors"])
+def test_a_record_without_rows_or_the_signals_of_its_loop_is_one_line(kind, rows, tmp_path, capsys):
+    (tmp_path / "scenario.yaml").write_text(find_scenario("two_link_wall").read_text())
+    Record(np.arange(float(rows)), {}).save(tmp_path / "record.npz")
+    assert (
+        main(["plot", kind, str(tmp_path), *[f"--out={tmp_path}/a.png"] * (kind != "--all")]) == 1
+    )
+    assert error_line(capsys)
+
+
+@pytest.mark.parametrize("text", ["1 / 0", "class P:\n    def __init__(self, *_):\n        1 / 0"])
+def test_a_plant_of_ones_own_that_fails_is_one_line(text, tmp_path, monkeypatch, capsys):
+    name = f"plants_{abs(hash(text))}"
+    (tmp_path / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    own = ["--set", f"plant=!OwnPlant {{maker: '{name}:P'}}"]
+    assert main(["simulate", "two_link_wall", *own, "--out", str(tmp_path / "run")]) == 1
+    assert "ZeroDivisionError" in error_line(capsys)
+
+
+NO_HOME = """
+import os, pwd, sys
+def unknown(uid): raise KeyError(uid)
+pwd.getpwuid = unknown
+from drake_dae.cli import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.slow
+def test_neither_a_home_nor_a_backend_nor_an_open_stdout_is_needed(tmp_path):
+    words = ["simulate", "two_link_wall", "--out", tmp_path / "run", *SHORT]
+    words += ["--set", "write.animation=false", "--set", "write.plots=true"]
+    others = {k: v for k, v in os.environ.items() if k not in ("HOME", "XDG_CACHE_HOME")}
+    shell = f'"{sys.executable}" -c "$0" "$@" >&-'
+    done = subprocess.run(
+        ["sh", "-c", shell, NO_HOME, *map(str, words)],
+        env=others | {"MPLBACKEND": "nonsense", "MPLCONFIGDIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / PLOTS[0]).exists()

@@ -17,10 +17,9 @@ from drake_dae import (
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import plants
-from drake_dae.scenario.advice.advice import advised
-from drake_dae.scenario.advice.sensed import sensed_contact
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.gains import advised, sensed_contact
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.parts import parts as parts
@@ -80,26 +79,6 @@ def test_encoders_are_estimated_at_rates_for_their_noise():
     assert differences.estimator.state_rate is None
     own = chosen(two_link("sensors.encoders={resolution: 1.0e-6}", "estimator={rate: 20.0}"))
     assert own.estimator.state_rate is None
-
-
-@pytest.mark.slow
-def test_another_bandwidth_of_differences_is_named_if_it_is_much_better():
-    """The named bandwidth has gains with the errors of the message, and no other is better."""
-    wide, narrow = "velocity_bandwidth: 500", "velocity_bandwidth: 50"
-    (note,) = build_completed(two_link(f"sensors.encoders={{resolution: 1.0e-4, {wide}}}"))[0].notes
-    told = re.search(
-        r"velocity_bandwidth of (\S+) rad/s in place of 500 the errors of one direction are "
-        r"(\S+ mm and \S+ N)",
-        note,
-    )
-    better = f"sensors.encoders={{resolution: 1.0e-4, velocity_bandwidth: {told[1]}}}"
-    (note,) = build_completed(two_link(better))[0].notes
-    assert f"the best for one direction alone: {told[2]} rms" in note
-    assert "in place of" not in note
-    with pytest.raises(ScenarioError, match="velocity_bandwidth") as raised:
-        chosen(two_link(f"sensors.encoders={{resolution: 1.0e-4, {narrow}}}"))
-    wider = re.search(r"or let velocity_bandwidth be (\S+) rad/s", str(raised.value))[1]
-    chosen(two_link(f"sensors.encoders={{resolution: 1.0e-4, velocity_bandwidth: {wider}}}"))
 
 
 def test_a_roughness_without_use_is_refused():

@@ -93,24 +93,19 @@ class Observation:
     not known, the derivatives of S^T dg/dmu v with respect to the velocities at rest, which span
     the same. The momentum cannot distinguish it from d.
 
-    Attributes:
-        momentum: (x, u, v, parameters) -> p, its rate without inputs and d, and the part from the
-            inputs, S^T (h u + g v); shape (k,) each.
-        friction: (x, v, parameters) -> the friction force per unit of each coefficient, C = S^T
-            dg/dmu v, shape (k, c), and the sliding speed from the power of friction, in m/s, shape
-            (c,).
-        directions: (x, v, parameters) -> Q = 1 + S^T g dalpha/dd, shape (k, k), where Q d is d with
-            the reaction of the constraints; and T of each contact, side by side.
-        metric: (x, d, parameters) -> W d with W = Q^T E^-1 Q, where d^T W d is the squared
-            acceleration caused by d in the metric of kinetic energy, shape (k,).
-        widths: The number of columns of T of each contact.
-        wanted: (x, R, t, parameters) -> x with the velocities that the reference has a time t
-            later, r' + t r'', on the constraints, shape (n,). None if outputs and constraints do
-            not determine the velocities.
-        moving: (x, parameters) -> R with the present rates r' of the outputs, and zeros otherwise.
-        rows: The states whose rates contain d.
-        frictions: The names of the coefficients of friction, and the constraint input of each.
-        identified: The other parameters that are estimated.
+    The functions take x first and the parameters last:
+
+        momentum(x, u, v):    p, its rate without inputs and d, and S^T (h u + g v), (k,) each;
+        friction(x, v):       C = S^T dg/dmu v, (k, c), and the sliding speeds in m/s, (c,);
+        directions(x, v):     Q = 1 + S^T g dalpha/dd, where Q d is d with the reaction of the
+                              constraints, and T of each contact, of `widths` columns, side by side;
+        metric(x, d):         W d with W = Q^T E^-1 Q: d^T W d is the squared acceleration by d;
+        wanted(x, R, t):      x with the velocities r' + t r'' of the reference, on the constraints;
+                              None if outputs and constraints do not determine the velocities;
+        moving(x):            R with the present rates r' of the outputs, and zeros otherwise.
+
+    `rows` are the states whose rates contain d, `frictions` the coefficients of friction with the
+    constraint input of each, `identified` the other parameters that are estimated.
     """
 
     momentum: TracedFunction

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers
+from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae.manifold.newton_steps import FOUND, STAYS, shortest_step, trace_first_steps
-from drake_dae.dae.manifold.settling import Settling
+from drake_dae.dae.manifold.settling import CONSISTENT, Settling
 from drake_dae.dae.system.layout import DerivativeLayout, Indices
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
@@ -19,12 +19,14 @@ from drake_dae.trace.functions import TracedFunction, count_operations
 from drake_dae.trace.newton import NewtonModel, newton, norm, shortest_steps
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
-CONSISTENT = 1e-8
-"""A state counts as consistent, and is projected without a message, if its distance from N*
-relative to its size is at most this; where gradients are dependent, if its residual is."""
-
 PROBE = 1e-4
 """The distance at which poles show, in states over their scale."""
+
+RESTARTS = 12
+"""The number of random starts of `Manifold.settle`."""
+
+FAR = 100.0
+"""A velocity is kept if no state moves further for it than so many times the size of the state."""
 
 FLOOR = 1e-12
 """A distance from N* that is round-off even if all states are zero."""
@@ -251,22 +253,71 @@ class Manifold:
             )
         return text + "Start nearer to the constraint, away from its singular states"
 
-    def settle(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+    def settle(
+        self,
+        state: ArrayLike,
+        parameters: ArrayLike | None = None,
+        fixed: Sequence[str] = (),
+    ) -> FloatArray:
         """Returns the consistent state next to a user's start, computed level by level.
 
         The constraints are met first, by the states that they depend on; then their derivatives, by
         the states that are new in them, and so on: positions first, then velocities, so that no
-        velocity moves a position. If this does not converge, `project` is used. Arguments, result
-        and exceptions are those of `project`.
+        velocity moves a position. Velocities that are not zero are kept where the constraints allow
+        it, and the others follow. If Newton's method does not reach N*, it starts again from random
+        states, at first near the given one.
+
+        Args:
+            state: A state near N*, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+            fixed: Names of states that keep their values.
+
+        Raises:
+            InconsistentStateError: N* is not reached, or not with these states fixed.
+            ModelError: There is no such state, or a shape is wrong.
         """
         start, p = self._state(state), self.system.parameter_vector(parameters)
+        names = [signal.name for signal in self.system.state_signals]
+        for name in fixed:
+            if name not in names:
+                raise ModelError(unknown_name("state", name, names))
         if not self.residual_function.evaluate(start, p)[0].any():
             return start
         near = self.first_steps(start, p)
         if near is not None and 0.0 < self._first_steps.outputs[0][1] <= FLOOR:
             return self.project(start, p)  # It was there up to round-off, which no level moves.
-        settled = self._settling.settled(start, p)
-        return self.project(start if settled is None else settled, p)
+        chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
+        error = InconsistentStateError(
+            f"{self.system.name}: no consistent state is found near the given one in which "
+            f"{', '.join(fixed)} keep their values; fix fewer states, or give others",
+            self.residual_function.evaluate(start, p)[0].copy(),
+        )
+        random = np.random.default_rng(0)
+        for spread in (0.0, *np.geomspace(0.1, 3.0, RESTARTS)):
+            moved = start.copy()
+            free = np.setdiff1d(self._settling.places, chosen)
+            moved[free] += spread * self.scale[free] * random.normal(size=free.size)
+            try:
+                return self._settled(moved, p, chosen, is_last=not fixed)
+            except InconsistentStateError as failure:
+                error = error if fixed or spread else failure
+        raise error
+
+    def _settled(
+        self, start: FloatArray, p: FloatArray, chosen: Indices, is_last: bool
+    ) -> FloatArray:
+        """The consistent state next to a start; chosen states, and if possible velocities, stay."""
+        given = np.union1d(chosen, self._settling.given_rates(start))
+        for kept in (given, chosen) if given.size > chosen.size else (chosen,):
+            found = self._settling.settled(start, p, kept)
+            if found is None:
+                continue
+            far = norm((found - start) / self.scale)
+            if kept is chosen or far <= FAR * norm(start / self.scale):
+                return self.project(found, p)
+        if not is_last:
+            raise InconsistentStateError("", np.zeros(0))
+        return self.project(start, p)
 
     def _state(self, state: ArrayLike) -> FloatArray:
         """A state as a new array; its numbers need not be finite."""

@@ -7,7 +7,7 @@ units, and coordinates on which no constraint force acts do not change.
 """
 
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -20,6 +20,10 @@ from drake_dae.trace.newton import NewtonModel, newton, shortest_steps, steps_al
 
 if TYPE_CHECKING:
     from drake_dae.dae.manifold.manifold import Manifold
+
+CONSISTENT = 1e-8
+"""A state counts as consistent, and is projected without a message, if its distance from N*
+relative to its size is at most this; where gradients are dependent, if its residual is."""
 
 ALONG = 1e-6
 """Constraint forces do no work if they are along the gradients to this, as the sine of an angle."""
@@ -141,20 +145,45 @@ class Settling:
     def _kinetic(self) -> KineticMetric:
         return KineticMetric(self._manifold.system, self._manifold.layout)
 
-    def settled(self, start: FloatArray, parameters: FloatArray) -> FloatArray | None:
-        """The consistent state next to one, to round-off; None if the method does not converge."""
-        kinetic = self._kinetic
+    def settled(
+        self, start: FloatArray, parameters: FloatArray, kept: Indices
+    ) -> FloatArray | None:
+        """The consistent state next to one, with some states kept; None if there is none near."""
+        kinetic, ways = self._kinetic, list[list[tuple[Indices, Indices, Any]]]()
         if kinetic.does_no_work(start, parameters, self._manifold.gradients(start, parameters)):
+            ways.append([(rows, of, (kinetic, depth)) for rows, of, depth in kinetic.levels])
+        for levels in [*ways, [(rows, of, None) for rows, of in self._levels]]:
             state = start.copy()
             moves = (
-                _settle_level(self._manifold, state, rows, columns, parameters, (kinetic, depth))
-                for rows, columns, depth in kinetic.levels
+                _settle_level(
+                    self._manifold,
+                    state,
+                    rows,
+                    np.setdiff1d(columns, kept),
+                    parameters,
+                    None if np.isin(columns, kept).any() else energy,
+                )
+                for rows, columns, energy in levels
             )
             if all(moves):
                 return state
-        state = start.copy()
-        moves = (_settle_level(self._manifold, state, *level, parameters) for level in self._levels)
-        return state if all(moves) else None
+        return None
+
+    def given_rates(self, start: FloatArray) -> Indices:
+        """The states that are new in derivatives of constraints, as velocities, where some are 0.
+
+        Those that are not 0 are given, and the others may follow.
+        """
+        found = [np.zeros(0, dtype=np.intp)]
+        for _, columns in self._levels[1:]:
+            given = columns[start[columns] != 0.0]
+            found += [given] if given.size < columns.size else []
+        return np.concatenate(found)
+
+    @property
+    def places(self) -> Indices:
+        """The states on which the constraints themselves depend, such as positions."""
+        return self._levels[0][1] if self._levels else np.zeros(0, dtype=np.intp)
 
 
 def _settle_level(
@@ -185,6 +214,11 @@ def _settle_level(
         directions = kinetic.directions(x, parameters, gradients, depth)
         return steps_along(gradients * scale, directions / scale[:, None], level_residual)
 
+    if not columns.size:
+        lengths = np.linalg.norm(
+            manifold.gradients(state, parameters)[rows] * manifold.scale, axis=1
+        )
+        return bool(np.all(np.abs(level_residual(state[columns])) <= CONSISTENT * lengths))
     z, converged = newton(state[columns] / scale, linearize)
     state[columns] = scale * z
     return converged

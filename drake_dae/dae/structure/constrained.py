@@ -1,6 +1,8 @@
 """The structure of the constraints alone: Assumptions (1)-(3), N*, and (9)-(14)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import casadi as ca
@@ -72,25 +74,25 @@ class ConstraintStructure:
     def constraint_matrix(
         self, state: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """Returns A(x) at a state, shape (m, m): for one frictionless contact its mobility in 1/kg.
+        """Returns A(x) at a state, shape (m, m): for one contact its mobility in 1/kg."""
+        return self._matrix(
+            self.system.state_vector(state), self.system.parameter_vector(parameters)
+        )
 
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-        """
+    @cached_property
+    def _matrix(self) -> Callable[[FloatArray, FloatArray], FloatArray]:
         matrix = self.elimination.constraint_matrix
         function = self.system.trace("A(x)", {"value": matrix}, often=False)
-        x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
-        return function(x, p)[0].reshape(matrix.shape)
+        return lambda x, p: function(x, p)[0].reshape(matrix.shape)
 
     def dependent_constraints(self, state: FloatArray, parameters: FloatArray) -> tuple[str, ...]:
         """Returns the names of the constraints that become dependent where A(x) is singular.
 
         They are the parts of n with n^T A(x) = 0, in units of the usual lengths of the gradients.
         """
-        usual = [np.diag(self.constraint_matrix(x, parameters)) for x in self.states]
+        usual = [np.diag(self._matrix(x, parameters)) for x in self.states]
         unit = 1.0 / np.sqrt(positive(np.median(np.abs(usual), axis=0)))
-        matrix = self.constraint_matrix(state, parameters) * unit * unit[:, None]
+        matrix = self._matrix(state, parameters) * unit * unit[:, None]
         if not np.isfinite(matrix).all():
             return ()
         part = np.abs(np.linalg.svd(matrix)[0][:, -1])

@@ -5,6 +5,7 @@ docstring explains them. A tag, as in `surface: !Sphere`, chooses among the clas
 """
 
 import inspect
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -16,7 +17,6 @@ from typing import (
     Annotated,
     Any,
     Generic,
-    Literal,
     NotRequired,
     TypeVar,
     Union,
@@ -27,7 +27,7 @@ from typing import (
 
 import numpy as np
 import pydantic
-from pydantic_core import ErrorDetails, core_schema
+from pydantic_core import ErrorDetails
 from typing_extensions import TypedDict
 
 from drake_dae.arrays import brief
@@ -79,38 +79,6 @@ class Key:
     text: str
 
 
-@dataclass(frozen=True, eq=False)
-class Value:
-    """Annotates the type of values that a function converts.
-
-    Attributes:
-        words: What is expected.
-        schema: The JSON Schema.
-        convert: The function of a value and the folder of relative file names; it returns None for
-            a value that is wrong.
-    """
-
-    words: str
-    schema: Mapping[str, Any]
-    convert: Callable[[Any, Path], Any]
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: pydantic.GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
-        return core_schema.with_info_plain_validator_function(self._read)
-
-    def __get_pydantic_json_schema__(
-        self, source: Any, handler: pydantic.GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        return dict(self.schema)
-
-    def _read(self, value: Any, info: core_schema.ValidationInfo) -> Any:
-        converted = self.convert(value, info.context or Path())
-        if converted is None:
-            raise ValueError(f"expected {self.words}, got {shown(value)}")
-        return converted
-
-
 def shown(data: Any) -> str:
     """A value as the user wrote it, but short."""
     if data is None:
@@ -146,8 +114,10 @@ class Reader(Generic[T]):
 
     @cached_property
     def schema(self) -> dict[str, Any]:
-        """The JSON Schema of the plain data, as an editor of YAML sees them: without tags."""
-        return dict(_without_tags(self._adapter.json_schema()))
+        """The JSON Schema of the plain data without tags, as an editor of YAML sees them."""
+        # Without its tag data may fit several members of a family.
+        text = json.dumps(self._adapter.json_schema()).replace('"oneOf"', '"anyOf"')
+        return dict(json.loads(text))
 
     @property
     def tags(self) -> list[str]:
@@ -250,7 +220,6 @@ class Reader(Generic[T]):
             return _annotated(self._type(inner), *more)
         members = _members(hint)
         value = next((v for base, v in self._values.items() if _members(base) <= members), None)
-        value = Annotated[Any, value] if isinstance(value, Value) else value
         if value is None and (family := self._family(hint)) is not None:
             if id(family) not in self._types:
                 self._types[id(family)] = self._choice(family)
@@ -270,7 +239,7 @@ class Reader(Generic[T]):
             return dict[str, self._type(parts[1])]  # type: ignore[misc]
         return hint
 
-    def _data(self, form: type, tag: str = "", needs_tag: bool = False) -> Any:
+    def _data(self, form: type) -> Any:
         """The type of the data of a form."""
         entries: dict[str, Any] = {}
         for name, key in self.keys_of(form).items():
@@ -278,28 +247,26 @@ class Reader(Generic[T]):
             about = pydantic.Field(description=key.text or None, json_schema_extra=more)
             entry = _annotated(self._type(key.hint), about)
             entries[name] = entry if key.default is MISSING else NotRequired[entry]
-        if tag:
-            entries[TAG] = Literal[tag] if needs_tag else NotRequired[Literal[tag]]
         make_type: Any = TypedDict
-        data = make_type(tag or form.__name__, entries)
+        data = make_type(self._tags.get(form, form.__name__), entries)
         data.__doc__ = introduction(form.__doc__ or "")
         data.__pydantic_config__ = _STRICT
         defaults = {
             name: key.default
-            for name, key in self.keys_of(form).items()
-            if form in self._keys and key.default is not MISSING
+            for name, key in self._keys.get(form, {}).items()
+            if key.default is not MISSING
         }
-
-        def make(given: dict[str, Any]) -> Any:
-            return form(**{**defaults, **{k: v for k, v in given.items() if k != TAG}})
-
-        return Annotated[data, pydantic.AfterValidator(make)]
+        return Annotated[data, pydantic.AfterValidator(lambda given: form(**{**defaults, **given}))]
 
     def _choice(self, family: Family) -> Any:
         """The type of the data of a family."""
+
+        def untagged(data: Any) -> Any:
+            return {key: data[key] for key in data if key != TAG}
+
         members = [
-            Annotated[self._data(cls, tag, needs_tag=index > 0), pydantic.Tag(tag)]
-            for index, (tag, cls) in enumerate(family.members.items())
+            _annotated(self._data(cls), pydantic.BeforeValidator(untagged), pydantic.Tag(tag))
+            for tag, cls in family.members.items()
         ]
         if family.plain is not None:
             members.append(_annotated(family.plain, pydantic.Tag("plain")))
@@ -383,23 +350,6 @@ def _name_length(data: Any, parts: Sequence[str]) -> int:
         if name in data and (count == len(parts) or isinstance(data[name], (dict, list))):
             return count
     return len(parts)
-
-
-def _without_tags(schema: Any) -> Any:
-    """A JSON Schema of data in which any member of a family fits, whatever its tag."""
-    if isinstance(schema, list):
-        return [_without_tags(part) for part in schema]
-    if not isinstance(schema, dict):
-        return schema
-    named = {"oneOf": "anyOf"}
-    cleaned = {
-        named.get(key, key): _without_tags(part)
-        for key, part in schema.items()
-        if key not in (TAG, "discriminator")
-    }
-    if "required" in cleaned:
-        cleaned["required"] = [name for name in cleaned["required"] if name != TAG]
-    return cleaned
 
 
 @cache

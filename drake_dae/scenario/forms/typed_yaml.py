@@ -16,7 +16,7 @@ TAG = "_tag"
 _REDEFINED = ("int", "float", "timestamp")
 """The types of YAML 1.1 whose forms are replaced below."""
 
-MOST_VALUES, MOST_TEXT, MOST_LEVELS = 100_000, 1_000_000, 50
+MOST_VALUES, MOST_TEXT = 100_000, 1_000_000
 """The limits of a file; an alias counts as often as it is used. Shipped scenarios have 200 values
 in 4,000 characters."""
 
@@ -28,18 +28,6 @@ class _Loader(yaml.SafeLoader):
         first: [(tag, form) for tag, form in resolvers if tag.rpartition(":")[2] not in _REDEFINED]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
-
-    _depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        self._depth += 1
-        if self._depth > MOST_LEVELS:
-            mark = self.peek_event().start_mark
-            text = f"more than {MOST_LEVELS} lists or keys in each other"
-            raise yaml.composer.ComposerError(problem=text, problem_mark=mark)
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        return node
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()
@@ -148,6 +136,8 @@ def load_lines(text: str, name: str) -> tuple[Any, Callable[[str], int | None]]:
         raise ScenarioError((name, line + what)) from None
     except yaml.YAMLError as error:  # Control characters.
         raise ScenarioError((name, str(error))) from None
+    except RecursionError:
+        raise ScenarioError((name, "too many lists or keys in each other")) from None
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
         # Of PyYAML, where a tag such as !!int or !!timestamp has a value that is none.
         raise ScenarioError((name, "a tag of YAML (!!...) does not fit its value")) from None

@@ -1,12 +1,16 @@
 """Values in plain data without a dataclass: numbers, vectors, file names."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from sys import float_info
 from typing import Any
 
 import numpy as np
+import pydantic
+from pydantic_core import core_schema
 
-from drake_dae.scenario.forms.forms import Value
+from drake_dae.scenario.forms.forms import shown
 
 _NUMBER = {"type": "number"}
 _LIST = {"type": "array", "items": _NUMBER}
@@ -14,6 +18,38 @@ _LIST = {"type": "array", "items": _NUMBER}
 
 def _is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) <= float_info.max
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """Annotates the type of values that a function converts.
+
+    Attributes:
+        words: What is expected.
+        schema: The JSON Schema.
+        convert: The function of a value and the folder of relative file names; it returns None for
+            a value that is wrong.
+    """
+
+    words: str
+    schema: Mapping[str, Any]
+    convert: Callable[[Any, Path], Any]
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: pydantic.GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        return core_schema.with_info_plain_validator_function(self._read)
+
+    def __get_pydantic_json_schema__(
+        self, source: Any, handler: pydantic.GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return dict(self.schema)
+
+    def _read(self, value: Any, info: core_schema.ValidationInfo) -> Any:
+        converted = self.convert(value, info.context or Path())
+        if converted is None:
+            raise ValueError(f"expected {self.words}, got {shown(value)}")
+        return converted
 
 
 def _vector(value: Any, size: int) -> Any:

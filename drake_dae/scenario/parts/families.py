@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from casadi import SX
 from numpy.typing import ArrayLike
@@ -86,12 +86,12 @@ FAMILIES: dict[type, Family] = {
 
 VALUES: dict[Any, Any] = {
     Callable[..., SX] | str: str,
-    str | Path: values.FILE,
-    str | Sequence[str]: values.NAMES,
-    float | list[float]: values.NUMBER_OR_LIST,
-    ArrayLike: values.NUMBERS,
-    surface.Vector: values.TRIPLE,
-    surface.Pair: values.PAIR,
+    str | Path: Annotated[Any, values.FILE],
+    str | Sequence[str]: Annotated[Any, values.NAMES],
+    float | list[float]: Annotated[Any, values.NUMBER_OR_LIST],
+    ArrayLike: Annotated[Any, values.NUMBERS],
+    surface.Vector: Annotated[Any, values.TRIPLE],
+    surface.Pair: Annotated[Any, values.PAIR],
 }
 
 _CONFIG = {
@@ -117,7 +117,7 @@ KEYS: dict[type, dict[str, Key]] = {
     # Points of paths are lists.
     **{
         cls: {
-            name: replace(key, hint=values.ROW) if key.hint == ArrayLike else key
+            name: replace(key, hint=Annotated[Any, values.ROW]) if key.hint == ArrayLike else key
             for name, key in keys_of(cls).items()
         }
         for cls in _REFERENCES.values()

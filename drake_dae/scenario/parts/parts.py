@@ -251,11 +251,14 @@ class Start:
     Attributes:
         positions: Joint name -> position near which the robot starts, in rad or m; by default that
             of the robot's file.
+        velocities: Velocity name -> its value in rad/s or m/s, for a start in motion; the others
+            follow from the constraints.
         errors: Output name -> z - r at the start, in the output's unit; 0 by default. Errors of
             forces are possible only if actuators have dynamics.
     """
 
     positions: dict[str, float] = field(default_factory=dict)
+    velocities: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
 
 

@@ -34,16 +34,7 @@ T = TypeVar("T")
 
 
 def change_robot(robot: Robot, plant: MultibodyPlant, mender: Mender) -> None:
-    """Applies the changes that a scenario makes to the robot of its file.
-
-    Args:
-        robot: The key `robot` of the scenario.
-        plant: The robot of that file, not finalized.
-        mender: What the file says besides, for new actuators and locked joints.
-
-    Raises:
-        ScenarioError: A change does not fit the robot; the message names its key.
-    """
+    """Applies the changes that a scenario makes to the robot of its file."""
     couplings = _couplings(plant, mender)
     with drake_errors():
         if robot.base is not None:
@@ -67,21 +58,13 @@ def change_robot(robot: Robot, plant: MultibodyPlant, mender: Mender) -> None:
 
 
 def finalize(plant: MultibodyPlant) -> None:
-    """Finalizes a plant.
-
-    Raises:
-        ModelError: Drake cannot finalize it.
-    """
+    """Finalizes a plant."""
     with drake_errors():
         plant.Finalize()
 
 
 def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -> None:
-    """Adds the payloads of a key of the scenario to a plant that is not finalized.
-
-    Raises:
-        ScenarioError: There is no such frame of the robot, or another body has the name.
-    """
+    """Adds the payloads of a key of the scenario to a plant that is not finalized."""
     for index, payload in enumerate(payloads):
         with at(f"{key}.{index}"):
             frame = frame_named(plant, payload.frame)
@@ -216,13 +199,6 @@ def _drive_joints(
     """Adds actuators to the joints that a scenario names, and removes those of all other joints.
 
     Actuators of the file remain, with their gear ratios and rotors.
-
-    Args:
-        driven: Names of joints, or name -> effort limit in N m or N; or "all", the revolute and
-            prismatic joints that mimic no other.
-        plant: The robot, not finalized; changed.
-        couplings: The couplings of the plant.
-        mender: It has the limits and rotors of the file.
     """
     joints = _movable(plant)
     if driven == "all":

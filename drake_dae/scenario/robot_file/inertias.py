@@ -99,10 +99,11 @@ def _mass_and_entries(inertial: Element, kind: str) -> list[str]:
         entries = inertial.get("fullinertia", inertial.get("diaginertia", "")).split()
         return [inertial.get("mass", "0"), *entries, *["0"] * 3][:7] if len(entries) > 2 else []
     mass, matrix = inertial.find("mass"), inertial.find("inertia")
-    if matrix is None or (mass is None and kind == ".urdf"):
+    if matrix is None:
         return []
-    if mass is not None and kind == ".urdf":
-        return [mass.get("value", "0"), *(matrix.get(key, "0") for key in _ENTRIES)]
+    if kind == ".urdf":
+        weight = "0" if mass is None else mass.get("value", "0")
+        return [weight, *(matrix.get(key, "0") for key in _ENTRIES)]
     # The defaults of SDFormat are those of the unit matrix.
     defaults = ("1", "1", "1", "0", "0", "0")
     pairs = zip(_ENTRIES, defaults, strict=True)

@@ -15,7 +15,7 @@ from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.changes import add_payloads, change_robot, finalize
 from drake_dae.scenario.robot_file.loops import cut_loops, joints_of, loop_constraints
-from drake_dae.scenario.robot_file.reading import read_into, read_robot
+from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Payload, Robot
 
 RobotLinks = tuple[MultibodyExpressions, list[Constraint]]
@@ -32,19 +32,8 @@ def add_robot(
     scene_graph: SceneGraph,
     payloads: Sequence[Payload] = (),
 ) -> None:
-    """Adds the robot of a scenario to a plant that is not finalized.
-
-    Args:
-        robot: The robot.
-        plant: The plant, registered in the scene graph.
-        scene_graph: The scene graph.
-        payloads: The key `plant.payloads` of the scenario.
-
-    Raises:
-        ScenarioError: Drake cannot read the file, or ignores parts of it; or a change of the
-            scenario does not fit it.
-    """
-    mender = read_into(plant, robot, scene_graph)
+    """Adds the robot of a scenario to a plant that is not finalized."""
+    _, mender = read_robot(robot, scene_graph, plant=plant)
     change_robot(robot, plant, mender)
     add_payloads("plant.payloads", payloads, plant)
     cut_loops(plant, mender.parent_frames)
@@ -57,17 +46,7 @@ def robot_links(
     payloads: Sequence[Payload] = (),
     drawn: bool = True,
 ) -> RobotLinks:
-    """The links of a scenario's robot, and its loop-closing joints as constraints.
-
-    Args:
-        robot: The key `robot` of the scenario.
-        scene_graph: The scene graph for its geometry.
-        payloads: The key `plant.payloads` of the scenario, for the links of the plant.
-        drawn: Whether the geometry will be drawn.
-
-    Raises:
-        ScenarioError: The file cannot be read or a change does not fit; the message names the key.
-    """
+    """The links of a scenario's robot, and its loop-closing joints as constraints."""
     plant, mender = read_robot(robot, scene_graph, drawn)
     change_robot(robot, plant, mender)
     add_payloads("plant.payloads", payloads, plant)
@@ -94,11 +73,7 @@ def robot_links(
 
 
 def _check_mass(plant: MultibodyPlant) -> None:
-    """Checks that each joint moves a mass; otherwise its acceleration is not determined.
-
-    Raises:
-        ModelError: M(q) is singular in the default and in three random configurations.
-    """
+    """Checks that each joint moves a mass; otherwise its acceleration is not determined."""
     context = plant.CreateDefaultContext()
     default = plant.GetPositions(context)
     random = np.random.default_rng(0)

@@ -70,15 +70,7 @@ def _has_one_position(joint: Joint) -> bool:
 def cut_loops(
     plant: MultibodyPlant, parent_frames: Mapping[tuple[str, str], str]
 ) -> list[CutJoint]:
-    """Removes joints until the others form a tree; driven joints only if necessary.
-
-    Args:
-        plant: Not finalized; changed.
-        parent_frames: (model, joint) -> the parent that an SDFormat file names.
-
-    Raises:
-        ModelError: A loop has no joint that can be cut, or is open, or Drake cannot remove it.
-    """
+    """Removes joints until the others form a tree; driven joints only if necessary."""
     driven = {actuator.joint().index(): actuator for actuator in actuators_of(plant)}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
     cuts = []
@@ -149,7 +141,10 @@ def _cut(
     try:
         plant.RemoveJoint(joint)
     except RuntimeError as error:
-        raise ModelError(f"joint '{name}' closes a loop, and cannot be cut: {error}") from None
+        raise ModelError(
+            f"joint '{name}' closes a loop, and cannot be cut: {error} Springs stop it: "
+            "robot.leave_out takes them out, as [dynamics/spring_stiffness]"
+        ) from None
     return cut
 
 
@@ -158,10 +153,6 @@ def loop_constraints(cuts: Sequence[CutJoint], plant: MultibodyPlant) -> list[Co
 
     If all joints of a loop move in one plane, the constraint is planar, since a spatial constraint
     would be redundant.
-
-    Args:
-        cuts: The result of `cut_loops`.
-        plant: The robot, finalized.
     """
     return [_constraint(cut, plant) for cut in cuts]
 
@@ -186,13 +177,7 @@ def _constraint(cut: CutJoint, plant: MultibodyPlant) -> Constraint:
 
 
 def _normal(cut: CutJoint, axis: FloatArray, plant: MultibodyPlant) -> FloatArray | None:
-    """The normal of the plane in which all joints of a loop move, in the world; None without one.
-
-    Args:
-        cut: The joint that closes the loop.
-        axis: Its axis in the world.
-        plant: The robot, finalized.
-    """
+    """The normal in the world of the plane in which all joints of a loop move, or None."""
     joints = [*_path(cut, plant), (cut.slides, axis)]
     turning = [axis for slides, axis in joints if not slides]
     sliding = [axis for slides, axis in joints if slides]

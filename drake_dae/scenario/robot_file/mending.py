@@ -9,7 +9,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -37,22 +36,6 @@ _EMPTY = "shapes of size 0 are left out"
 _WITH_COMMA = re.compile(r"[-+.\deE\s]*\d,\d[-+.\deE,\s]*")
 
 
-class FloatingJoint(NamedTuple):
-    """A link that moves freely relative to a pose in its parent.
-
-    Attributes:
-        model: Its model, as in `Mender`.
-        name, parent, child: Of the joint and its links.
-        origin: The pose: a position in m, and roll, pitch and yaw in rad, shape (6,).
-    """
-
-    model: str
-    name: str
-    parent: str
-    child: str
-    origin: FloatArray
-
-
 @dataclass
 class Mender:
     """Makes mended copies of files, and collects what is to be known of them.
@@ -66,14 +49,15 @@ class Mender:
         drives: Whether the file's motors count, since the scenario names no driven joints.
         has_geometry, drawn: Whether geometry is read, and converted to such that can be drawn.
         folder: An empty folder for the copies; None makes none.
-        changes: What changed -> the items.
+        omitted, changed: What of the geometry is left out, and what else changed -> the items.
         lost: Part that is lost -> where.
         originals: Copy -> its file.
         efforts: (model, joint) -> effort limit in N m or N.
         armatures: (model, joint) -> rotor inertia at the joint, kg m^2 or kg.
         followers: (model, joint) -> the joint that it follows, the ratio, and the offset.
         standing: (model, joint) -> the position that a coupling gives it, in rad or m.
-        floating: The floating joints.
+        floating: Model, name, parent, child and pose of floating joints: x, y and z in m, and
+            roll, pitch and yaw in rad.
         crossed: (model, link) of which visual geometry is left out.
         parent_frames: (model, joint) -> the parent that an SDFormat file names.
         count: The number of files that were read.
@@ -86,14 +70,15 @@ class Mender:
     has_geometry: bool = True
     drawn: bool = True
     folder: Path | None = None
-    changes: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    omitted: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    changed: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     lost: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     originals: dict[Path, Path] = field(default_factory=dict)
     efforts: dict[tuple[str, str], float] = field(default_factory=dict)
     armatures: dict[tuple[str, str], float] = field(default_factory=dict)
     followers: dict[tuple[str, str], tuple[str, float, float]] = field(default_factory=dict)
     standing: dict[tuple[str, str], float] = field(default_factory=dict)
-    floating: list[FloatingJoint] = field(default_factory=list)
+    floating: list[tuple[str, str, str, str, FloatArray]] = field(default_factory=list)
     crossed: set[tuple[str, str]] = field(default_factory=set)
     parent_frames: dict[tuple[str, str], str] = field(default_factory=dict)
     count: int = 0
@@ -104,21 +89,18 @@ class Mender:
         model: str = "",
         placed: Collection[str] = (),
         within: tuple[Path, ...] = (),
-    ) -> tuple[Path, list[str]]:
-        """A mended copy of a file, and the links that it fixes to the world.
+    ) -> Path:
+        """A mended copy of a file.
 
         Args:
             file: The file; what is neither URDF, SDFormat nor MJCF stays.
             model: Its model.
             placed: Links that the scenario places: joints that fix them to the world are removed.
             within: The files that include this one.
-
-        Raises:
-            ModelError: Drake does not read it, and it cannot be mended.
         """
         kind, own = file.suffix, (*within, file.resolve())
         if kind not in READ_BY_DRAKE:
-            return file, []
+            return file
         root = self._read(file, within)
         if kind == ".xml":
             self._include(root, file, own)
@@ -141,22 +123,22 @@ class Mender:
             if text := mend_inertia(inertial, kind, place(inertial)):
                 if "inertia" not in self.leave_out:
                     self.lost["inertia"].append(text)
-                self.changes["moments of inertia of no body become possible ones"].append(text)
+                self.changed["moments of inertia of no body become possible ones"].append(text)
         for joint in root.iter("joint"):
             self._check_joint(joint, kind, place(joint))
         if kind == ".urdf":
-            fixed = list(self._mend_urdf(root, file, model, placed))
+            self._mend_urdf(root, file, model, placed)
         elif kind == ".sdf":
-            fixed = list(self._mend_sdf(root, file, model, placed, own))
+            self._mend_sdf(root, file, model, placed, own)
         else:
-            fixed = list(self._mend_mjcf(root, file, model, placed))
+            self._mend_mjcf(root, file, model, placed)
         if self.folder is None:
-            return file, fixed
+            return file
         copy = self.folder / str(len(self.originals)) / file.name
         copy.parent.mkdir()
         copy.write_text(write_xml(root), "utf-8")
         self.originals[copy] = file
-        return copy, fixed
+        return copy
 
     def _read(self, file: Path, within: tuple[Path, ...]) -> Node:
         if file.resolve() in within:
@@ -191,14 +173,7 @@ class Mender:
     def _mesh(
         self, path: Path | None, name: str, collides: bool, kinds: tuple[str, ...]
     ) -> Path | None:
-        """The file of a mesh as Drake reads it; None if it is left out.
-
-        Args:
-            path: The file; None if its package is unknown.
-            name: Its name in the robot's file.
-            collides: Whether it is a collision: Drake needs its convex hull.
-            kinds: The kinds of files to which it is converted; none leaves it.
-        """
+        """The file of a mesh as Drake reads it; None if it is left out."""
         if self.folder is None:
             return path
         drawn, why = path, ""
@@ -217,7 +192,7 @@ class Mender:
             why = "cannot be read by Drake"
         if not why:
             return drawn
-        items = self.changes[f"geometry is left out, which no equation needs, since it {why}"]
+        items = self.omitted[f"geometry is left out, which no equation needs, since it {why}"]
         items.append(f"'{name if path is None else Path(name).name}'")
         return None
 
@@ -233,30 +208,24 @@ class Mender:
                 for size in (form.get(key) or form.findtext(key) or "1").split()
             ]
             if self.has_geometry and any((number_in(size) or 0.0) <= 0.0 for size in sizes):
-                self.changes[_EMPTY].append(f"of '{name}'")
+                self.omitted[_EMPTY].append(f"of '{name}'")
                 link.remove(shape)
             elif not self.has_geometry:
                 link.remove(shape)
             for owner, key in meshes if self.has_geometry else ():
                 text = _text(owner, key)
-                path, kinds = self.find(text, file), DRAWN
-                if path is not None and path.suffix.lower() == ".dae" and drawable(path) is None:
-                    kinds = ()  # Meshcat draws it.
-                path = self._mesh(
-                    path, text, not is_visual, kinds if is_visual and self.drawn else ()
-                )
-                if path is not None:
-                    _set_text(owner, key, str(path))
-                    continue
-                link.remove(shape)
-                if is_visual:
-                    self.crossed.add((model, name))
+                kinds = DRAWN if is_visual and self.drawn else ()
+                path = self._mesh(self.find(text, file), text, not is_visual, kinds)
+                _set_text(owner, key, str(path))
+                if path is None:
+                    link.remove(shape)
+                    self.crossed |= {(model, name)} if is_visual else set()
             for owner, key in _files(shape, "material", ("texture", "drake:diffuse_map")):
                 path = self.find(_text(owner, key), file)
                 if path is not None and path.is_file() and all_within(path, self.folders):
                     _set_text(owner, key, str(path))
                 else:
-                    self.changes["textures are left out"].append(f"'{_text(owner, key)}'")
+                    self.omitted["textures are left out"].append(f"'{_text(owner, key)}'")
                     for material in shape.iterfind("material"):
                         _remove(material, owner.tag)
 
@@ -266,17 +235,16 @@ class Mender:
         for mimic in [part for part in joint if part.tag == tag]:
             ratio = number_in(mimic.get("multiplier", "1"))
             offset = number_in(mimic.get("offset", "0"))
-            if ratio == 0.0 and offset is not None:
-                self.changes["joints that follow others with multiplier 0 stand"] += [f"'{name}'"]
+            if joint.get("type") in ("planar", "floating", "universal", "ball"):
+                self.lost[f"joint/{tag}"].append(f"joint '{name}'")
+            elif ratio == 0.0 and offset is not None:
+                self.changed["joints that follow others with multiplier 0 stand"] += [f"'{name}'"]
                 self.standing[model, name] = offset
                 joint.remove(mimic)
             elif ratio is not None and offset is not None:
                 self.followers[model, name] = (mimic.get("joint", ""), ratio, offset)
 
-    def _mend_urdf(
-        self, root: Element, file: Path, model: str, placed: Collection[str]
-    ) -> Iterator[str]:
-        """Mends a URDF, and yields the links that it fixes to the world."""
+    def _mend_urdf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
         root.attrib.setdefault("name", file.stem)
         for link in root.iterfind("link"):
             self._mend_shapes(link, file, model)
@@ -288,8 +256,6 @@ class Mender:
             parent, child = ("" if end is None else str(end.get("link", "")) for end in ends)
             if parent == "world" and child in placed and kind in ("fixed", "floating"):
                 root.remove(joint)
-            elif parent == "world" and kind == "fixed":
-                yield child
             elif kind == "floating":
                 root.remove(joint)
                 origin = joint.find("origin")
@@ -298,24 +264,26 @@ class Mender:
                 numbers = [number_in(word) for word in text.split()]
                 if len(numbers) != 6 or None in numbers:
                     raise ModelError(f"joint '{name}': its origin is six numbers, got '{text}'")
-                where = np.array(numbers, float)
-                self.floating.append(FloatingJoint(model, name, parent, child, where))
+                self.floating.append((model, name, parent, child, np.array(numbers, float)))
             if kind == "fixed":
                 _remove(joint, "mimic")
             self._follow(model, joint, "mimic")
             for limit in joint.iterfind("limit"):
-                effort = number_in(limit.get("effort", ""))
-                if effort:  # Many authors write 0 for an unknown limit.
+                effort = number_in(limit.get("effort", "")) or 0.0
+                if effort > 0.0:
                     self.efforts[model, name] = effort
-                elif effort == 0.0:
+                elif "effort" in limit.attrib:  # Many authors write 0 for an unknown limit.
                     still.add(name)
-        joints, count = {joint.get("name") for joint in root.iterfind("joint")}, Counter[str]()
+        moving = [joint for joint in root.iterfind("joint") if joint.get("type") != "fixed"]
+        joints, count = {joint.get("name") for joint in moving}, Counter[str]()
         for transmission in root.findall("transmission"):
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
             if driven & still and self.drives:
-                self.lost["transmission/joint"].append(f"{', '.join(map(str, driven))}: effort 0")
-            if not has_type or (driven and not driven & joints):
+                self.lost["transmission/joint"] += [
+                    f"joint '{joint}': effort 0" for joint in driven
+                ]
+            if not has_type or not driven & joints:
                 root.remove(transmission)
                 continue
             for actuator in transmission.iterfind("actuator"):  # Their names may be equal.
@@ -330,14 +298,13 @@ class Mender:
         model: str,
         placed: Collection[str],
         within: tuple[Path, ...],
-    ) -> Iterator[str]:
-        """Mends an SDFormat file, and yields the links that it fixes to the world."""
+    ) -> None:
         for uri in root.iterfind(".//include/uri"):
             path = self.find((uri.text or "").strip(), file)
             if path is not None and path.is_dir():
                 path = next(iter(sorted(path.glob("*.sdf"))), None)
             if path is not None and path.is_file():
-                uri.text = self.copy(path, model, (), within)[0].resolve().as_uri()
+                uri.text = self.copy(path, model, (), within).resolve().as_uri()
         for number, body in enumerate(root.iter("model")):
             body.attrib.setdefault("name", file.stem + f"_{number}" * bool(number))
             for link in body.iterfind("link"):
@@ -346,8 +313,6 @@ class Mender:
                 parent, child = (joint.findtext(end, "").strip() for end in ("parent", "child"))
                 if parent == "world" and joint.get("type") == "fixed" and child in placed:
                     body.remove(joint)
-                elif parent == "world" and joint.get("type") == "fixed":
-                    yield child
                 self.parent_frames[model, joint.get("name", "")] = parent
                 self._follow(model, joint, "drake:mimic")
 
@@ -364,10 +329,9 @@ class Mender:
                 part.line = 0  # type: ignore[attr-defined]
             owner[index : index + 1] = list(included)
 
-    def _mend_mjcf(
-        self, root: Element, file: Path, model: str, placed: Collection[str]
-    ) -> Iterator[str]:
-        """Mends an MJCF file, and yields the bodies that it fixes to the world."""
+    def _mend_mjcf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
+        if not self.has_geometry:
+            mjcf.remove_geometry(root)
         refused: dict[str, str] = {}
         used = mjcf.colliding_meshes(root) if self.has_geometry else set[str]()
         for mesh, path in mjcf.mesh_files(root, file):
@@ -377,19 +341,16 @@ class Mender:
             if readable is None:
                 refused[mesh.get("name", "")] = name
         crossed, empty = mjcf.remove_shapes(root, refused)
-        self.crossed |= {(model, body) for body in crossed}
+        self.crossed |= {(model, body) for body in crossed if self.has_geometry}
         if empty:
-            self.changes[_EMPTY] += [f"of '{body}'" for body in empty]
+            self.omitted[_EMPTY] += [f"of '{body}'" for body in empty]
         for name, armature in mjcf.armatures(root):
             if name:
                 self.armatures[model, name] = armature
             elif mjcf.ARMATURE not in self.leave_out:
                 self.lost[mjcf.ARMATURE].append(f"{file.name}: of a joint that no motor can drive")
-        for name, joint in mjcf.base_bodies(root, placed):
-            if joint:
-                self.floating.append(FloatingJoint(model, joint, "world", name, np.zeros(6)))
-            else:
-                yield name
+        for name, joint in mjcf.floating_bodies(root, placed):
+            self.floating.append((model, joint, "world", name, np.zeros(6)))
 
 
 def _check_values(root: Element, place: Callable[[Element], str]) -> None:

@@ -112,18 +112,15 @@ def has_hull(mesh: Path) -> bool:
 
 
 def drawable(mesh: Path, kinds: tuple[str, ...] = DRAWN) -> Path | None:
-    """A mesh, or its copy, of a kind that is drawn; None if there is none.
-
-    Copies are removed when Python exits.
-    """
+    """A mesh, or a copy until Python exits, of a kind that is drawn; None if there is none."""
     if mesh.suffix.lower() in kinds:
         return mesh
     try:
         name, changed, size = check_file(mesh.resolve(), ModelError)
         is_scene = mesh.suffix.lower() == ".dae" and ".gltf" in kinds
         return _converted(Path(name), ".gltf" if is_scene else ".obj", changed, size)
-    except ModelError:
-        return None
+    except ModelError:  # Meshcat draws a .dae.
+        return mesh if mesh.suffix.lower() == ".dae" and ".gltf" in kinds else None
 
 
 @cache
@@ -148,15 +145,16 @@ def _obj(mesh: Path) -> bytes:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals /= np.where(lengths > 0.0, lengths, 1.0)
-    rows = [
-        *("v {:.9g} {:.9g} {:.9g}\n".format(*vertex) for vertex in vertices.tolist()),
-        *("vn {:.5g} {:.5g} {:.5g}\n".format(*normal) for normal in normals.tolist()),
-        *(
-            f"f {i}//{number} {j}//{number} {k}//{number}\n"
-            for number, (i, j, k) in enumerate((triangles + 1).tolist(), start=1)
-        ),
-    ]
-    return "".join(rows).encode("ascii")
+    numbers = np.arange(1, len(triangles) + 1)[:, None]
+    faces = np.dstack([triangles + 1, np.broadcast_to(numbers, triangles.shape)])
+    tables = (
+        ("v %.9g %.9g %.9g\n", vertices),
+        ("vn %.5g %.5g %.5g\n", normals),
+        ("f %d//%d %d//%d %d//%d\n", faces),
+    )
+    return "".join(
+        row * len(table) % tuple(table.ravel().tolist()) for row, table in tables
+    ).encode()
 
 
 def _gltf(mesh: Path) -> bytes:

@@ -20,9 +20,6 @@ def prepare(root: Element, file: Path) -> None:
     of the efforts at joints, the gear times those of motors; servos become motors, since controls
     are efforts here. Bodies of mass 0, which MuJoCo takes if they do not move or move with others,
     lose their inertia, and their geometry its mass.
-
-    Raises:
-        ModelError: The file has global coordinates.
     """
     root.attrib.setdefault("model", file.stem)
     _apply_defaults(root)
@@ -97,6 +94,22 @@ def _apply_defaults(root: Element) -> None:
     apply(root, "main")
 
 
+def remove_geometry(root: Element) -> None:
+    """Removes the geometry from which no mass is computed, and meshes that nothing names."""
+    always = _compiler(root).get("inertiafromgeom") == "true"
+    for body in [*root.iter("body"), *root.iter("worldbody")]:
+        if body.tag == "worldbody" or (body.find("inertial") is not None and not always):
+            for geom in body.findall("geom"):
+                body.remove(geom)
+    for contact in root.findall("contact"):
+        root.remove(contact)
+    named = {geom.get("mesh", "") for geom in root.iter("geom")}
+    for asset in root.iterfind("asset"):
+        for mesh in asset.findall("mesh"):
+            if mesh.get("name", Path(mesh.get("file", "")).stem) not in named:
+                asset.remove(mesh)
+
+
 def mesh_files(root: Element, file: Path) -> Iterator[tuple[Element, Path]]:
     """The meshes of a file with their names, and their files."""
     compiler = _compiler(root)
@@ -113,18 +126,7 @@ def colliding_meshes(root: Element) -> set[str]:
 
 
 def remove_shapes(root: Element, refused: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """Removes meshes that cannot be read, and shapes that have one or are of size 0.
-
-    Args:
-        root: The root of the file; changed.
-        refused: Name of a mesh -> its file.
-
-    Returns:
-        The bodies with such a mesh, and those with such a shape.
-
-    Raises:
-        ModelError: A movable body has its mass from such a mesh, or from the surface of a mesh.
-    """
+    """Removes meshes that cannot be read, and shapes that have one or are of size 0."""
     shells = set()
     for asset in root.iterfind("asset"):
         for mesh in asset.findall("mesh"):
@@ -170,17 +172,12 @@ def armatures(root: Element) -> Iterator[tuple[str, float]]:
             yield joint.get("name", "") if can_be_driven else "", armature
 
 
-def base_bodies(root: Element, placed: Collection[str]) -> Iterator[tuple[str, str]]:
-    """The bodies in the world that stand or float, and the names of floating joints.
-
-    Those that are placed elsewhere become free bodies, and are not among them.
-    """
+def floating_bodies(root: Element, placed: Collection[str]) -> Iterator[tuple[str, str]]:
+    """The bodies that float, and their joints. Those that are placed elsewhere become free."""
     for body in root.iterfind("worldbody/body"):
         name = body.get("name", "")
         free = [*body.iterfind("freejoint"), *body.iterfind("joint[@type='free']")]
-        if name in placed and not free and body.find("joint") is None:
-            SubElement(body, "freejoint")
-        elif name not in placed and free:
+        if free and name not in placed:
             yield name, free[0].get("name", name)
-        elif name not in placed and body.find("joint") is None:
-            yield name, ""
+        elif name in placed and not free and body.find("joint") is None:
+            SubElement(body, "freejoint")

@@ -1,7 +1,6 @@
 """Finds the files that a robot's files name, in packages as ROS finds them."""
 
 import os
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from urllib.parse import unquote
@@ -9,7 +8,7 @@ from urllib.parse import unquote
 from pydrake.common import GetDrakePath
 from pydrake.multibody.parsing import PackageMap
 
-from drake_dae.arrays import brief
+from drake_dae.arrays import brief, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.robot import Robot
@@ -27,7 +26,7 @@ class RobotFiles:
         main: The file.
         packages: The packages of Drake's parser.
         folders: The folders from which geometry is read: those of the model and its packages.
-        missing: Package that is not found -> a file that names it.
+        missing: The packages that are not found.
 
     Args:
         robot: The key `robot` of the scenario.
@@ -38,7 +37,7 @@ class RobotFiles:
     """
 
     def __init__(self, robot: Robot, packages: PackageMap) -> None:
-        self.missing: dict[str, Path] = {}
+        self.missing: set[str] = set()
         self.packages = packages
         self._places = [
             *(Path(part) for part in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)),
@@ -51,17 +50,17 @@ class RobotFiles:
                     packages.Add(name, folder)
                 except RuntimeError as error:
                     raise ModelError(f"no package in '{folder}': {error}") from None
-        self.folders = [FOLDER / "models", *map(Path, robot.packages.values()), *_drake_folders()]
-        main: Path | None = Path(robot.file)
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        self.folders = [FOLDER / "models", *map(Path, robot.packages.values())]
+        self.folders += [Path(GetDrakePath()), Path(cache) / "drake" / "package_map"]
+        main = Path(robot.file)
         if robot.description:
             with at("robot.description"):
                 main, described = described_robot(robot.description)
                 self.folders += described[:2]
                 self._places += described
         elif "://" in robot.file:
-            main = self.find(robot.file, Path())
-        if main is None:
-            raise ModelError(self.unknown_packages())
+            main = self.needed(robot.file, Path())
         try:
             is_there = main.is_file()
         except (OSError, ValueError):  # A null byte.
@@ -90,7 +89,7 @@ class RobotFiles:
         if not self.packages.Contains(package):
             folder = self._folder_of(package, file)
             if folder is None:
-                self.missing.setdefault(package, file)
+                self.missing.add(package)
                 return None
             self.packages.Add(package, str(folder))
             self.folders.append(folder)
@@ -112,41 +111,30 @@ class RobotFiles:
         inside = (place / package for place in self._places if str(place) != ".")
         return next((folder for folder in inside if folder.is_dir()), None)
 
-    def unknown_packages(self) -> str:
-        """The message for packages that are not found."""
-        name, file = next(iter(self.missing.items()))
-        others = f" (nor are {', '.join(list(self.missing)[1:])})" if len(self.missing) > 1 else ""
-        return (
-            f"unknown package '{name}': it is neither beside '{file.name or name}', as a folder "
-            f"with a package.xml, nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH{others}; name its "
-            f"folder under robot.packages, as packages: {{{name}: <folder>}}, so that "
-            f"package://{name}/a is <folder>/a"
-        )
+    def needed(self, name: str, file: Path) -> Path:
+        """The path of a URL or a name in a file."""
+        path = self.find(name, file)
+        if path is None:
+            package = name.split("://")[-1].split("/")[0]
+            raise ModelError(
+                f"unknown package '{package}' in '{name}': it is neither beside the file, as a "
+                "folder with a package.xml, nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH; name its "
+                f"folder under robot.packages, as packages: {{{package}: <folder>}}, so that "
+                f"package://{package}/a is <folder>/a"
+            )
+        return path
 
 
 def _package_name(folder: Path) -> str:
     """The name in a folder's package.xml; empty if there is none."""
-    if not (folder / "package.xml").is_file():
-        return ""
     try:
         return (read_xml(folder / "package.xml").findtext("name") or "").strip()
     except ModelError:
         return ""
 
 
-def _drake_folders() -> list[Path]:
-    """The folders of Drake's packages, installed and downloaded."""
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return [Path(GetDrakePath()), Path(cache) / "drake" / "package_map"]
-
-
 def described_robot(name: str) -> tuple[Path, list[Path]]:
-    """The file of a robot of the package robot_descriptions, and folders that have its packages.
-
-    Raises:
-        ModelError: There is no such robot, it cannot be cloned, or robot_descriptions is not
-            installed.
-    """
+    """The file of a robot of the package robot_descriptions, and folders that have its packages."""
     try:
         names = import_module("robot_descriptions").DESCRIPTIONS
     except ImportError:
@@ -155,26 +143,21 @@ def described_robot(name: str) -> tuple[Path, list[Path]]:
             "name a file of your own as robot.file"
         ) from None
     if name not in names:
-        near = get_close_matches(name, names, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ModelError(
-            f"robot_descriptions has no '{name}'; {hint}python -m robot_descriptions list names all"
-        )
+        raise ModelError(unknown_name("robot in robot_descriptions", name, names))
     try:
         module = import_module(f"robot_descriptions.{name}")
+        file = Path(getattr(module, "URDF_PATH", None) or module.MJCF_PATH)
+    except AttributeError:
+        raise ModelError(
+            f"'{name}' comes as neither URDF nor MJCF; name its URDF, which xacro makes, as "
+            "robot.file"
+        ) from None
     except Exception as error:  # Of git, of the network, of the disk.
         raise ModelError(
-            f"'{name}' cannot be fetched: {brief(str(error))}. Without a network clone it "
-            "elsewhere, and let ROBOT_DESCRIPTIONS_CACHE name the folder, or name the robot's own "
-            "file as robot.file"
+            f"'{name}' cannot be fetched: {brief(str(error))}. Clone it elsewhere, and let "
+            "ROBOT_DESCRIPTIONS_CACHE name the folder, or name its file as robot.file"
         ) from None
-    file = getattr(module, "URDF_PATH", None) or getattr(module, "MJCF_PATH", None)
-    if file is None:
-        raise ModelError(
-            f"'{name}' comes as neither URDF nor MJCF; make a URDF of it, as xacro does, and name "
-            "it as robot.file"
-        )
     package, repository = (
-        Path(getattr(module, key, Path(file).parent)) for key in ("PACKAGE_PATH", "REPOSITORY_PATH")
+        Path(getattr(module, key, file.parent)) for key in ("PACKAGE_PATH", "REPOSITORY_PATH")
     )
-    return Path(file), [package, repository, package.parent, repository.parent, Path(file).parent]
+    return file, [package, repository, package.parent, repository.parent, file.parent]

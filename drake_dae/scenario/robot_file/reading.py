@@ -30,24 +30,30 @@ from drake_dae.scenario.robot_file.robot import Robot
 _REMEDIES = {
     "inertia": "it takes the nearest possible moments of inertia",
     "friction": "robot.known_forces has friction as a !JointFriction",
-    "mimic": "constraints has two joints that move together as a !JointCoupler",
-    "equality/joint": "constraints has two joints that move together as a !JointCoupler",
+    "mimic": "constraints has joints that move together as a !JointCoupler",
+    "equality/joint": "constraints has joints that move together as a !JointCoupler",
     "equality/weld": "constraints has it as a !WeldedFrames",
     "equality/connect": "constraints has it as a !CoincidentPoints",
 }
 """What the name of a lost part contains -> what to do besides."""
 
+_RED = [0.8, 0.1, 0.1, 1.0]
+
 
 def read_robot(
-    robot: Robot, scene_graph: SceneGraph | None = None, drawn: bool = True
+    robot: Robot,
+    scene_graph: SceneGraph | None = None,
+    drawn: bool = True,
+    plant: MultibodyPlant | None = None,
 ) -> tuple[MultibodyPlant, Mender]:
-    """Makes a plant in continuous time with the models of the robot's file, not finalized.
+    """Reads the models of the robot's file into a plant that is not finalized.
 
     Args:
         robot: The key `robot` of the scenario.
         scene_graph: The scene graph for the robot's geometry; None leaves geometry out.
         drawn: Whether the geometry will be drawn: visual meshes are converted then, which takes
             longer than all else.
+        plant: The plant, registered in the scene graph; None makes one.
 
     Returns:
         The plant, and what its files say besides.
@@ -56,44 +62,33 @@ def read_robot(
         ModelError: The files cannot be read, or are not supported.
         ScenarioError: A key of the scenario does not fit; the message names the key.
     """
-    # In continuous time, in which the plant's own dynamics are those of (37).
-    plant = MultibodyPlant(0.0)
-    if scene_graph is not None:
-        plant.RegisterAsSourceForSceneGraph(scene_graph)
-    return plant, read_into(plant, robot, scene_graph, drawn)
-
-
-def read_into(
-    plant: MultibodyPlant,
-    robot: Robot,
-    scene_graph: SceneGraph | None = None,
-    drawn: bool = True,
-) -> Mender:
-    """Adds the models of the robot's file to a plant that is not finalized; see `read_robot`."""
+    if plant is None:
+        plant = MultibodyPlant(0.0)  # In continuous time, as (37).
+        if scene_graph is not None:
+            plant.RegisterAsSourceForSceneGraph(scene_graph)
     parser = Parser(plant)
     files = RobotFiles(robot, parser.package_map())
     with TemporaryDirectory() as folder:
-        mender = _mender(robot, files, Path(folder).resolve())
+        mender = Mender(files.find, files.folders, robot.leave_out, robot.actuators is None)
         mender.has_geometry, mender.drawn = scene_graph is not None, drawn
+        mender.folder = Path(folder).resolve()
         with drake_errors(mender.originals):
-            directives = _mended(robot, files, mender)
+            models = _mended(robot, files, mender)
             if mender.lost:
-                raise ModelError(_lost(mender))
-            if isinstance(directives, Path):
-                parser.AddModels(str(directives))
+                raise ModelError(_told(mender))
+            if isinstance(models, Path):
+                parser.AddModels(str(models))
             else:
-                ProcessModelDirectives(directives, parser)
+                ProcessModelDirectives(models, parser)
             _add_floating_joints(plant, mender)
-    for kind, items in mender.changes.items():
-        category = GeometryWarning if "left out" in kind else RobotFileWarning
-        warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=3)
-    for model, name in sorted(mender.crossed) if scene_graph is not None else ():
+    for category, found in ((GeometryWarning, mender.omitted), (RobotFileWarning, mender.changed)):
+        for kind, items in found.items():
+            warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
+    for model, name in sorted(mender.crossed):
         body = plant.GetBodyByName(name, *_instance(plant, model)) if name else plant.world_body()
         for axis in range(3):
-            size = np.where(np.arange(3) == axis, 0.06, 0.004)
-            plant.RegisterVisualGeometry(
-                body, RigidTransform(), Box(*size), f"left_out_{axis}", [0.8, 0.1, 0.1, 1.0]
-            )
+            bar = Box(*np.where(np.arange(3) == axis, 0.06, 0.004))
+            plant.RegisterVisualGeometry(body, RigidTransform(), bar, f"left_out_{axis}", _RED)
     unlimited = np.full(1, np.inf)  # Many authors write 0 for an unknown limit.
     for joint in joints_of(plant):
         if joint.num_positions() != 1:
@@ -103,69 +98,34 @@ def read_into(
             joint.set_position_limits(-unlimited, unlimited)
         if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
             joint.set_velocity_limits(-unlimited, unlimited)
-    return mender
+    return plant, mender
 
 
-def parts_to_leave_out(robot: Robot) -> list[str]:
-    """What `robot.leave_out` needs to name, so that the robot's file can be read.
-
-    Raises:
-        ModelError: The file cannot be read.
-    """
-    return [*robot.leave_out, *_looked_at(robot)[1].lost]
-
-
-def unknown_packages(robot: Robot) -> list[str]:
-    """The packages that the robot's file names, and that are not found.
-
-    Raises:
-        ModelError: The file cannot be read.
-    """
-    return list(_looked_at(robot)[0].missing)
-
-
-def _looked_at(robot: Robot) -> tuple[RobotFiles, Mender]:
+def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
+    """The packages that a robot's file names and that are not found, and what is lost of it."""
     files = RobotFiles(robot, Parser(MultibodyPlant(0.0)).package_map())
-    mender = _mender(robot, files, None)
+    mender = Mender(files.find, files.folders, robot.leave_out, robot.actuators is None)
     with drake_errors():
         _mended(robot, files, mender)
-    return files, mender
-
-
-def _mender(robot: Robot, files: RobotFiles, folder: Path | None) -> Mender:
-    is_driven = robot.actuators is not None
-    return Mender(files.find, files.folders, robot.leave_out, not is_driven, folder=folder)
+    return list(files.missing), list(mender.lost)
 
 
 def _mended(robot: Robot, files: RobotFiles, mender: Mender) -> Path | ModelDirectives:
     """The mended copy of the robot's file, or directives with the copies of their models."""
     placed = [*([robot.base.weld] if robot.base is not None else []), *robot.free]
     if not files.main.name.endswith((".dmd.yaml", ".dmd.yml")):
-        return mender.copy(files.main, "", placed)[0]
+        return mender.copy(files.main, "", placed)
     _find_packages(files, files.main, ())
     loaded = LoadModelDirectives(str(files.main))
     directives = FlattenModelDirectives(loaded, files.packages)
     welds = (directive.add_weld for directive in directives.directives)
     placed += [weld.child for weld in welds if weld is not None]
-    standing: dict[Path, str] = {}
     for directive in directives.directives:
         if (model := directive.add_model) is None:
             continue
-        file = files.find(model.file, files.main)
-        if file is None:
-            raise ModelError(files.unknown_packages())
+        file = files.needed(model.file, files.main)
         links = [link.removeprefix(f"{model.name}::") for link in placed]
-        copy, fixed = mender.copy(file, model.name, links)
-        model.file = copy.as_uri()
-        if fixed and file in standing:
-            raise ModelError(
-                f"models '{standing[file]}' and '{model.name}' stand in one place: '{file.name}' "
-                f"fixes its link '{fixed[0]}' to the world. Say where another one stands by "
-                f"add_weld: {{parent: world, child: {model.name}::{fixed[0]}, X_PC: ...}}, in the "
-                "place of the joint in the file"
-            )
-        if fixed:
-            standing[file] = model.name
+        model.file = mender.copy(file, model.name, links).as_uri()
     return directives
 
 
@@ -176,19 +136,13 @@ def _find_packages(files: RobotFiles, file: Path, within: tuple[Path, ...]) -> N
         raise ModelError(f"'{file.name}' includes itself: {names}")
     for directive in LoadModelDirectives(str(file)).directives:
         if directive.add_directives is not None:
-            inner = files.find(directive.add_directives.file, file)
-            if inner is None:
-                raise ModelError(files.unknown_packages())
+            inner = files.needed(directive.add_directives.file, file)
             _find_packages(files, inner, (*within, file))
 
 
 @contextmanager
 def drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Iterator[None]:
-    """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion.
-
-    Args:
-        originals: A copy -> the file that the message names instead.
-    """
+    """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
     try:
         yield
     except DrakeDaeError:
@@ -200,16 +154,16 @@ def drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Itera
         raise ModelError(text) from None
 
 
-def _lost(mender: Mender) -> str:
+def _told(mender: Mender) -> str:
     """The message for what Drake does not read of the files."""
     text = "; ".join(f"{part} ({_listed(places)})" for part, places in mender.lost.items())
-    found = {hint for part in mender.lost for word, hint in _REMEDIES.items() if word in part}
-    hints = sorted(found)
+    ways = [f"leave_out: [{', '.join(mender.lost)}] under robot"]
+    ways += [hint for word, hint in _REMEDIES.items() if any(word in part for part in mender.lost)]
     if any(part.startswith(DRIVES) for part in mender.lost):
-        hints.append("or name the driven joints under robot.actuators")
+        ways.append("or name the driven joints under robot.actuators")
     return (
         f"the equations would lack what Drake does not read of the file: {text}. Mend it, or write "
-        f"leave_out: [{', '.join(mender.lost)}] under robot{'; ' * bool(hints)}{'; '.join(hints)}"
+        f"{'; '.join(ways)}"
     )
 
 
@@ -228,22 +182,20 @@ def _add_floating_joints(plant: MultibodyPlant, mender: Mender) -> None:
 
     No constraint force keeps the length of a quaternion at 1.
     """
-    for joint in mender.floating:
-        models = _instance(plant, joint.model)
-        is_world = joint.parent == "world"
-        parent = plant.world_body() if is_world else plant.GetBodyByName(joint.parent, *models)
-        body = plant.GetBodyByName(joint.child, *models)
+    for model, name, parent, child, pose in mender.floating:
+        models = _instance(plant, model)
+        is_world = parent == "world"
+        above = plant.world_body() if is_world else plant.GetBodyByName(parent, *models)
+        body = plant.GetBodyByName(child, *models)
         start = plant.GetDefaultFloatingBaseBodyPose(body)
-        pose = RigidTransform(RollPitchYaw(joint.origin[3:]), joint.origin[:3])
+        origin = RigidTransform(RollPitchYaw(pose[3:]), pose[:3])
         frame = plant.AddFrame(
-            FixedOffsetFrame(
-                f"{joint.name}_origin", parent.body_frame(), pose, body.model_instance()
-            )
+            FixedOffsetFrame(f"{name}_origin", above.body_frame(), origin, body.model_instance())
         )
-        added = plant.AddJoint(RpyFloatingJoint(joint.name, frame, body.body_frame()))
+        joint = plant.AddJoint(RpyFloatingJoint(name, frame, body.body_frame()))
         if is_world:
-            added.SetDefaultPose(start)
-        mender.changes[
+            joint.SetDefaultPose(start)
+        mender.changed[
             "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place "
             "of a quaternion, and must not pitch by 90 degrees"
-        ].append(f"'{joint.name}'")
+        ].append(f"'{name}'")

@@ -22,9 +22,6 @@ def read_xml(file: Path) -> Node:
     """The root of an XML file.
 
     Like Drake it takes prefixes that are not declared, such as `drake:`, as parts of names.
-
-    Raises:
-        ModelError: It is no XML, has entities, or is nested too deep.
     """
     try:
         data = read_bytes(file)

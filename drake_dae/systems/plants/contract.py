@@ -128,15 +128,39 @@ class Plant(System):
         check_context(self, context)
         context.SetContinuousState(self.dae.state_vector(state))
 
-    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
-        """Sets the state on N* next to a guess, shape (n,), and returns it.
+    def set_consistent_state(
+        self, context: Context, guess: ArrayLike | Mapping[str, float], fixed: Sequence[str] = ()
+    ) -> FloatArray:
+        """Sets the state on N* next to a guess, and returns it.
+
+        Args:
+            context: The context of this plant.
+            guess: x, shape (n,): velocities that are not zero are kept where the constraints allow
+                it. Or name of a state -> its value, which is fixed; the others are near the nominal
+                state.
+            fixed: Names of further states that keep their values.
 
         Raises:
-            InconsistentStateError: None is found near the guess.
+            InconsistentStateError: None is found near the guess, or none with these states fixed.
         """
-        state = self.structure.manifold.settle(guess, self.current_parameters(context))
+        state = self._consistent(guess, fixed, self.current_parameters(context))
         self.set_state(context, state)
         return state
+
+    def _consistent(
+        self,
+        guess: ArrayLike | Mapping[str, float],
+        fixed: Sequence[str],
+        parameters: FloatArray,
+    ) -> FloatArray:
+        """The state on N* next to a guess, as for `set_consistent_state`."""
+        if isinstance(guess, Mapping):
+            names = [signal.name for signal in self.dae.state_signals]
+            start, fixed = self.dae.nominal_state.copy(), [*fixed, *guess]
+            for name in set(guess) & set(names):  # The manifold refuses others.
+                start[names.index(name)] = guess[name]
+            guess = start
+        return self.structure.manifold.settle(guess, parameters, fixed)
 
     @property
     def port_signals(self) -> dict[str, tuple[Signal, ...]]:

@@ -1,6 +1,6 @@
 """Any DaeSystem as a LeafSystem."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import casadi as ca
@@ -103,20 +103,18 @@ class DaePlant(ParameterizedSystem, Plant):
     def _start(self, structure: ConstraintStructure, block: Block) -> None:
         """Makes the system of its block."""
         system, values = structure.system, (*block.outputs.values(), block.derivative)
+        self.equations = system
         self.structure, self._left_out = structure, manifold_of_left_out(structure.system)
         self.projects = block.projection is not None
         super().__init__(system, block, system.exogenous.degrees(*values))
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
 
-    def set_consistent_state(self, context: Context, guess: ArrayLike) -> FloatArray:
-        """Sets the state on N* next to a guess, shape (n,), and returns it.
-
-        Raises:
-            InconsistentStateError: None is found near the guess.
-        """
+    def set_consistent_state(
+        self, context: Context, guess: ArrayLike | Mapping[str, float], fixed: Sequence[str] = ()
+    ) -> FloatArray:
         self.check_context(context)
         values = self._values(context)
-        state = self.structure.manifold.settle(guess, values)
+        state = self._consistent(guess, fixed, values)
         self._check_left_out(state, values)
         self.set_state(context, state)
         return state
@@ -190,7 +188,8 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
         force = ca.substitute(force, control, none)
     projection = None
     if project and system.num_constraints:
-        projection = Projection(newton_of(manifold), manifold.projected)
+        parameters = system.parameter_symbol
+        projection = Projection(newton_of(manifold), manifold.projected, parameters)
     return Block(
         system.name,
         inputs={"control": control},

@@ -8,9 +8,11 @@ from runs import scenario
 
 from drake_dae import build_scenario
 from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.structure.constrained import find_constraint_structure
 from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.system.system import DaeSystem
-from drake_dae.errors import InconsistentStateError
+from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import newton, shortest_steps
 from drake_dae.trace.round_off import are_dependent
 
@@ -250,3 +252,65 @@ def test_a_state_near_a_pole_of_a_constraint_is_not_consistent(off):
         else:  # Newton's steps double, and lead away from the pole.
             np.testing.assert_allclose(turned.residual(find(start)), 0.0, atol=1e-12)
     np.testing.assert_allclose(turned.project([1.0, 0.2, 0.3, 0.1])[:2], 0.0, atol=1e-12)
+
+
+def crank():
+    """Two bodies of 1 and 100 kg on a line, of which one pulls the other by a gear of 2.
+
+    Least kinetic energy would keep the heavy one.
+    """
+    x, v = ca.SX.sym("x", 2), ca.SX.sym("v", 2)
+    system = DaeSystem(
+        name="gear",
+        state=ca.vertcat(x, v),
+        f=ca.vertcat(v, 0, 0),
+        g=ca.vertcat(0, 0, 1, -0.02),
+        h=ca.SX(4, 0),
+        k=x[0] - 2 * x[1] + 0.1 * ca.sin(x[0]),
+        l=ca.SX(0, 1),
+        m=ca.SX(0, 1),
+        state_signals=[Signal(name, "m") for name in ("x", "y", "x_v", "y_v")],
+        nominal_state=np.zeros(4),
+    )
+    return find_constraint_structure(system).manifold
+
+
+def test_a_velocity_that_is_given_is_kept_and_the_others_follow():
+    """x' - 2 y' + 0.1 cos(x) x' = 0 at x = 0.3, y = (0.3 + 0.1 sin 0.3) / 2."""
+    manifold = crank()
+    y = (0.3 + 0.1 * np.sin(0.3)) / 2.0
+    found = manifold.settle([0.3, y, 5.24, 0.0])
+    np.testing.assert_allclose(found, [0.3, y, 5.24, 5.24 * (1 + 0.1 * np.cos(0.3)) / 2])
+
+
+def test_states_that_are_fixed_keep_their_values_or_it_says_so():
+    manifold = crank()
+    found = manifold.settle([0.3, 0.0, 0.0, 1.0], fixed=["x", "y_v"])
+    y = (0.3 + 0.1 * np.sin(0.3)) / 2.0
+    np.testing.assert_allclose(found, [0.3, y, 2.0 / (1 + 0.1 * np.cos(0.3)), 1.0])
+    with pytest.raises(InconsistentStateError, match="x, y"):
+        manifold.settle([0.3, 0.0, 0.0, 0.0], fixed=["x", "y"])
+    with pytest.raises(ModelError, match="'z'"):
+        manifold.settle([0.3, 0.0, 0.0, 0.0], fixed=["z"])
+
+
+def test_a_start_half_a_turn_off_is_tried_again():
+    """2 tan(x / 2) is zero at 0, and has a pole at half a turn, where Newton's step is short."""
+    x, v = ca.SX.sym("x", 2), ca.SX.sym("v", 2)
+    system = DaeSystem(
+        name="weld",
+        state=ca.vertcat(x, v),
+        f=ca.vertcat(v, 0, 0),
+        g=ca.vertcat(0, 0, 1, 0),
+        h=ca.SX(4, 0),
+        k=2 * ca.tan(x[0] / 2),
+        l=ca.SX(0, 1),
+        m=ca.SX(0, 1),
+        nominal_state=np.zeros(4),
+    )
+    manifold = find_constraint_structure(system).manifold
+    start = [np.pi - 1e-9, 0.5, 0.0, 0.0]
+    assert not manifold.is_consistent(start)
+    found = manifold.settle(start)
+    np.testing.assert_allclose(np.cos(found[0]), 1.0, atol=1e-12)
+    assert manifold.is_consistent(found)

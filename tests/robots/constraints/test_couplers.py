@@ -131,7 +131,7 @@ def test_rods_of_a_plant_are_fixed_distances():
     own = JointCoupler("hinge0", "hinge1")
     with pytest.raises(ModelError, match=r"3.*2"):
         RobotModel(links, [own], [])
-    model = RobotModel(links, [own], [], forces=["rod1.thrust", "rod0.thrust"])
+    model = RobotModel(links, [own], [], [0.0, 0.0], forces=["rod1.thrust", "rod0.thrust"])
     assert model.constraints == (
         own,
         FixedDistance("first", (0.4, 0.0, 0.0), "second", (0.0, 0.5, 0.0), 0.7, "rod0"),

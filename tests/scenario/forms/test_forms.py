@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -72,7 +73,10 @@ class Everything:
 READER = Reader(
     Everything,
     {Surface: Family({"!Bowl": Bowl, "!Funnel": Cone})},
-    {ArrayLike: NUMBERS, tuple[float, float, float]: TRIPLE},
+    {
+        ArrayLike: Annotated[Any, NUMBERS],
+        tuple[float, float, float]: Annotated[Any, TRIPLE],
+    },
     {
         Config: {"accuracy": Key(float, 0.25, "How well."), "step": Key(float, 0.1, "How far.")},
         Cone: {**keys_of(Cone), "angle": Key(float, 30.0, "")},

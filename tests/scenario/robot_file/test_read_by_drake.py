@@ -15,7 +15,7 @@ from pydrake.solvers import MathematicalProgram
 from drake_dae.errors import ModelError
 from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.read_by_drake import READ_BY_DRAKE
-from drake_dae.scenario.robot_file.reading import parts_to_leave_out, read_robot
+from drake_dae.scenario.robot_file.reading import needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.robot_file.xml_tree import read_xml, write_xml
 
@@ -246,7 +246,7 @@ def test_what_is_lost_is_an_error_with_its_name_until_it_is_left_out(
     file = tmp_path / f"robot{kind}"
     file.write_text(text)
     robot = Robot(str(file))
-    assert parts_to_leave_out(robot) == [part]
+    assert needs_of(robot)[1] == [part]
     with pytest.raises(ModelError, match=rf"leave_out: \[{part}\]"):
         read_robot(robot)
     finalize(read_robot(Robot(str(file), leave_out=[part]))[0])

@@ -15,7 +15,6 @@ from vendors import joint, link, mobile_arm, panda, robot, write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import RobotFileWarning, ScenarioError
-from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.changes import change_robot
 from drake_dae.scenario.robot_file.links import robot_links
@@ -254,33 +253,20 @@ def test_limits_of_the_scenario_are_those_of_actuators_that_it_adds(tmp_path):
     np.testing.assert_array_equal(links.effort_limits, [60.0, 87.0])
 
 
-@pytest.mark.parametrize("text", [PANDA, MOBILE], ids=["arm", "cart"])
-def test_a_saved_scenario_is_read_back_equal(text, tmp_path):
-    scenario = load_scenario(files(tmp_path, text))
-    save_scenario(scenario, tmp_path / "saved.yaml")
-    assert load_scenario(tmp_path / "saved.yaml") == scenario
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
         (["robot.base=null"], ["'panda_link0'", "{weld: panda_link0}"]),
-        (["robot.base.wold=x"], ["robot.base: ", "'wold'", "'weld'"]),
-        (["robot.base=panda_link0"], ["robot.base: ", "'panda_link0'"]),
         (["robot.base.weld=panda_lnk0"], ["robot.base.weld: ", "'panda_link0'"]),
         (["robot.base.weld=panda_hand"], ["robot.base.weld: ", "'panda_hand_joint'"]),
         (["robot.base.weld=world"], ["robot.base.weld: "]),
-        (["robot.base.pose.rpy_deg=[0, 0]"], ["robot.base.pose.rpy_deg: ", "3"]),
         (["robot.free=[panda_link0]"], ["robot.free: ", "'world_welds_to_panda_link0'"]),
         (["robot.locked={panda_joint8: 0}"], ["robot.locked: ", "panda_joint"]),
         (["robot.locked={panda_hand_joint: 0}"], ["robot.locked: ", "'panda_hand_joint'", "there"]),
         (["robot.locked={panda_joint1: 3}"], ["robot.locked: ", "3", "-2.9", "2.9"]),
         (["robot.locked.panda_finger_joint2=0"], ["robot.locked: "]),
-        (["robot.locked={panda_joint1: a}"], ["robot.locked.panda_joint1: ", "'a'"]),
-        (["robot.locked=[panda_joint1]"], ["robot.locked: "]),
         (["robot.locked.panda_joint7=0"], ["outputs.1: ", "'panda_joint7'"]),
         (["robot.actuators=null"], ["robot.actuators: ", "'panda.urdf'", "all"]),
-        (["robot.actuators=some"], ["robot.actuators: ", "'some'"]),
         (["robot.actuators=[panda_joint0]"], ["robot.actuators: ", "panda_joint"]),
         (["robot.actuators=[panda_finger_joint1]"], ["robot.actuators: ", "'panda_finger_joint1'"]),
         (["robot.actuators={panda_joint1: 0}"], ["robot.actuators: ", "panda_joint1", "positive"]),
@@ -357,17 +343,9 @@ def test_joint_friction_is_left_out_where_the_scenario_says_so(tmp_path):
     (tmp_path / "arm.yaml").write_text(FRICTION)
     links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
     assert links.plant.GetJointByName("j").default_damping() == 0.5
-    with pytest.raises(ScenarioError) as caught:
+    with pytest.raises(ScenarioError, match=r"robot\.file: .*arm\.urdf:7: joint 'j'"):
         scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[]"]))
-    message = str(caught.value)
-    assert message.startswith("robot.file: ")
-    assert "arm.urdf:7: " in message
-    assert "'j'" in message
-    assert r"[dynamics/friction]" in message
-    with pytest.raises(
-        ScenarioError,
-        match=r"leave_out\.0: ",
-    ):
+    with pytest.raises(ScenarioError, match=r"leave_out\.0: "):
         load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[x]"])
 
 
@@ -382,22 +360,8 @@ def test_a_transmission_without_effort_needs_actuators(tmp_path):
     (tmp_path / "arm.yaml").write_text(FRICTION)
     links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
     np.testing.assert_array_equal(links.effort_limits, [np.inf])
-    with pytest.raises(ScenarioError, match=r"robot\.file: .*\(j: .*robot\.actuators"):
+    with pytest.raises(ScenarioError, match=r"robot\.file: .*'j'.*robot\.actuators"):
         scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.actuators=null"]))
-
-
-def test_what_drake_refuses_to_change_is_reported(tmp_path):
-    """An actuator of the file has the name that the one of another joint would get."""
-    drive = (
-        "<transmission><type>transmission_interface/SimpleTransmission</type>"
-        '<joint name="j"/><actuator name="k"/></transmission>'
-    )
-    bodies = [link(name, 1) for name in ("base", "arm", "hand")]
-    joints = [joint("j", "base", "arm", "0 1 0"), joint("k", "arm", "hand", "0 1 0")]
-    (tmp_path / "arm.urdf").write_text(robot("arm", *bodies, *joints, drive))
-    (tmp_path / "arm.yaml").write_text(FRICTION)
-    with pytest.raises(ScenarioError, match=r"robot\.file: .*'k'"):
-        scenario_model(load_scenario(tmp_path / "arm.yaml"))
 
 
 def test_a_joint_that_follows_with_multiplier_0_stands(tmp_path):

@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.geometry import Role, SceneGraph
-from runs import run_scenario
-from vendors import COLLADA, binary_stl, write_panda, write_ur5
+from vendors import binary_stl, write_panda, write_ur5
 
-from drake_dae import build_scenario, load_scenario
-from drake_dae.errors import GeometryWarning, ModelError, ScenarioError
-from drake_dae.pictures.scene.view import start_meshcat
+from drake_dae.errors import GeometryWarning, ModelError
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 
@@ -46,18 +43,6 @@ def test_collision_meshes_are_left_out_by_name_and_the_rest_stays(tmp_path: Path
     assert count(scene_graph, Role.kIllustration) == 11
 
 
-def test_names_beside_the_file_lead_to_the_same_meshes(tmp_path: Path):
-    scene_graph = SceneGraph()
-    with pytest.warns(GeometryWarning, match=r"'link\.stl'"):
-        read(write_ur5(tmp_path), scene_graph)
-    inspector = scene_graph.model_inspector()
-    drawn = {
-        Path(inspector.GetShape(one).source().path()).resolve()
-        for one in inspector.GetAllGeometryIds(Role.kIllustration)
-    }
-    assert drawn == {tmp_path / "meshes" / "link.dae"}
-
-
 def test_a_collision_that_drake_can_read_stays(tmp_path: Path):
     file = write_ur5(tmp_path)
     (tmp_path / "meshes" / "good.obj").write_text(OBJ)
@@ -70,35 +55,6 @@ def test_a_collision_that_drake_can_read_stays(tmp_path: Path):
     file.write_text(text.replace("link.stl", "good.obj"))
     read(file, scene_graph := SceneGraph())
     assert count(scene_graph, Role.kProximity) == 7
-
-
-def test_a_material_keeps_the_colour_that_it_has_first(tmp_path: Path):
-    """Drake refuses a URDF that gives a name two colours, other readers take one."""
-    part = (
-        '<visual><geometry><sphere radius="0.1"/></geometry>\n<material name="paint">'
-        '<color\n rgba="{} 0 0 1"/></material></visual>\n'
-    )
-    links = "".join(
-        f'<link name="{n}">{part.format(red)}</link>' for n, red in (("a", 1), ("b", 0))
-    )
-    joint = '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
-    (tmp_path / "paint.urdf").write_text(f'<robot name="r">{links}{joint}</robot>')
-    scene_graph = SceneGraph()
-    read(tmp_path / "paint.urdf", scene_graph)
-    inspector = scene_graph.model_inspector()
-    found = [
-        inspector.GetProperties(one, Role.kIllustration).GetProperty("phong", "diffuse").r()
-        for one in inspector.GetAllGeometryIds(Role.kIllustration)
-    ]
-    assert found == [1.0, 1.0]
-
-
-def test_a_collision_with_too_few_points_is_left_out(tmp_path: Path):
-    file = write_ur5(tmp_path)
-    (tmp_path / "meshes" / "link.obj").write_text("v 0 0 0\n")
-    file.write_text(file.read_text().replace("link.stl", "link.obj"))
-    with pytest.warns(GeometryWarning, match=r"'link\.obj'"):
-        read(file, SceneGraph())
 
 
 def test_models_of_directives_are_read_so_too(tmp_path: Path):
@@ -118,25 +74,6 @@ def test_models_of_directives_are_read_so_too(tmp_path: Path):
     assert plant.HasModelInstanceNamed("left")
     assert plant.num_joints() == 22
     assert count(scene_graph, Role.kIllustration) == 22
-
-
-SDF = """<sdf version="1.9"><model name="m">
-<!-- <collision name="old"><geometry><mesh><uri>none.stl</uri></mesh></geometry></collision> -->
-<link name="a"><collision name="c"><geometry><mesh><uri>a.stl</uri></mesh></geometry></collision>
-<visual name="v"><geometry><mesh><uri>a.dae</uri></mesh></geometry></visual>
-<collision name="d"><geometry><sphere><radius>0.1</radius></sphere></geometry></collision></link>
-</model></sdf>"""
-
-
-def test_sdformat_is_read_so_too(tmp_path: Path):
-    (tmp_path / "a.stl").write_bytes(binary_stl())
-    (tmp_path / "a.dae").write_text(COLLADA)
-    (tmp_path / "robot.sdf").write_text(SDF)
-    scene_graph = SceneGraph()
-    with pytest.warns(GeometryWarning, match=r"'a\.stl'"):
-        read(tmp_path / "robot.sdf", scene_graph)
-    assert count(scene_graph, Role.kProximity) == 1
-    assert count(scene_graph, Role.kIllustration) == 1
 
 
 @pytest.mark.usefixtures("without_trimesh")
@@ -240,81 +177,34 @@ def test_shapes_of_size_0_are_left_out(kind: str, shape: str, tmp_path: Path):
     assert scene_graph.model_inspector().num_geometries() == 0
 
 
-UR5 = """
-robot: {file: robots/ur5.urdf, base: {weld: base_link}, actuators: all}
-outputs:
-- !JointPositions
-  joints: [shoulder_pan_joint, shoulder_lift_joint, elbow_joint, wrist_1_joint, wrist_2_joint,
-    wrist_3_joint]
-law:
-  gains: !Poles {all: [-3.0]}
-references: {shoulder_pan_joint: 0.2, shoulder_lift_joint: 0.3, elbow_joint: 0.4,
-  wrist_1_joint: 0.1, wrist_2_joint: 0.2, wrist_3_joint: 0.3}
-"""
-
-
-def test_a_robot_with_meshes_is_drawn(tmp_path: Path):
-    write_ur5(tmp_path)
-    (tmp_path / "ur5.yaml").write_text(UR5)
-    with pytest.warns(GeometryWarning, match=r"'link\.stl'"):
-        loop, context = build_scenario(load_scenario(tmp_path / "ur5.yaml"), start_meshcat())
-    loop.diagram.ForcedPublish(context)
-
-
-MJCF = """<mujoco model="arm"><compiler angle="radian" meshdir="assets"/>
+MJCF = """<mujoco model="arm"><compiler meshdir="assets"/>
 <asset><mesh name="upper" file="upper.stl"/><mesh file="lower.obj"/>
 <!-- <mesh name="old" file="old.stl"/> --></asset>
 <worldbody><body name="a"><inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>
-<joint name="j1" type="hinge" axis="0 1 0"/><geom type="mesh" mesh="upper"/>
+<joint name="j1" axis="0 1 0"/><geom type="mesh" mesh="upper"/>
 <body name="b" pos="0 0 0.4"><inertial pos="0 0 0.2" mass="2" diaginertia="0.1 0.2 0.1"/>
-<joint name="j2" type="hinge" axis="0 1 0"/><geom type="mesh" mesh="lower"/></body></body>
-</worldbody>
-<actuator><motor joint="j1"/><motor joint="j2"/></actuator></mujoco>"""
-
-ARM = """
-robot: {file: arm.xml}
-outputs: [!JointPositions {joints: [j1, j2]}]
-law:
-  gains: !Poles {all: [-3.0]}
-references: {j1: 0.2, j2: 0.3}
-start: {errors: {j1: 0.1}}
-duration: 0.5
-"""
-
-
-def write_mjcf(folder: Path, text: str = MJCF) -> Path:
-    (folder / "assets").mkdir()
-    (folder / "assets" / "upper.stl").write_bytes(binary_stl())
-    (folder / "assets" / "lower.obj").write_text(OBJ)
-    (folder / "arm.xml").write_text(text)
-    (folder / "arm.yaml").write_text(ARM)
-    return folder / "arm.yaml"
+<joint name="j2" axis="0 1 0"/><geom type="mesh" mesh="lower"/></body></body></worldbody>
+</mujoco>"""
 
 
 @pytest.mark.usefixtures("without_trimesh")
-def test_an_mjcf_robot_runs_without_the_meshes_that_drake_cannot_read(tmp_path: Path):
-    """Its masses are those of the file; the accuracy of a step, 1e-6, is in the prediction."""
-    path = write_mjcf(tmp_path)
+def test_meshes_of_mjcf_are_left_out_unless_a_mass_is_that_of_one(tmp_path: Path):
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "assets" / "upper.stl").write_bytes(binary_stl())
+    (tmp_path / "assets" / "lower.obj").write_text(OBJ)
+    file = tmp_path / "arm.xml"
+    file.write_text(MJCF)
     scene_graph = SceneGraph()
     with pytest.warns(GeometryWarning, match=r"'upper\.stl'"):
-        plant = read(tmp_path / "arm.xml", scene_graph)
+        plant = read(file, scene_graph)
     assert [plant.GetBodyByName(name).default_mass() for name in "ab"] == [1.0, 2.0]
     assert count(scene_graph, Role.kProximity) == 1
-    with pytest.warns(GeometryWarning):
-        loop, _, record = run_scenario(load_scenario(path))
-    predicted = loop.predicted_error(record)
-    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-5)
-
-
-@pytest.mark.usefixtures("without_trimesh")
-@pytest.mark.parametrize("head", ['meshdir="assets"', 'meshdir="assets" inertiafromgeom="true"'])
-def test_an_mjcf_body_that_weighs_what_its_mesh_does_is_refused(head: str, tmp_path: Path):
-    text = MJCF.replace('meshdir="assets"', head)
-    if "inertiafromgeom" not in head:
-        text = text.replace('<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>', "")
-    path = write_mjcf(tmp_path, text)
-    with pytest.raises(ScenarioError, match=r"robot\.file: .*'a'.*upper\.stl"):
-        build_scenario(load_scenario(path))
+    weighed = '<compiler inertiafromgeom="true"'
+    lighter = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>'
+    for old, new in (("<compiler", weighed), (lighter, "")):
+        file.write_text(MJCF.replace(old, new))
+        with pytest.raises(ModelError, match=r"'a'.*upper\.stl"):
+            read(file, SceneGraph())
 
 
 def box_of_collada(file: Path, unit: float) -> None:
@@ -357,8 +247,11 @@ def test_a_dae_is_drawn_in_its_unit_and_its_colors_by_films_as_well(unit: float,
         'izz="1" ixy="0" ixz="0" iyz="0"/></inertial><visual><geometry>'
         '<mesh filename="box.dae" scale="2 1 1"/></geometry></visual></link></robot>'
     )
-    scene_graph = SceneGraph()
-    read(tmp_path / "robot.urdf", scene_graph)
+    read_robot(Robot(str(tmp_path / "robot.urdf")), scene_graph := SceneGraph(), drawn=False)
+    inspector = scene_graph.model_inspector()
+    (one,) = inspector.GetAllGeometryIds(Role.kPerception)
+    assert Path(inspector.GetShape(one).source().path()).name == "box.dae"
+    read(tmp_path / "robot.urdf", scene_graph := SceneGraph())
     inspector = scene_graph.model_inspector()
     (one,) = inspector.GetAllGeometryIds(Role.kPerception)
     drawn = Path(inspector.GetShape(one).source().path())
@@ -371,20 +264,3 @@ def test_a_dae_is_drawn_in_its_unit_and_its_colors_by_films_as_well(unit: float,
     )
     # .gltf has single precision; Drake's box has a margin of its own.
     np.testing.assert_allclose(np.ptp(corners, axis=1), unit * np.array([200, 200, 300]), rtol=1e-3)
-
-
-@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")
-def test_a_mesh_is_converted_only_for_a_robot_that_is_drawn(tmp_path: Path):
-    box_of_collada(tmp_path / "box.dae", 1.0)
-    file = tmp_path / "robot.urdf"
-    file.write_text(
-        '<robot name="r"><link name="a"><inertial><mass value="1"/><inertia ixx="1" iyy="1" '
-        'izz="1" ixy="0" ixz="0" iyz="0"/></inertial><visual><geometry>'
-        '<mesh filename="box.dae"/></geometry></visual></link></robot>'
-    )
-    for drawn, name in ((False, "box.dae"), (True, "box.gltf")):
-        scene_graph = SceneGraph()
-        read_robot(Robot(str(file)), scene_graph, drawn)
-        inspector = scene_graph.model_inspector()
-        (one,) = inspector.GetAllGeometryIds(Role.kPerception)
-        assert Path(inspector.GetShape(one).source().path()).name == name

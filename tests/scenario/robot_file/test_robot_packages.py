@@ -59,17 +59,6 @@ def away(folder: Path) -> str:
     return "robots/panda.urdf"
 
 
-def test_the_package_of_the_file_is_found(tmp_path: Path):
-    write_panda(tmp_path)
-    assert joints(tmp_path) == 7
-
-
-def test_its_name_is_that_of_package_xml_and_not_of_the_folder(tmp_path: Path):
-    write_panda(tmp_path)
-    (tmp_path / "panda_description").rename(tmp_path / "clone")
-    assert joints(tmp_path, "clone/urdf/panda.urdf") == 7
-
-
 def test_a_package_beside_that_of_the_file_is_found(tmp_path: Path):
     file = write_panda(tmp_path)
     (tmp_path / "my_cell" / "robots").mkdir(parents=True)

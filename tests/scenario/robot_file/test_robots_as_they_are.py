@@ -132,15 +132,6 @@ def test_a_joint_that_moves_no_mass_is_named(name, tmp_path):
         robot_links(own, SceneGraph())
 
 
-def test_all_joints_that_move_no_mass_are_named(tmp_path):
-    names = ("base", "upper", "lower", "hand")
-    joints = [joint(f"j{k}", names[k], names[k + 1], "0 1 0") for k in range(3)]
-    heavy, empty = [link(name, 1) for name in names[:2]], [f'<link name="{n}"/>' for n in names[2:]]
-    file = written(tmp_path, robot("arm", *heavy, *empty, *joints))
-    with pytest.raises(ScenarioError, match=r"j1, j2.*lower, hand"):
-        robot_links(Robot(str(file), base=RobotPlacement("base"), actuators="all"), SceneGraph())
-
-
 def test_a_point_mass_moves_by_both_joints_though_not_where_the_arm_is_straight(tmp_path):
     """|M(q)| = (m l^2 sin q_2)^2 of a mass m at the end of two links of l without mass."""
     mass = '<inertial><origin xyz="0 0 0.4"/><mass value="2"/><inertia {}/></inertial>'
@@ -363,15 +354,6 @@ def test_a_fixed_joint_mimics_nothing_and_a_transmission_to_no_joint_drives_noth
     assert [(one.name(), one.joint().name()) for one in found] == [("motor", "a"), ("motor_2", "c")]
 
 
-@pytest.mark.parametrize("slashes", ["//", "///"])
-def test_a_package_with_three_slashes_is_that_with_two(slashes, tmp_path):
-    (tmp_path / "part.stl").write_bytes(binary_stl())
-    text = robot("r", link("base", 1, f"package:{slashes}own/part.stl"))
-    scene_graph = SceneGraph()
-    plant_of(written(tmp_path, text), scene_graph, packages={"own": str(tmp_path)})
-    assert scene_graph.model_inspector().num_geometries() == 1
-
-
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
@@ -468,13 +450,6 @@ def test_a_robot_that_its_file_holds_stands_where_the_user_says(name, tmp_path):
         place(plant_of(file, base=moved), "tip", "arm"), [0.75, 0, 0], atol=1e-12
     )
     assert plant_of(file, free=["base"]).num_velocities() == plant_of(file).num_velocities() + 6
-
-
-@pytest.mark.parametrize("name", HELD)
-def test_two_robots_in_one_place_are_refused(name, tmp_path):
-    two = written(tmp_path, TWO.format(written(tmp_path, HELD[name], name)), "two.dmd.yaml")
-    with pytest.raises(ModelError, match="'left' and 'right'"):
-        plant_of(two)
 
 
 # Joints that float.

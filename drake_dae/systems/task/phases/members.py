@@ -30,7 +30,7 @@ class Approach(Phase):
     Attributes:
         speed: The speed of the touch, in m/s; less if it touches during the transition, such as
             after a start at rest nearer than speed * over / 2. None for 0.05 m/s, and for less
-            where a scenario computes the gains for a compliant contact: see `lasting_speed`.
+            where a scenario computes the gains for a compliant contact: so that it lasts.
         behind: The largest distance behind the surface of the model, in m; farther behind it is
             late.
         over: The duration of the transition from the previous references, in s.
