@@ -26,7 +26,6 @@ from drake_dae.robots.known_forces import ScaledForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.controllers.task_controller import check_task, task_controller
 from drake_dae.scenario.forms.keys import at, each, violated
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, scenario_structure
@@ -36,6 +35,7 @@ from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.scenario.task_controller import check_task, task_controller
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 
