@@ -85,10 +85,12 @@ class Projection:
             the gradients at the start.
         project: (state, parameters) -> the state on the manifold, also where plain Newton steps do
             not converge; the state itself if it is there. Raises InconsistentStateError.
+        parameters: The parameters of both, an expression of the block's symbols.
     """
 
     newton: ca.Function
     project: Callable[[FloatArray, FloatArray], FloatArray]
+    parameters: ca.SX
 
 
 @dataclass(frozen=True, eq=False)

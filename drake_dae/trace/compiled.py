@@ -13,7 +13,8 @@ better choice. Calls are counted instead of reading a clock, so that each run do
 import hashlib
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -81,13 +82,13 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     path = library(source, function.n_instructions(), compiled, make)
     if path is None:
         return None
-    try:
-        return ca.external(function.name(), str(path))
-    except RuntimeError as error:
-        lines = [line for line in str(error).splitlines() if line.strip()] or [""]
-        why = f"compiled code cannot be loaded: {brief(lines[-1])}"
-        _warn(MachineCodeError(why), make)
-        return None
+    with _warned(make):  # Which makes it None.
+        try:
+            return ca.external(function.name(), str(path))
+        except RuntimeError as error:
+            lines = [line for line in str(error).splitlines() if line.strip()] or [""]
+            why = f"compiled code cannot be loaded: {brief(lines[-1])}"
+            raise MachineCodeError(why) from None
 
 
 def library(
@@ -98,45 +99,41 @@ def library(
     Warns:
         MachineCodeWarning: Machine code is requested and cannot be made.
     """
+    more = tuple(options)
+    with _warned(make):  # Which makes it None.
+        compiler = find_compiler()
+        for level in ("-O1", "-O0") if compiled == "auto" else ("-O1",):
+            path = files.find(_key(source, compiler, level, more))
+            if path is not None:
+                return path
+        level = _level(compiled, operations)
+        if not (make and level):
+            return None
+        with files.workplace() as folder:
+            usual = STARTING + COMPILING[level] * operations
+            seconds = max(PATIENCE * LIMIT, SLOWEST * usual if compiled is True else 0.0)
+            try:
+                compiler.compile(source, folder / "code", level, seconds, more)
+            except CompilerHangs as error:
+                give_up(compiler, error)
+                raise
+            return files.store(_key(source, compiler, level, more), folder / "code.so")
+
+
+@contextmanager
+def _warned(make: bool) -> Iterator[None]:
+    """Ends with a warning, if machine code was requested, where a MachineCodeError is raised."""
     try:
-        return _library(source, operations, compiled, make, tuple(options))
+        yield
     except MachineCodeError as error:
-        _warn(error, make)
-        return None
-
-
-def _warn(error: MachineCodeError, make: bool) -> None:
-    if make:
-        # One text at one place: Python shows it once.
-        warnings.warn(
-            f"{error}. Functions run interpreted, at about a tenth of the speed; that is "
-            "chosen without this warning by compiled=False (scenarios: compiled: false)",
-            MachineCodeWarning,
-            stacklevel=1,
-        )
-
-
-def _library(
-    source: str, operations: int, compiled: Compiled, make: bool, options: tuple[str, ...]
-) -> Path | None:
-    compiler = find_compiler()
-    levels = ("-O1", "-O0") if compiled == "auto" else ("-O1",)
-    for level in levels:
-        path = files.find(_key(source, compiler, level, options))
-        if path is not None:
-            return path
-    level = _level(compiled, operations)
-    if not (make and level):
-        return None
-    with files.workplace() as folder:
-        usual = STARTING + COMPILING[level] * operations
-        seconds = max(PATIENCE * LIMIT, SLOWEST * usual if compiled is True else 0.0)
-        try:
-            compiler.compile(source, folder / "code", level, seconds, options)
-        except CompilerHangs as error:
-            give_up(compiler, error)
-            raise
-        return files.store(_key(source, compiler, level, options), folder / "code.so")
+        if make:
+            # One text at one place: Python shows it once.
+            warnings.warn(
+                f"{error}. Functions run interpreted, at about a tenth of the speed; that is "
+                "chosen without this warning by compiled=False (scenarios: compiled: false)",
+                MachineCodeWarning,
+                stacklevel=1,
+            )
 
 
 def without_branches(source: str) -> str:
