@@ -218,7 +218,7 @@ def test_two_sources_of_noise_of_one_run_have_numbers_of_their_own(compiled):
     diagram = builder.Build()
     start, parameters = start_values(diagram, diagram.CreateDefaultContext())
     times = np.arange(10) * 0.1 + 0.05
-    seeds = [3, 4, 3]
+    seeds = np.array([3, 4, 3])
     found = rollout(
         diagram,
         [start] * 3,
