@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -66,6 +67,8 @@ class Requirement:
     reason: str
     fault: FailureKind = FailureKind.SINGULAR
 
+    OUTSIDE: ClassVar[FailureKind] = FailureKind.OUTSIDE
+
     @classmethod
     def regular(cls, pivot: ca.SX, matrix: str) -> "Requirement":
         """A matrix must be regular; see `Factorization.pivot`."""
@@ -85,10 +88,12 @@ class Projection:
             the gradients at the start.
         project: (state, parameters) -> the state on the manifold, also where plain Newton steps do
             not converge; the state itself if it is there. Raises InconsistentStateError.
+        parameters: The parameters of both, an expression of the block's symbols.
     """
 
     newton: ca.Function
     project: Callable[[FloatArray, FloatArray], FloatArray]
+    parameters: ca.SX
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,6 +68,8 @@ class TracedSystem(LeafSystem):
 
     Attributes:
         block: The block.
+        equations: The DaeSystem that plant and law may share; None if there is none.
+        is_law: Whether it is a law for `equations`, and not a plant with these equations.
 
     Raises:
         SingularityError: A matrix that must be regular is singular during a run.
@@ -76,6 +78,8 @@ class TracedSystem(LeafSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
+    equations: object = None
+    is_law = False
 
     def __init__(
         self, block: Block, *, compiled: Compiled = False, sees_steps: bool | None = None
@@ -89,6 +93,8 @@ class TracedSystem(LeafSystem):
         self._steps = StepWatch(self, watches)
         _declare(self, float, partial(_by_numbers, proxy(self)))
         if block.projection is not None:
+            values = {"parameters": block.projection.parameters}
+            self._projected_by = _by_numbers(proxy(self), "parameters", values, self._readers)
             self.DeclarePerStepUnrestrictedUpdateEvent(weakly(self._project))
         if any(held.begin is not None for held in block.held.values()):
             begin = {n: h.begin for n, h in block.held.items() if h.begin is not None}
@@ -125,6 +131,17 @@ class TracedSystem(LeafSystem):
         """As `ToAutoDiffXd`, with symbolic expressions."""
         return _convert(_CONVERTED[sym.Expression], self)
 
+    def begin_run(self, context: Context) -> None:
+        """Begins a run from a context without initialization events, which would do this."""
+        self._steps.begin(context)
+
+    def motion(self) -> ca.SX | None:
+        """x' of a plant that is the law's own `equations`, in fewer operations; None without it.
+
+        An expression of the block's symbols, for plants that get the law's control by a wire.
+        """
+        return None
+
     def explained(
         self, error: SimulationError, values: Mapping[str, FloatArray]
     ) -> SimulationError:
@@ -151,18 +168,13 @@ class TracedSystem(LeafSystem):
         x, projection = context.get_continuous_state_vector().value(), self.block.projection
         assert projection is not None
         try:
-            projected = projection.project(x, self._values(context))
+            projected = projection.project(x, self._projected_by(context)[0])
         except InconsistentStateError as error:
             raise off_manifold(context.get_time(), x.copy(), error) from error
         if projected is x:
             return _UNCHANGED
         state.get_mutable_continuous_state().SetFromVector(projected)
         return _CHANGED
-
-    def _values(self, context: Context) -> FloatArray:
-        """All parameters; the array must not be changed."""
-        values: FloatArray = context.get_numeric_parameter(0).value()
-        return values
 
     def traced(self) -> computations.Block:
         """The computations of the block."""
@@ -181,6 +193,20 @@ def check_context(system: System, context: Context) -> None:
         raise ModelError(
             f"the context is not that of '{system.get_name()}'; of a diagram's context take "
             "system.GetMyMutableContextFromRoot(context)"
+        ) from None
+
+
+def context_in(system: System, root: Context) -> Context:
+    """The context of a system in that of a diagram that contains it.
+
+    Raises:
+        ModelError: It belongs to a diagram without this system.
+    """
+    try:
+        return system.GetMyMutableContextFromRoot(root)
+    except RuntimeError:
+        raise ModelError(
+            f"the context is that of another diagram, which has not this '{system.get_name()}'"
         ) from None
 
 

@@ -104,7 +104,7 @@ class StepWatch:
         # An entry keeps its system alive: a context may hold one, but not the system itself.
         self._entry: Callable[[], CacheEntry | None] = lambda: None
         if sees_steps:
-            system.DeclareInitializationPublishEvent(weakly(self._begin))
+            system.DeclareInitializationPublishEvent(weakly(self.begin))
             system.DeclarePerStepPublishEvent(weakly(self._accept))
 
     def tolerate(self, context: Context, error: SimulationError) -> None:
@@ -135,7 +135,8 @@ class StepWatch:
         progress: RunProgress = self._system.get_cache_entry(self._index).Eval(context)
         return progress
 
-    def _begin(self, context: Context) -> EventStatus:
+    def begin(self, context: Context) -> EventStatus:
+        """Takes the state of a context as accepted, as an initialization event does."""
         time = context.get_time()
         progress = self._progress(context)
         entry = self._system.get_cache_entry(self._index)

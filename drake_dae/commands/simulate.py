@@ -95,9 +95,7 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     print(took, *notes, sep="\n", flush=True)
 
     # The run, in a folder of its own.
-    name = f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
-    unused = (Path("runs", name if i == 1 else f"{name}-{i}") for i in count(1))
-    folder = options.out or next(path for path in unused if not path.exists())
+    folder = options.out or _new_folder(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
     folder.mkdir(parents=True, exist_ok=True)
     for file in (*FILES, PART):
         (folder / file).unlink(missing_ok=True)
@@ -112,6 +110,16 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     if code == 0 and options.check and results.get("missed"):
         code = 2
     return code, {"scenario": path.stem, "folder": str(folder), **results}
+
+
+def _new_folder(name: str) -> Path:
+    """Makes a folder below runs/ that no other run has."""
+    for i in count(1):
+        folder = Path("runs", name if i == 1 else f"{name}-{i}")
+        with suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            break
+    return folder
 
 
 @contextmanager

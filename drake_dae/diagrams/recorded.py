@@ -9,7 +9,6 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.state_feedback import MeasuredState
-from drake_dae.simulation.sampled import SampleLog
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
@@ -110,7 +109,8 @@ def log_steps(builder: DiagramBuilder, ports: Sequence[OutputPort], plant: Plant
         builder.Connect(port, stacked.get_input_port(index))
     port = stacked.get_output_port()
     if plant.time_step:
-        log = builder.AddSystem(SampleLog(port.size(), plant.time_step))
+        triggers = {TriggerType.kPeriodic}
+        log = builder.AddSystem(VectorLogSink(port.size(), triggers, plant.time_step))
         builder.Connect(port, log.get_input_port())
         return log
     return LogVectorOutput(port, builder, {TriggerType.kPerStep})

@@ -25,11 +25,11 @@ from drake_dae.references import Reference
 from drake_dae.robots.links.links import velocities_are_rates
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.task_controller import opening_contact
 from drake_dae.systems.task.fade import fade
 from drake_dae.systems.task.phases import Approach, Press
 

@@ -216,8 +216,9 @@ class DiagramWatch:
             SimulationError: The run diverges.
         """
         self._steps += steps
-        if self._steps % EVERY and not (always or is_last or states_only):
+        if self._steps < EVERY and not (always or is_last or states_only):
             return
+        self._steps = 0
         for plant, watch in self._watches.items():
             at_plant, dae = plant.GetMyContextFromRoot(context), plant.dae
             rows: _Rows = {"state": (plant.state(at_plant), dae.state_signals)}

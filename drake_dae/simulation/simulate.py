@@ -27,12 +27,12 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
-from drake_dae.compiler.stepped import NO_EVENTS
+from drake_dae.blocks.traced_system import check_context
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, SimulationError
+from drake_dae.simulation.compiled_run import NO_EVENTS, CompiledRun
 from drake_dae.simulation.diagnosis import RunDiagnosis
 from drake_dae.simulation.divergence import DiagramWatch
 from drake_dae.simulation.records.interruption import Interruption, ending_signals
-from drake_dae.simulation.sampled import SampledRun
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines without a terminal, in s."""
@@ -84,9 +84,9 @@ def simulate(
 
     If the states or errors of a `Plant` diverge, an exception ends the run: see `DiagramWatch`.
 
-    If Drake steps the plant and other blocks are sampled and traced, as on a `ContactPlant`, one
-    call computes these blocks at a sample, in runs of 500 steps or more. `after_step`, a view or a
-    real-time rate need each step; then the blocks run one by one.
+    In runs of many steps all traced blocks are composed to one, so that Drake calls Python once for
+    each derivative and sample; see `compile_diagram`. `after_step`, a live view or a real-time rate
+    need each step; then the blocks run one by one.
 
     A run whose start_time is the end of an earlier run appends to its logs. A run that starts
     earlier clears them.
@@ -115,6 +115,7 @@ def simulate(
         SimulationError: The run cannot continue, or diverges; the exception has time and state.
     """
     config = config or SimulatorConfig()
+    check_context(diagram, context)
     check_duration(duration)
     check_config(config)
     _check_times(config.start_time, duration)
@@ -129,7 +130,7 @@ def simulate(
     ending = Interruption()
     began: float | None = None
     watch: DiagramWatch | None = None
-    steps, sampled = 0, None
+    steps, composed = 0, None
     diagnosis = RunDiagnosis(diagram, context, config, duration)
     accepted = start, context.get_continuous_state_vector().CopyToVector()
 
@@ -175,14 +176,14 @@ def simulate(
             if is_needed or ending.signal is not None:
                 simulator.set_monitor(monitor)
             if after_step is None and not config.target_realtime_rate:
-                sampled = SampledRun.of(diagram, context, duration)
-            if sampled is None or not sampled.run(start + duration, seen):
-                if sampled is not None:  # To the failure, whose message the blocks know.
+                composed = CompiledRun.of(diagram, context, config, duration)
+            if composed is None or not composed.run(start + duration, seen):
+                if composed is not None:  # To the failure, whose message the blocks know.
                     simulator.Initialize(NO_EVENTS)
                 simulator.AdvanceTo(start + duration)
                 steps = simulator.get_num_steps_taken()
                 simulator.AdvancePendingEvents()
-            steps += 0 if sampled is None else sampled.steps
+            steps += 0 if composed is None else composed.steps
             elapsed = time.perf_counter() - began
             if watch is not None:
                 watch.look(context, is_last=True)
@@ -190,7 +191,7 @@ def simulate(
             if began is None or not impatience.is_over:
                 raise
             context.SetTimeAndContinuousState(*accepted)
-            steps = simulator.get_num_steps_taken() + (0 if sampled is None else sampled.steps)
+            steps = simulator.get_num_steps_taken() + (0 if composed is None else composed.steps)
             elapsed = time.perf_counter() - began
         except (DrakeDaeError, RuntimeError) as error:
             if began is None and isinstance(error, InconsistentStateError):

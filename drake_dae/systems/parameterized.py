@@ -126,8 +126,12 @@ def with_exogenous(block: Block, places: Sequence[int]) -> Block:
         (value,) = ca.substitute([value], [block.parameters], [parameters])
         return value
 
+    projection = block.projection
+    if projection is not None:
+        projection = replace(projection, parameters=moved(projection.parameters))
     return replace(
         block,
+        projection=projection,
         inputs={**block.inputs, "exogenous": exogenous},
         outputs={name: moved(value) for name, value in block.outputs.items()},
         derivative=moved(block.derivative),

@@ -179,20 +179,20 @@ class Mender:
         drawn, why = path, ""
         if path is None:
             why = (
-                "is in a package that is neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH"
-                ", and whose folder robot.packages can name"
+                "is in a package neither near nor in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH "
+                "(robot.packages can name its folder)"
             )
         elif not path.is_file():
             why = "is not there"
         elif not all_within(path, self.folders):
-            why = "is outside of the model's folder or package, and of those in robot.packages"
+            why = "is outside of the model's folder or package (robot.packages can name its folder)"
         elif kinds and (drawn := drawable(path, kinds)) is None:
-            why = "cannot be converted; pip install 'drake_dae[meshes]' converts more"
+            why = "cannot be converted (pip install 'drake_dae[meshes]' converts more)"
         elif collides and drawn is not None and not has_hull(drawn):
             why = "cannot be read by Drake"
         if not why:
             return drawn
-        items = self.omitted[f"geometry is left out, which no equation needs, since it {why}"]
+        items = self.omitted[f"geometry that {why} is left out; no equation needs it"]
         items.append(f"'{name if path is None else Path(name).name}'")
         return None
 

@@ -12,14 +12,14 @@ from xml.etree.ElementTree import Element
 
 from drake_dae.arrays import number_in
 
-# "owner: parts that Drake reads | parts that change no equation". "a=0" is as read only with that
-# value, "a=never" with none, "*" is all others. Owners without a line hold geometry, or text.
+# "owner: parts that Drake reads | parts that change no equation". Of "a=0" that holds with this
+# value only, of "a=never" with none; "*" is all others. Owners without a line hold geometry.
 _URDF = """
 robot: name material link joint drake:joint transmission frame gazebo drake:linear_bushing_rpy
 robot: drake:linear_spring_damper drake:ball_constraint drake:distance_constraint
 robot: drake:tendon_constraint drake:collision_filter_group
 robot: | version sensor ros2_control disable_collisions link_group group verbose plugin mujoco
-gazebo: reference | * joint=never constraint=never gravity=1 turnGravityOff=0 springStiffness=0
+gazebo: | * reference joint=never constraint=never gravity=1 turnGravityOff=0 springStiffness=0
 gazebo: | dampingFactor=0 kinematic=0
 link: name inertial visual collision contact drake:surface_velocity_axis | gravity=1 kinematic=0
 link: | type origin self_filter collision_checking surface self_collide sensor
@@ -35,7 +35,7 @@ joint: | mechanical_reduction offset sensor disable_collision
 origin: xyz rpy
 axis: xyz | rpy
 limit: lower upper velocity effort drake:acceleration
-dynamics: damping friction=0 | coulomb_window
+dynamics: damping | coulomb_window friction=0
 mimic: joint multiplier offset
 transmission: type=simple joint actuator | name mechanicalReduction plugin param
 transmission: | use_simulated_gripper_joint
@@ -45,35 +45,36 @@ actuator: | hardwareInterface mechanicalReduction mechanical_reduction role
 
 _SDF = """
 sdf: version model world | light actor
-world: name model frame include joint gravity=earth | light scene physics gui plugin atmosphere wind
-world: | magnetic_field spherical_coordinates audio state population road actor
+world: name model frame include joint | light scene physics gui plugin atmosphere wind
+world: | gravity=earth magnetic_field spherical_coordinates audio state population road actor
 include: uri name pose placement_frame static | plugin
 model: name canonical_link placement_frame pose static link joint frame include model
 model: drake:joint drake:linear_bushing_rpy drake:linear_spring_damper drake:ball_constraint
 model: drake:distance_constraint drake:tendon_constraint drake:collision_filter_group
-model: enable_wind=0 | self_collide allow_auto_disable plugin gripper
-link: name pose inertial visual collision drake:visual drake:surface_velocity_axis gravity=1
-link: kinematic=0 enable_wind=0 velocity_decay | self_collide must_be_base_link sensor light
+model: | enable_wind=0 self_collide allow_auto_disable plugin gripper
+link: name pose inertial visual collision drake:visual drake:surface_velocity_axis velocity_decay
+link: | gravity=1 kinematic=0 enable_wind=0 self_collide must_be_base_link sensor light
 link: | audio_source audio_sink battery projector particle_emitter
-velocity_decay: linear=0 angular=0
-inertial: pose mass inertia auto=0 | density auto_inertia_params
+velocity_decay: | linear=0 angular=0
+inertial: pose mass inertia | auto=0 density auto_inertia_params
 inertia: ixx iyy izz ixy ixz iyz
 joint: name type parent child pose axis axis2 screw_thread_pitch thread_pitch drake:rotor_inertia
 joint: drake:gear_ratio drake:controller_gains drake:mimic
 joint: | sensor plugin physics gearbox_ratio gearbox_reference_body
 axis axis2: xyz limit dynamics use_parent_model_frame | initial_position
 limit: lower upper effort velocity drake:acceleration | stiffness dissipation
-dynamics: damping spring_reference spring_stiffness friction=0
+dynamics: damping spring_reference spring_stiffness | friction=0
 """
 
 _MJCF = """
 mujoco: model compiler option asset worldbody body actuator contact equality
 mujoco: | size statistic sensor keyframe visual custom extension
-compiler: coordinate angle assetdir meshdir eulerseq inertiafromgeom autolimits boundmass=0
-compiler: boundinertia=0 settotalmass=-1 balanceinertia=0 inertiagrouprange=0_5 strippath=0
+compiler: coordinate angle assetdir meshdir eulerseq inertiafromgeom autolimits
+compiler: | boundmass=0 boundinertia=0 settotalmass=-1 balanceinertia=0 inertiagrouprange=0_5
+compiler: | strippath=0
 compiler: | usethread texturedir discardvisual fusestatic fitaabb saveinertial alignfree convexhull
 compiler: | exactmeshinertia conflictcheck lengthrange
-option: gravity flag density=0 viscosity=0 wind=0
+option: gravity flag | density=0 viscosity=0 wind=0
 option: | timestep apirate impratio magnetic o_margin o_solref o_solimp o_friction integrator cone
 option: | jacobian solver iterations tolerance ls_iterations ls_tolerance noslip_iterations
 option: | noslip_tolerance ccd_iterations ccd_tolerance mpr_iterations mpr_tolerance sdf_iterations
@@ -81,14 +82,14 @@ option: | sdf_tolerance sdf_initpoints actuatorgroupdisable collision sleep_tole
 flag: | * constraint=enable equality=enable frictionloss=enable limit=enable passive=enable
 flag: | spring=enable damper=enable gravity=enable clampctrl=enable actuation=enable
 worldbody body: name pos quat axisangle euler xyaxes zaxis body geom joint freejoint inertial
-worldbody body: mocap=0 gravcomp=0 | user site light camera childclass sleep class
+worldbody body: | mocap=0 gravcomp=0 user site light camera childclass sleep class
 inertial: pos quat axisangle euler xyaxes zaxis mass diaginertia fullinertia
-joint: name type pos axis range limited damping ref armature stiffness=0 springdamper=0
-joint: frictionloss=0 actuatorfrclimited=0 | class group user margin solreflimit solimplimit
-joint: | solreffriction solimpfriction springref actuatorgravcomp
+joint: name type pos axis range limited damping ref armature
+joint: | stiffness=0 springdamper=0 frictionloss=0 actuatorfrclimited=0 class group user margin
+joint: | solreflimit solimplimit solreffriction solimpfriction springref actuatorgravcomp
 freejoint: name | group align class user
 geom: name type pos quat axisangle euler xyaxes zaxis size fromto mesh mass density contype
-geom: conaffinity group material rgba friction shellinertia=0 fluidshape=none | class condim
+geom: conaffinity group material rgba friction | shellinertia=0 fluidshape=none class condim
 geom: | priority solmix solref solimp margin gap fitscale user hfield fluidcoef
 actuator: motor
 motor: name joint gear ctrlrange=+- ctrllimited forcerange=+- forcelimited
@@ -166,6 +167,9 @@ def take_lost(
         if is_read and is_meant and part not in leave_out:
             if node is not None:
                 yield from take_lost(node, kind, leave_out)
+                own = READ_BY_DRAKE[kind].get(name, {})
+                if own and not any(is_read for is_read, _ in own.values()):
+                    element.remove(node)
         elif node is not None:
             element.remove(node)
         else:

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
-from drake_dae.blocks.block import Block, Held, Requirement
+from drake_dae.blocks.block import Block, Held, Requirement, where_finite
 from drake_dae.blocks.computations import DERIVATIVE, HELD, PARAMETERS, STATE, Computation
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae.system.signals import Signal
@@ -69,7 +69,7 @@ class TrackingController(ParameterizedSystem, Controller):
     """
 
     __slots__ = SHARED_DICTIONARY
-    follows, shown = True, ("tracking_error",)
+    follows, is_law, shown = True, True, ("tracking_error",)
 
     def __init__(
         self,
@@ -91,6 +91,7 @@ class TrackingController(ParameterizedSystem, Controller):
         warn_of_zero_dynamics(law, outputs)
         self.law, self.sample_period = law, sample_period if count else 0.0
         block = law_block(law, np.broadcast_to(largest, (count,)), self.sample_period)
+        self.equations = law.system
         super().__init__(law.system, block, law.exogenous_degrees, sees_steps=True)
 
     def set_integral(self, context: Context, integral: ArrayLike) -> None:
@@ -148,6 +149,13 @@ class TrackingController(ParameterizedSystem, Controller):
         integral = values["integral"][0] if self.law.integral.outputs else None
         start = values["state"][0], values["reference"][0]
         return self.law.predicted_error(times - times[0], *start, parameters, integral)
+
+    def motion(self) -> ca.SX | None:
+        motion = self.law.trace_motion()
+        if motion is None:
+            return None
+        rate, *_, valid = motion.function.call([*self.law.inputs.values()])
+        return where_finite(rate, valid)
 
     def _shares(self) -> dict[str, Any]:
         return {

@@ -103,6 +103,7 @@ class DaePlant(ParameterizedSystem, Plant):
     def _start(self, structure: ConstraintStructure, block: Block) -> None:
         """Makes the system of its block."""
         system, values = structure.system, (*block.outputs.values(), block.derivative)
+        self.equations = system
         self.structure, self._left_out = structure, manifold_of_left_out(structure.system)
         self.projects = block.projection is not None
         super().__init__(system, block, system.exogenous.degrees(*values))
@@ -187,7 +188,8 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
         force = ca.substitute(force, control, none)
     projection = None
     if project and system.num_constraints:
-        projection = Projection(newton_of(manifold), manifold.projected)
+        parameters = system.parameter_symbol
+        projection = Projection(newton_of(manifold), manifold.projected, parameters)
     return Block(
         system.name,
         inputs={"control": control},

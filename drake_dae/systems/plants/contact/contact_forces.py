@@ -10,7 +10,9 @@ from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.block import Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
+from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.robots.constraint_wrenches import contact_normals
@@ -18,29 +20,19 @@ from drake_dae.robots.model import RobotModel
 
 
 class ContactForces(LeafSystem):
-    """Converts Drake's contact results to the signals of a `RobotModel`.
+    """Sums Drake's contact results to the forces of a robot's contacts.
 
-    A constraint force is the contact force along the normal of its surface, lambda = n(q) . F,
-    where n is the gradient of phi and F is the total force on the robot of all contacts (points and
-    patches) between the constraint's two geometries. An open contact has lambda = 0 and phi > 0.
-
-    Input ports:
-        state: x, shape (n,).
+    Input port:
         contact_results: Those of the MultibodyPlant.
 
-    Output ports:
-        constraint_force: lambda, N, shape (m,).
-        contact_force: F in the world, N, shape (3 m,), constraint by constraint, including
+    Output port:
+        contact_force: The total force F on the robot of all contacts (points and patches) between
+            the two geometries of each constraint, in the world, N, shape (3 m,), including
             friction.
-        constraint_residual: phi and phi', as for `DaePlant`; not zero, since compliant surfaces are
-            penetrated.
-        controlled_output: z = l(x) + m(x) lambda.
 
     Args:
         model: The robot; each constraint is a contact with one force.
-        structure: The structure of its system.
         pairs: For each constraint, the geometries of the robot and those of the surface.
-        parameters: Values of all parameters.
 
     Attributes:
         contact_force_signals: Names and units of `contact_force`.
@@ -51,13 +43,11 @@ class ContactForces(LeafSystem):
     def __init__(
         self,
         model: RobotModel,
-        structure: ConstraintStructure,
         pairs: Sequence[tuple[Sequence[GeometryId], Sequence[GeometryId]]],
-        parameters: FloatArray,
     ) -> None:
         super().__init__()
         self.set_name("contact_forces")
-        dae = model.dae
+        self._model, self._pairs = model, pairs
         # Geometry -> the first entry of its constraint's force, and the sign of a force on it as
         # one on the robot. A geometry of the robot collides only with its constraint's surface.
         self._owners = {
@@ -67,25 +57,19 @@ class ContactForces(LeafSystem):
             for geometry in geometries
         }
         self.contact_force_signals = contact_force_signals(model)
-        self._manifold, self._parameters = structure.manifold, parameters
-        self._normals = contact_normals(model)
-        force = ca.SX.sym("force", dae.num_constraints)
-        output = {"value": dae.outputs(force)}
-        self._output = dae.trace("controlled output", output, {"force": force})
-        self._state = self.DeclareVectorInputPort("state", dae.num_states)
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        # Ports that others use are computed once; none depends on the time, which changes from a
-        # record to the next sample while the state does not.
-        sources = {self.all_input_ports_ticket()}
-        self._contact, self._constraint, *_ = (
-            self.DeclareVectorOutputPort(name, size, port_value(value), sources)
-            for name, size, value in (
-                ("contact_force", len(self.contact_force_signals), self._contact_force),
-                ("constraint_force", dae.num_constraints, self._force),
-                ("constraint_residual", len(structure.manifold.residual_signals), self._residual),
-                ("controlled_output", dae.num_outputs, self._outputs),
-            )
+        # Independent of the time, which changes from a record to the next sample while the state
+        # does not.
+        self.DeclareVectorOutputPort(
+            "contact_force",
+            len(self.contact_force_signals),
+            port_value(self._contact_force),
+            {self.all_input_ports_ticket()},
         )
+
+    def again(self) -> "ContactForces":
+        """Another instance, for another diagram."""
+        return ContactForces(self._model, self._pairs)
 
     def contact_force(self, results: ContactResults) -> list[float]:
         """The contact forces of Drake's contact results, N: 3 m numbers."""
@@ -112,20 +96,43 @@ class ContactForces(LeafSystem):
     def _contact_force(self, context: Context) -> FloatArray:
         return np.array(self.contact_force(self._results.Eval(context)))
 
-    def _force(self, context: Context) -> FloatArray:
-        contact = self._contact.Eval(context).reshape(-1, 3)
-        state = self._state.Eval(context)
-        normals = self._normals.evaluate(state, self._parameters)[0].reshape(-1, 3)
-        force: FloatArray = (normals * contact).sum(axis=1)
-        return force
 
-    def _residual(self, context: Context) -> FloatArray:
-        function = self._manifold.residual_function
-        return function.evaluate(self._state.Eval(context), self._parameters)[0]
+def contact_signals(
+    model: RobotModel, structure: ConstraintStructure, parameters: FloatArray
+) -> TracedSystem:
+    """The signals of a `RobotModel` from its state and contact forces, as a system.
 
-    def _outputs(self, context: Context) -> FloatArray:
-        state, force = self._state.Eval(context), self._constraint.Eval(context)
-        return self._output.evaluate(state, force, self._parameters)[0]
+    A constraint force is the contact force along the normal of its surface, lambda = n(q) . F,
+    where n is the gradient of phi. An open contact has lambda = 0 and phi > 0.
+
+    Input ports:
+        state: x, shape (n,).
+        contact_force: F as of `ContactForces`, shape (3 m,).
+
+    Output ports:
+        constraint_force: lambda, N, shape (m,).
+        constraint_residual: phi and phi', as for `DaePlant`; not zero, since compliant surfaces are
+            penetrated.
+        controlled_output: z = l(x) + m(x) lambda.
+
+    Args:
+        model: The robot; each constraint is a contact with one force.
+        structure: The structure of its system.
+        parameters: Values of all parameters.
+    """
+    dae, contact = model.dae, ca.SX.sym("contact_force", 3 * len(model.constraints))
+    values = ca.DM(parameters)
+    normals = contact_normals(model).function(dae.state, values)[0]
+    force = ca.sum1(ca.reshape(normals * contact, 3, -1)).T
+    shown = [dae.outputs(force), structure.manifold.residual_expression]
+    output, residual = ca.substitute(shown, [dae.parameter_symbol], [values])
+    outputs = {
+        "constraint_force": force,
+        "constraint_residual": residual,
+        "controlled_output": output,
+    }
+    inputs = {"state": dae.state, "contact_force": contact}
+    return TracedSystem(Block("contact_signals", inputs, outputs), compiled=dae.compiled)
 
 
 def contact_force_signals(model: RobotModel) -> tuple[Signal, ...]:

@@ -40,7 +40,7 @@ from drake_dae.systems.plants.contact.contact_checks import (
     set_masses,
     solids_of,
 )
-from drake_dae.systems.plants.contact.contact_forces import ContactForces
+from drake_dae.systems.plants.contact.contact_forces import ContactForces, contact_signals
 from drake_dae.systems.plants.contact.contact_material import (
     ContactMaterial,
     ball_properties,
@@ -57,10 +57,6 @@ from drake_dae.systems.plants.contract import Plant
 def _is_relevant(record: logging.LogRecord) -> bool:
     """Filters Drake's message on half spaces in deformable contact, which is not used here."""
     return "half spaces are not currently supported for deformable" not in record.getMessage()
-
-
-_OF_FORCES = ("constraint_force", "contact_force", "constraint_residual", "controlled_output")
-"""The output ports of `ContactForces`."""
 
 
 @checked(ModelError)
@@ -86,8 +82,8 @@ class ContactPlant(Diagram, Plant):
         state: x = (q, v), and the states of the stages; shape (n,).
         link_state: (q, v), shape (nq + nv,). joint_torque, and the ports of the stages such as
         `motor_state`: as for `RobotPlant`.
-        constraint_force, contact_force, constraint_residual, controlled_output: As of
-            `ContactForces`.
+        contact_force: As of `ContactForces`. constraint_force, constraint_residual,
+            controlled_output: As of `contact_signals`.
         contact_results: Drake's.
         query_object: Drake's, of the scene with the contact geometry.
 
@@ -147,18 +143,21 @@ class ContactPlant(Diagram, Plant):
             frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
             applied = builder.AddSystem(AppliedDisturbances(plant, disturbances, frames))
             builder.Connect(applied.get_output_port(), plant.get_applied_spatial_force_input_port())
-        forces = ContactForces(model, structure, pairs, self._values)
+        forces = ContactForces(model, pairs)
         self._forces = builder.AddSystem(forces)
+        signals = builder.AddSystem(contact_signals(model, structure, self._values))
         self.contact_force_signals = forces.contact_force_signals
         results = plant.get_contact_results_output_port()
         builder.Connect(results, forces.GetInputPort("contact_results"))
         state = plant.get_state_output_port()
-        builder.Connect(state, forces.GetInputPort("state"))
+        builder.Connect(state, signals.GetInputPort("state"))
+        builder.Connect(forces.get_output_port(), signals.GetInputPort("contact_force"))
         builder.ExportInput(plant.get_actuation_input_port(), "control")
         builder.ExportOutput(state, "state")
         builder.ExportOutput(state, "link_state")
-        for name in _OF_FORCES:
-            builder.ExportOutput(forces.GetOutputPort(name), name)
+        builder.ExportOutput(forces.get_output_port(), "contact_force")
+        for name in signals.block.outputs:
+            builder.ExportOutput(signals.GetOutputPort(name), name)
         builder.ExportOutput(results, "contact_results")
         builder.ExportOutput(scene_graph.get_query_output_port(), "query_object")
         builder.BuildInto(self)

@@ -100,6 +100,7 @@ class AppliedDisturbances(LeafSystem):
     ) -> None:
         super().__init__()
         self.set_name("disturbances")
+        self._arguments = plant, disturbances, frames
         self._forces = [
             disturbance.reference.derivatives([0, 0, 0]) for disturbance in disturbances
         ]
@@ -115,6 +116,10 @@ class AppliedDisturbances(LeafSystem):
             weakly(self._calc),
             {self.time_ticket()},
         )
+
+    def again(self) -> "AppliedDisturbances":
+        """Another instance, for another diagram."""
+        return AppliedDisturbances(*self._arguments)
 
     def _calc(self, context: Context, output: Value) -> None:
         time = context.get_time()

@@ -1,4 +1,4 @@
-"""Runs in which one call computes all blocks around a plant that Drake steps."""
+"""Runs of a diagram whose traced blocks are composed to one, beside the diagram as wired."""
 
 import os
 import signal
@@ -8,17 +8,18 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from runs import first_quick, scenario, some
 
 from drake_dae import build_scenario, simulate
-from drake_dae.compiler import stepped
-from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.errors import SimulationError
-from drake_dae.simulation import sampled
-from drake_dae.simulation.sampled import SampledRun
+from drake_dae.simulation import compiled_run
+from drake_dae.simulation import simulate as simulation
+from drake_dae.simulation.compiled_run import CompiledRun
 
 NOISE = "sensors.force={sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
+
+FIXED = ("integrator.use_error_control=false", "integrator.max_step_size=0.001")
 
 LOOPS = {
     "observer and integrals": ("wall_point_contact",),
@@ -31,6 +32,9 @@ LOOPS = {
     "a control that is late": ("wall_point_contact", "sampling={period: 2.0e-3, delay: 3.0e-3}"),
     "drives with limits": ("wall_point_contact", "saturation=true"),
     "a start between two samples": ("wall_point_contact", "integrator.start_time=0.0104"),
+    "springs on a contact that gives way": ("wall_flexible_contact",),
+    "ideal contact": ("seven_joint_wall", *FIXED),
+    "a mechanism with springs": ("slider_crank_flexible", *FIXED),
 }
 
 DEAR = (
@@ -46,7 +50,7 @@ DEAR = (
 @pytest.fixture
 def short_runs(monkeypatch):
     """Short runs are computed in this way, too."""
-    monkeypatch.setattr(sampled, "WORTH", 1)
+    monkeypatch.setattr(compiled_run, "WORTH", 1)
 
 
 @cache
@@ -72,9 +76,10 @@ def logs(loop, context):
     }
 
 
-def discrete(context):
+def states(context):
     groups = range(context.num_discrete_state_groups())
-    return np.concatenate([context.get_discrete_state(i).value() for i in groups])
+    held = [context.get_discrete_state(i).value() for i in groups]
+    return np.concatenate([context.get_continuous_state_vector().CopyToVector(), *held])
 
 
 @pytest.mark.slow
@@ -88,6 +93,7 @@ def test_logs_and_context_are_those_of_drakes_simulator(name, short_runs):
     chosen, loop, context = built(name)
     expected = context.Clone()
     simulator = Simulator(loop.diagram, expected)
+    ApplySimulatorConfig(chosen.integrator, simulator)
     simulator.Initialize()
     end = expected.get_time() + duration
     simulator.AdvanceTo(end)
@@ -102,7 +108,7 @@ def test_logs_and_context_are_those_of_drakes_simulator(name, short_runs):
     assert 3 <= len(seen) <= 6
     assert statistics.steps == steps
     assert context.get_time() == end
-    found, right = discrete(context), discrete(expected)
+    found, right = states(context), states(expected)
     assert_allclose(found, right, rtol=0, atol=1e-9 * np.abs(right).max())
     pairs = zip(logs(loop, context).items(), logs(loop, expected).values(), strict=True)
     for (signal_name, (times, data)), (right_times, right_data) in pairs:
@@ -131,11 +137,13 @@ def test_a_run_that_goes_on_is_that_of_drakes_simulator(short_runs):
 def test_a_fixed_value_at_a_connected_port_counts(short_runs):
     """Drake lets it replace the connection; so the blocks run one by one."""
     chosen, loop, context = built("observer and integrals")
-    assert SampledRun.of(loop.diagram, context.Clone(), 0.01) is not None
+    Simulator(loop.diagram, context).Initialize()
+    given = chosen.integrator, 0.01
+    assert CompiledRun.of(loop.diagram, context.Clone(), *given) is not None
     port = loop.plant.GetInputPort("control")
     port.FixValue(loop.plant.GetMyMutableContextFromRoot(context), np.zeros(7))
     simulate(loop.diagram, context, 0.01, chosen.integrator)
-    assert SampledRun.of(loop.diagram, context, 0.01) is None
+    assert CompiledRun.of(loop.diagram, context, *given) is None
 
 
 def test_each_step_is_seen_where_that_is_asked_for(short_runs):
@@ -150,13 +158,13 @@ def test_drake_goes_on_from_samples_that_fail(short_runs, monkeypatch):
     """So a failure is that of Drake's Simulator; here it finds a step after all."""
     chosen, loop, context = built("observer and integrals")
 
-    class Failing(DrakeSteps):
-        def step(self, time, given, outputs):
-            if time > 0.0445:
+    class Failing(CompiledRun):
+        def _write_back(self, count):
+            if self._own.get_time() > 0.0445:
                 raise RuntimeError("no convergence.")
-            super().step(time, given, outputs)
+            super()._write_back(count)
 
-    monkeypatch.setattr(stepped, "DrakeSteps", Failing)
+    monkeypatch.setattr(simulation, "CompiledRun", Failing)
     expected, seen = context.Clone(), []
     statistics = simulate(
         loop.diagram, context, 0.06, chosen.integrator, look=lambda now: seen.append(now.get_time())

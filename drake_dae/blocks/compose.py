@@ -1,0 +1,466 @@
+"""A diagram, or the part of it that can be traced, as one block."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    InputPortIndex,
+    OutputPort,
+    OutputPortIndex,
+    PortDataType,
+    System,
+)
+
+from drake_dae.arrays import FloatArray
+from drake_dae.blocks.block import NOTHING, Block, Held, Projection, Requirement, stacked
+from drake_dae.blocks.primitives import symbolic_block
+from drake_dae.blocks.traced_system import TracedSystem
+from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError
+
+Port = tuple[System, int]
+"""A leaf system and the index of one of its ports."""
+
+
+@dataclass(frozen=True, eq=False)
+class Leaves:
+    """The leaf systems of a diagram, and the wires between them, with nested diagrams flattened.
+
+    Attributes:
+        systems: The leaves, in the order of Drake's states and parameters.
+        sources: Input port of a leaf -> the output port of a leaf that it is wired to.
+    """
+
+    systems: list[System] = field(default_factory=list)
+    sources: dict[Port, Port] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, diagram: Diagram) -> "Leaves":
+        """The leaves of a diagram."""
+        found = cls()
+        found._collect(diagram)
+        return found
+
+    def _collect(self, diagram: Diagram) -> None:
+        for system in diagram.GetSystems():
+            if isinstance(system, Diagram):
+                self._collect(system)
+            else:
+                self.systems.append(system)
+        for (reader, read), (writer, written) in diagram.connection_map().items():
+            source = leaf_port(writer.get_output_port(int(written)))
+            self.sources.update(dict.fromkeys(_inputs(reader, int(read)), source))
+
+
+def leaf_port(port: OutputPort) -> Port:
+    """The port of a leaf that an output port exports, through all nested diagrams."""
+    system, index = port.get_system(), int(port.get_index())
+    while isinstance(system, Diagram):
+        system, index = system.get_output_port_locator(OutputPortIndex(index))
+    return system, int(index)
+
+
+def _inputs(system: System, index: int) -> list[Port]:
+    """The ports of leaves that an input port of a diagram leads to."""
+    if not isinstance(system, Diagram):
+        return [(system, index)]
+    found = system.GetInputPortLocators(InputPortIndex(index))
+    return [leaf for inner, port in found for leaf in _inputs(inner, int(port))]
+
+
+@dataclass(frozen=True, eq=False)
+class Composed:
+    """A part of a diagram as one block.
+
+    Attributes:
+        block: The block. Its inputs are `cuts` and `fixed`.
+        cuts: Name of an input -> the output port of a leaf that is not in the block.
+        fixed: Name of an input -> the input port of a leaf that is exported or has a fixed value.
+        states, parameters: Leaf -> its slice of the block's column.
+        held: (leaf, index of its group) -> the name of a group of the block, and its slice there.
+    """
+
+    block: Block
+    cuts: Mapping[str, Port]
+    fixed: Mapping[str, Port]
+    states: Mapping[System, slice]
+    parameters: Mapping[System, slice]
+    held: Mapping[tuple[System, int], tuple[str, slice]]
+
+    @property
+    def systems(self) -> set[System]:
+        """The leaves in the block that have states."""
+        return {*self.states, *(system for system, _ in self.held)}
+
+
+def compile_diagram(
+    diagram: Diagram,
+    outputs: Mapping[str, OutputPort] | None = None,
+    *,
+    context: Context | None = None,
+    merge: bool = False,
+) -> Block:
+    """A diagram as one block: the expressions of its blocks, with wires in place of inputs.
+
+    The diagram may contain `TracedSystem`s, and every system that Drake converts to symbolic
+    expressions: its primitives, and LeafSystems templated on the scalar type. Nested diagrams are
+    flattened. Systems on which no output depends, such as loggers, are left out. Output ports of
+    other systems, such as a MultibodyPlant or a RandomSource, become inputs of the block, and so do
+    the diagram's own input ports.
+
+    Algebraic loops need no check: Drake finds them, by ports, when it builds the diagram.
+
+    Args:
+        diagram: The diagram.
+        outputs: Name -> an output port of a system in it; its own vector-valued ports if None.
+        context: A context of the diagram, with the start; the default one if None.
+        merge: Whether held values of one rate become one group, which takes Drake less time.
+
+    Raises:
+        ModelError: An input port has neither a wire nor a value, or an output port has no vector.
+    """
+    return compose(diagram, outputs, context=context, merge=merge).block
+
+
+def compose(
+    diagram: Diagram,
+    outputs: Mapping[str, OutputPort] | None = None,
+    *,
+    context: Context | None = None,
+    merge: bool = False,
+) -> Composed:
+    """As `compile_diagram`, with the places of the systems in the block."""
+    if outputs is None:
+        every = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]
+        vectors = [p for p in every if p.get_data_type() == PortDataType.kVectorValued]
+        outputs = {port.get_name(): port for port in vectors}
+    walk = _Walk(diagram, context or diagram.CreateDefaultContext())
+    values = {name: walk.port(leaf_port(port)) for name, port in outputs.items()}
+    dynamics: dict[System, _Dynamics] = {}
+    while new := [s for s in walk.leaves.systems if s in walk.used and s not in dynamics]:
+        dynamics |= {system: walk.dynamics(system) for system in new}  # May use more.
+    systems = [s for s in walk.leaves.systems if s in dynamics]  # In the order of Drake's states.
+    states, first = dict[System, slice](), 0
+    for system in systems:
+        size = walk.own[system]["state"].numel()
+        if size:
+            states[system] = slice(first, first + size)
+            first += size
+    every_held = {
+        (system, i): held for system in systems for i, held in enumerate(dynamics[system].held)
+    }
+    held, places = _grouped(walk, every_held, [*values.values()] if merge else None)
+    parameters, column, first = dict[System, slice](), list[ca.SX](), 0
+    defaults = list[np.ndarray]()
+    for system in walk.leaves.systems:
+        if system in walk.owners and (size := walk.own[system]["parameters"].numel()):
+            parameters[system] = slice(first, first + size)
+            first += size
+            column.append(walk.own[system]["parameters"])
+            defaults.append(walk.parameters_of(system))
+    start = {
+        "state": np.concatenate([np.zeros(0), *(dynamics[s].start for s in systems)]),
+        "parameters": np.concatenate([np.zeros(0), *defaults]),
+    }
+    scales = [dynamics[s].scale for s in systems]
+    block = Block(
+        diagram.get_name() or "compiled",
+        walk.inputs,
+        values,
+        stacked([walk.own[s]["state"] for s in states]),
+        stacked([dynamics[s].derivative for s in states]),
+        held,
+        stacked(column),
+        start,
+        projection=_projection(states, dynamics),
+        scale=np.concatenate([np.zeros(0), *scales]),
+        requirements=tuple(r for s in systems for r in dynamics[s].requirements),
+        signals=walk.signals(outputs),
+    )
+    return Composed(block, walk.cuts, walk.fixed, states, parameters, places)
+
+
+@dataclass(frozen=True, eq=False)
+class _Dynamics:
+    """What changes the states of a leaf, as expressions of the whole."""
+
+    derivative: ca.SX
+    held: list[Held]
+    start: np.ndarray
+    scale: np.ndarray
+    projection: Projection | None
+    requirements: tuple[Requirement, ...]
+
+
+class _Walk:
+    """The expressions of a diagram's ports, found from port to port."""
+
+    def __init__(self, diagram: Diagram, context: Context) -> None:
+        self.leaves, self.context = Leaves.of(diagram), context
+        self.prefix = f"{diagram.GetSystemPathname()}::"
+        self.inputs: dict[str, ca.SX] = {}
+        self.cuts: dict[str, Port] = {}
+        self.fixed: dict[str, Port] = {}
+        self.blocks: dict[System, Block | None] = {}
+        self.own: dict[System, dict[str, ca.SX]] = {}  # Source -> symbols of this leaf.
+        self.values: dict[Port, ca.SX] = {}
+        self.used: set[System] = set()  # Those whose states matter.
+        self.owners: set[System] = set()  # Those with parameters of their own.
+        self.exported = {
+            place: diagram.get_input_port(i).get_name()
+            for i in range(diagram.num_input_ports())
+            for place in _inputs(diagram, i)
+        }
+        self._twins = self._find_twins()
+
+    def name(self, system: System) -> str:
+        """The name of a leaf, with those of the diagrams in which it is nested."""
+        return system.GetSystemPathname().removeprefix(self.prefix).replace("::", ".")
+
+    def local(self, system: System) -> Context:
+        return system.GetMyContextFromRoot(self.context)
+
+    def parameters_of(self, system: System) -> np.ndarray:
+        """All numeric parameters of a leaf in the context."""
+        local = self.local(system)
+        groups = range(local.num_numeric_parameter_groups())
+        values = [local.get_numeric_parameter(i).CopyToVector() for i in groups]
+        return np.concatenate([np.zeros(0), *values])
+
+    def _find_twins(self) -> dict[System, System]:
+        """Plant -> the law whose model it is, with equal parameters: they share their symbols."""
+        systems = [s for s in self.leaves.systems if isinstance(s, TracedSystem)]
+        laws = {id(s.equations): s for s in systems if s.is_law}
+        twins = {}
+        for plant in systems:
+            law = laws.get(id(plant.equations))
+            if law is not None and not plant.is_law:
+                own = self.parameters_of(plant)
+                if np.array_equal(own, self.parameters_of(law)[: own.size]):
+                    twins[plant] = law
+        return twins
+
+    def block(self, system: System) -> Block | None:
+        """The block of a leaf, which gets symbols of its own in the whole; None without one."""
+        if system not in self.blocks:
+            self.blocks[system] = block = (
+                system.block if isinstance(system, TracedSystem) else symbolic_block(system)
+            )
+            if block is not None:
+                self._add_symbols(system, block)
+        return self.blocks[system]
+
+    def _add_symbols(self, system: System, block: Block) -> None:
+        name, own = self.name(system), dict[str, ca.SX]()
+        own["state"] = ca.SX.sym(f"{name}.state", block.state.numel())
+        for group, held in block.held.items():
+            own[f"held {group}"] = ca.SX.sym(f"{name}.{group}", held.symbol.numel())
+        size = block.parameters.numel()
+        if (law := self._twins.get(system)) is not None:
+            self.block(law)
+            own["parameters"] = self.own[law]["parameters"][:size, 0]
+        else:
+            own["parameters"] = ca.SX.sym(f"{name}.parameters", size)
+            self.owners.add(system)
+        self.own[system] = own
+
+    def port(self, port: Port) -> ca.SX:
+        """The expression of an output port of a leaf."""
+        if port not in self.values:
+            system, index = port
+            block, output = self.block(system), system.get_output_port(index)
+            if block is None or output.get_name() not in block.outputs:
+                if output.get_data_type() != PortDataType.kVectorValued:
+                    raise ModelError(
+                        f"the output port '{output.get_name()}' of '{self.name(system)}' has no "
+                        "vector: what depends on it cannot be traced"
+                    )
+                self.values[port] = self._new_input(
+                    self.cuts, f"{self.name(system)}.{output.get_name()}", port, output.size()
+                )
+            else:
+                (self.values[port],) = self.expressions(system, [block.outputs[output.get_name()]])
+        return self.values[port]
+
+    def _new_input(self, kind: dict[str, Port], name: str, port: Port, size: int) -> ca.SX:
+        kind[name], self.inputs[name] = port, ca.SX.sym(name, size)
+        return self.inputs[name]
+
+    def expressions(self, system: System, values: Sequence[ca.SX]) -> list[ca.SX]:
+        """Expressions of a leaf's block as expressions of the whole."""
+        block = self.block(system)
+        assert block is not None
+        columns, sources, meanings = block.columns(), block.sources(*values), list[ca.SX]()
+        for source in sources:
+            if source == "time":
+                meanings.append(columns[source])
+            elif source.startswith("input "):
+                meanings.append(ca.densify(self.input(system, source.removeprefix("input "))))
+            else:
+                meanings.append(self.own[system][source])
+                self.used |= {system} - ({system} if source == "parameters" else set())
+        if not sources:
+            return [*values]
+        found: list[ca.SX] = ca.substitute(list(values), [columns[s] for s in sources], meanings)
+        return found
+
+    def input(self, system: System, name: str) -> ca.SX:
+        """The expression of an input of a leaf."""
+        block, port = self.block(system), system.GetInputPort(name)
+        place = system, int(port.get_index())
+        if place in self.leaves.sources:
+            return self.port(self.leaves.sources[place])
+        assert block is not None
+        if not port.HasValue(self.local(system)) and name in block.defaults:
+            return self.expressions(system, [block.defaults[name]])[0]
+        if place in self.exported or port.HasValue(self.local(system)):
+            label = self.exported.get(place, f"{self.name(system)}.{name}")
+            if label not in self.inputs:
+                self._new_input(self.fixed, label, place, port.size())
+            return self.inputs[label]
+        if not port.size():
+            return NOTHING
+        raise ModelError(
+            f"the input port '{name}' of '{self.name(system)}' has neither a wire nor a value: "
+            "connect it, or fix its value in the context"
+        )
+
+    def dynamics(self, system: System) -> _Dynamics:
+        """What changes the states of a leaf."""
+        block, local, own = self.block(system), self.local(system), self.own[system]
+        assert block is not None
+        groups = list(block.held.values())
+        (derivative, *following) = self.expressions(
+            system, [block.derivative, *(held.next for held in groups)]
+        )
+        if (short := self._under(system)) is not None:
+            derivative = short
+        begins = [
+            None if held.begin is None else self.expressions(system, [held.begin])[0]
+            for held in groups
+        ]
+        names = list(block.held)
+        held = [
+            replace(
+                each,
+                symbol=own[f"held {names[i]}"],
+                next=following[i],
+                start=local.get_discrete_state(i).CopyToVector(),
+                begin=begins[i],
+            )
+            for i, each in enumerate(groups)
+        ]
+        margins = self.expressions(system, [r.margin for r in block.requirements])
+        required = tuple(
+            Requirement(margin, r.reason, r.fault)
+            for r, margin in zip(block.requirements, margins, strict=True)
+        )
+        size = block.state.numel()
+        start = local.get_continuous_state_vector().CopyToVector() if size else np.zeros(0)
+        scale = np.ones(size) if block.scale is None else block.scale
+        projection = block.projection
+        if projection is not None:
+            (parameters,) = self.expressions(system, [projection.parameters])
+            projection = replace(projection, parameters=parameters)
+        return _Dynamics(derivative, held, start, scale, projection, required)
+
+    def _under(self, plant: System) -> ca.SX | None:
+        """x' of a plant that is its law's model and gets its control by a wire."""
+        law, block = self._twins.get(plant), self.block(plant)
+        if law is None or block is None or "exogenous" in block.inputs:
+            return None
+        wired = self.leaves.sources.get((plant, int(plant.GetInputPort("control").get_index())))
+        if wired != (law, int(law.GetOutputPort("control").get_index())):
+            return None
+        motion = law.motion()
+        return None if motion is None else self.expressions(law, [motion])[0]
+
+    def signals(self, outputs: Mapping[str, OutputPort]) -> dict[str, Sequence[Signal]]:
+        """Names and units of outputs, as far as their blocks have them."""
+        named = {}
+        for name, port in outputs.items():
+            system, index = leaf_port(port)
+            block = self.block(system)
+            own = system.get_output_port(index).get_name()
+            if block is not None and own in block.signals:
+                named[name] = block.signals[own]
+        return named
+
+
+def _projection(
+    states: Mapping[System, slice], dynamics: Mapping[System, _Dynamics]
+) -> Projection | None:
+    """The projection of all states, each by that of its leaf."""
+    parts = [(s, p) for s in states if (p := dynamics[s].projection) is not None]
+    if not parts:
+        return None
+    sizes = [p.parameters.numel() for _, p in parts]
+    ends = np.cumsum([0, *sizes])
+    places = [slice(a, b) for a, b in pairwise(ends.tolist())]
+    total = max(part.stop for part in states.values())
+    x, start = ca.SX.sym("x", total), ca.SX.sym("start", total)
+    values, steps = ca.SX.sym("parameters", int(ends[-1])), ca.SX.zeros(total)
+    for (system, each), place in zip(parts, places, strict=True):
+        part = states[system]
+        steps[part] = each.newton(x[part], start[part], values[place])
+
+    def project(state: FloatArray, parameters: FloatArray) -> FloatArray:
+        moved = state
+        for (system, each), place in zip(parts, places, strict=True):
+            before = state[states[system]]
+            after = each.project(before, parameters[place])
+            if after is not before:
+                moved = state.copy() if moved is state else moved
+                moved[states[system]] = after
+        return moved
+
+    newton = ca.Function("newton", [x, start, values], [steps])
+    return Projection(newton, project, stacked([p.parameters for _, p in parts]))
+
+
+def _grouped(
+    walk: _Walk, held: Mapping[tuple[System, int], Held], outputs: Sequence[ca.SX] | None
+) -> tuple[dict[str, Held], dict[tuple[System, int], tuple[str, slice]]]:
+    """The groups of held values; those of one rate as one, except for those that are outputs."""
+    groups: dict[str, list[tuple[tuple[System, int], Held]]] = {}
+    for key, each in held.items():
+        system, i = key
+        block = walk.blocks[system]
+        assert block is not None
+        name = f"{walk.name(system)}.{list(block.held)[i]}"
+        shown = any(_is_same(value, each.symbol) for value in outputs or ())
+        if outputs is not None and not shown:
+            name = f"held at {each.offset:g} s + k {each.period:g} s"
+            name += "" if each.is_unrestricted else ", last"
+        groups.setdefault(name, []).append((key, each))
+    result, places = dict[str, Held](), {}
+    for name, members in groups.items():
+        first = 0
+        for key, each in members:
+            places[key] = name, slice(first, first + each.symbol.numel())
+            first += each.symbol.numel()
+        one = members[0][1]
+        begins = [each.begin for _, each in members]
+        result[name] = Held(
+            stacked([each.symbol for _, each in members]),
+            stacked([each.next for _, each in members]),
+            np.concatenate([each.start for _, each in members]),
+            one.period,
+            one.offset,
+            one.is_unrestricted,
+            None
+            if all(begin is None for begin in begins)
+            else stacked(
+                [ca.SX(each.start) if each.begin is None else each.begin for _, each in members]
+            ),
+        )
+    return result, places
+
+
+def _is_same(value: ca.SX, symbol: ca.SX) -> bool:
+    return value.shape == symbol.shape and bool(symbol.numel()) and ca.is_equal(value, symbol)
