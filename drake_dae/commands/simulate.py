@@ -1,13 +1,12 @@
 """`drake-dae simulate`: runs a scenario and writes its files into a folder."""
 
 import argparse
-import json
 import os
 import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import count
@@ -45,26 +44,16 @@ def _options(parser: Parser) -> None:
     parser.flag("--open", "open the animation in a browser at the end")
     parser.flag("--rollout", "run the whole loop as one function, without Drake's Simulator")
     parser.flag("--check", "exit code 2 for a run that missed its task")
-    parser.json("print the verdict and the files, and all else on stderr,")
+    parser.json("print the verdict and the files")
 
 
-def _command(options: argparse.Namespace) -> int:
+def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Runs a scenario and writes its record, a summary and an animation into a folder.
 
     The first line of the summary says whether the run is GOOD, BAD or UNDECIDED, and why. A rollout
     is faster for many runs (see sweep), not for one; its record has every fixed step, or 1000 rows
     under error control.
     """
-    if not options.json:
-        return _simulate(options)[0]
-    with redirect_stdout(sys.stderr):
-        code, results = _simulate(options)
-    print(json.dumps(results, indent=2))
-    return code
-
-
-def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Runs a scenario; returns the exit code, and the results for JSON."""
     # The scenario, and whether its files may be written.
     path = find_scenario(options.scenario)
     scenario, remarks = load_scenario(path, options.settings), list[str]()
@@ -275,4 +264,4 @@ class _Run:
             print(f"watch it: {program()} play {named}{plots}", flush=True)
 
 
-COMMANDS = {"simulate": (_options, _command)}
+COMMANDS = {"simulate": (_options, _simulate)}

@@ -56,7 +56,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     disturbance and friction, and measured force, each if it is left out; and for a task the gains
     without contact, soft along the distance. With encoders and rigid joints the gains are those of
     `advised_gains` for the noise of the encoders; otherwise those of `contact_gains`. A scenario
-    with `gains`, or with ideal contact, is unchanged.
+    with `law.gains`, or with ideal contact, is unchanged.
 
     Args:
         scenario: The scenario, with all of its outputs.
