@@ -3,7 +3,11 @@
 from . import errors as errors
 from .analysis.analyze import analyze as analyze
 from .analysis.report import Analysis as Analysis
-from .compiler.compile import compile_diagram as compile_diagram
+from .blocks.block import Block as Block
+from .blocks.block import Held as Held
+from .blocks.block import Requirement as Requirement
+from .blocks.compose import compile_diagram as compile_diagram
+from .blocks.traced_system import TracedSystem as TracedSystem
 from .dae.beyond.advised_gains import AdvisedGains as AdvisedGains
 from .dae.beyond.advised_gains import SensedContact as SensedContact
 from .dae.beyond.advised_gains import advised_gains as advised_gains
@@ -139,7 +143,7 @@ from .systems.plants.robot_plant import RobotPlant as RobotPlant
 from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor
 from .systems.sensing.force_sensor import ForceSensor as ForceSensor
-from .systems.task.contacts.open_contact import open_contact as open_contact
+from .systems.task.contacts import open_contact as open_contact
 from .systems.task.controller import TaskController as TaskController
 from .systems.task.phases import Approach as Approach
 from .systems.task.phases import Condition as Condition

@@ -10,7 +10,7 @@ from drake_dae.analysis.limits import LimitKind, SignalRange
 from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.dae.system.signals import Signal
 from drake_dae.simulation.records.record import Record
-from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.control.contract import PhaseChange
 
 SHARE = 0.01
 """The default tolerance of an output, as a fraction of the range of references in its unit."""
@@ -182,13 +182,17 @@ def judge(
 def _of_task(changes: Sequence[PhaseChange]) -> Iterator[RunFinding]:
     """Whether a task was done, given up, or had not ended yet; and which failures it got over."""
     last, decides = changes[-1], None
-    pairs = zip((None, *changes), changes, strict=False)
-    failures = [c for b, c in pairs if c.failed and not (b is not None and b.chosen == "leave")]
-    leaves = last.failed and last.chosen == "leave" and last.phase != "done"
-    if leaves or (last.phase == "held" and last.failed):
-        last, decides = (failures or [last])[-1], Outcome.BAD
-        left = ", and has left the contact" if last.chosen == "leave" and not leaves else ""
-        text, failures = f"the task was given up at {last.time:.4g} s{left}: {last.reason}", []
+    # After "leave" the change that led there has the reason.
+    failures = [change for change in changes if change.failed and change.phase != "held"]
+    if last.failed and last.phase in ("held", "leave"):
+        left = ""
+        if last.phase == "held" and failures and changes[-2].phase == "leave":
+            last, left = failures[-1], ", and has left the contact"
+        text, decides = (
+            f"the task was given up at {last.time:.4g} s{left}: {last.reason}",
+            Outcome.BAD,
+        )
+        failures = []
     elif last.phase == "held":
         text, failures = f"the task ended as chosen at {last.time:.4g} s: {last.reason}", []
     elif last.phase == "done":

@@ -21,7 +21,7 @@ from drake_dae.simulation.judgement import (
 )
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
-from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.control.contract import PhaseChange
 
 WIDTH = 100
 """The width of a paragraph, in characters."""

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from numbers import Integral
 from threading import Lock
 from typing import Any
 
@@ -40,11 +41,6 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
     program = program_of(loop)
     state, held = program.compiled.start(context)
     values = program.compiled.values(context)
-    if program.compiled.changes and np.isnan(held).any():
-        # The initialization of a block need not be an expression.
-        begun = context.Clone()
-        program.compiled.diagram.ExecuteInitializationEvents(begun)
-        held = np.where(np.isnan(held), program.compiled.start(begun)[1], held)
     held = program.compiled.initialized(context.get_time(), state, held, values)
     return np.concatenate([state, held[program.kept_places]]), values
 
@@ -168,6 +164,8 @@ def problems_of(
         events = Events(events.times[is_before], events.due[is_before])
     if parameters is None:
         parameters = compiled.values(compiled.context)
+    if seeds is not None:
+        seeds = [int(seed) if isinstance(seed, Integral) else seed for seed in seeds]
     states = _table("starts", starts, size + program.kept_places.size)
     rows = _table("parameters", parameters, compiled.sizes["parameters"])
     count = max(len(states), len(rows), len(seeds or ()))
