@@ -127,7 +127,6 @@ def of_the_crank(angle, rate):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_four_bar_keeps_its_energy_and_turns_as_its_crank_alone():
     """Over 10 s and some turns, by Lagrange's equation in one angle; energies by MultibodyPlant.
 

@@ -137,7 +137,7 @@ def run(level: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("level", [pytest.param(0, marks=pytest.mark.thorough), 1])
+@pytest.mark.parametrize("level", [0, 1])
 def test_the_published_solution(level):
     """Ten digits of positions and six of forces, as many as the printed start determines.
 

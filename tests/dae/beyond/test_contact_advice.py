@@ -87,7 +87,6 @@ def test_within_a_bound_of_an_error_the_smoothest_gains_are_taken():
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_an_error_that_no_gains_keep_is_refused_with_what_forbids_it():
     """An unknown force with good sensors, their noise with bad ones, or the allowed roughness."""
     good, bad = situation(1e-6, 1e5, 0.03, 1), situation(1e-3, 1e5, 0.03, 1)

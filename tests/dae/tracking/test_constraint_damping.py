@@ -117,7 +117,7 @@ def test_a_force_that_changes_is_followed_with_the_error_derived():
     ("stage", "degree"),
     [(DcMotors(0.5, 0.01, 1.0, 100.0), 1), (FlexibleJoints(8000.0, inertia=1.0), 2)],
 )
-@pytest.mark.parametrize("ratio", [3.0])
+@pytest.mark.parametrize("ratio", [3.0, 5.0])
 def test_behind_motors_and_springs_a_fast_force_damps_it_too(stage, degree, ratio):
     """From 20 N off rest, with poles of the force at -3 w or -5 w and c = w, it comes to rest.
 

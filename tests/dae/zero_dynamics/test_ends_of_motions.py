@@ -99,7 +99,6 @@ def test_unstable_zero_dynamics_end_the_motion_in_growth():
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_long_motion_does_not_drift(monkeypatch):
     """With errors of 1e-3 a step: outputs and rod to round-off, and the angle to a few steps."""
     monkeypatch.setattr(module, "TOLERANCE", 1e-3)

@@ -222,7 +222,7 @@ def test_a_multiplier_of_a_thousand_is_unstable():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rate", "size"), [(3.3, 0.3)])
+@pytest.mark.parametrize(("rate", "size"), [(3.3, 0.3), (2.0, 0.0)])
 def test_a_limit_cycle_without_the_period_of_the_reference_is_not_called_stable(rate, size):
     """The oscillator of FitzHugh and Nagumo, weakly driven; near it only its focus repeats.
 
