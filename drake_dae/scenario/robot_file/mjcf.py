@@ -39,7 +39,7 @@ def prepare(root: Element, file: Path) -> None:
             motor.tag = "motor"
             motor.attrib.pop("ctrlrange", None)
             motor.attrib.pop("ctrllimited", None)
-        gear = abs(number_in(motor.get("gear", "1").split()[0]) or 1.0)
+        gear = abs(number_in([*motor.get("gear", "").split(), "1"][0]) or 1.0)
         for key in ("ctrlrange", "forcerange"):
             bounds = [number_in(word) for word in motor.get(key, "").split()]
             if gear != 1.0 and bounds and None not in bounds:
