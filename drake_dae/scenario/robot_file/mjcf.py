@@ -94,14 +94,15 @@ def _apply_defaults(root: Element) -> None:
     apply(root, "main")
 
 
-def remove_geometry(root: Element) -> None:
-    """Removes the geometry from which no mass is computed, and meshes that nothing names."""
+def remove_geometry(root: Element, collides: bool) -> None:
+    """Removes geometry from which no mass is computed: what is only drawn, or also collisions."""
     always = _compiler(root).get("inertiafromgeom") == "true"
     for body in [*root.iter("body"), *root.iter("worldbody")]:
         if body.tag == "worldbody" or (body.find("inertial") is not None and not always):
             for geom in body.findall("geom"):
-                body.remove(geom)
-    for contact in root.findall("contact"):
+                if collides or not _collides(geom):
+                    body.remove(geom)
+    for contact in root.findall("contact") if collides else ():
         root.remove(contact)
     named = {geom.get("mesh", "") for geom in root.iter("geom")}
     for asset in root.iterfind("asset"):
