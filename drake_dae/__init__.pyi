@@ -3,7 +3,11 @@
 from . import errors as errors
 from .analysis.analyze import analyze as analyze
 from .analysis.report import Analysis as Analysis
-from .compiler.compile import compile_diagram as compile_diagram
+from .blocks.block import Block as Block
+from .blocks.block import Held as Held
+from .blocks.block import Requirement as Requirement
+from .blocks.compose import compile_diagram as compile_diagram
+from .blocks.traced_system import TracedSystem as TracedSystem
 from .dae.beyond.advised_gains import AdvisedGains as AdvisedGains
 from .dae.beyond.advised_gains import SensedContact as SensedContact
 from .dae.beyond.advised_gains import advised_gains as advised_gains

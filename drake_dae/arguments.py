@@ -19,7 +19,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 def checked(error: Callable[[str], Exception]) -> Callable[[F], F]:
     """Decorates a public name so that arguments which do not match their annotations raise.
 
-    Of a class, the constructor and the class methods are decorated. A number must be finite and not
+    Of a class, the constructor and the class methods are decorated; what it makes keeps copies of
+    the caller's arrays. A number must be finite and not
     a bool, text is no list of letters, and the entries of lists and dictionaries are checked as
     well. Shapes and ranges are left to the function. A default is always accepted. A check takes
     some 10 us: nothing that is called in a loop has one.
@@ -57,6 +58,10 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
                 wanted = dict.fromkeys(words for where, words, _ in problems if where == place)
                 text = f"{name}{place} must be {' or '.join(wanted)}, got {brief(wrong)}"
                 raise error(f"{owner}: {text}")
+        if function.__name__ == "__init__":
+            own = (value.copy() if isinstance(value, np.ndarray) else value for value in arguments)
+            arguments = tuple(own)
+            options |= {n: v.copy() for n, v in options.items() if isinstance(v, np.ndarray)}
         return function(*arguments, **options)
 
     return call  # type: ignore[return-value]

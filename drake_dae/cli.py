@@ -9,6 +9,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from importlib import import_module
 from io import TextIOWrapper
 
@@ -81,9 +82,14 @@ def _main(arguments: Sequence[str]) -> int:
             options = _parsed(arguments)
             if options.command == "analyze":  # Its report says so.
                 warnings.simplefilter("ignore", NonMinimumPhaseWarning)
-            code = int(options.run(options))
+            is_json = getattr(options, "json", False)
+            with redirect_stdout(sys.stderr if is_json else sys.stdout):
+                result = options.run(options)
+            code, data = result if isinstance(result, tuple) else (result, None)
+            if is_json:
+                print(json.dumps(data, indent=2))
             sys.stdout.flush()  # The interpreter's own last flush would end with 120.
-            return code
+            return int(code)
     except DrakeDaeError as error:
         # A scenario's error has a line for each problem; other texts, as of Drake, become one line.
         text = str(error)

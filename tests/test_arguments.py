@@ -27,7 +27,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 import drake_dae as dd
-from drake_dae.analysis.findings import Assumption
+from drake_dae.analysis.report import Assumption
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold

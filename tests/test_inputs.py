@@ -12,20 +12,33 @@ from runs import scenario
 
 from drake_dae import (
     ConstantReference,
+    DcMotors,
+    Encoders,
+    FlexibleJoints,
     ForceSensor,
     JointPositions,
     MultibodyExpressions,
     NormalForm,
+    Observing,
+    Parameter,
     PointToPointReference,
     Record,
     RobotModel,
     RobotPlant,
+    StateEstimator,
     Torus,
+    TrackingLaw,
     build_scenario,
+    compile_diagram,
     dynamic_extension,
+    export_code,
     find_structure,
     load_scenario,
+    make_animation,
+    poles,
     simulate,
+    start_values,
+    with_disturbance,
 )
 from drake_dae.arrays import brief, numbers
 from drake_dae.cli import main
@@ -35,6 +48,7 @@ from drake_dae.pictures.axes import labelled
 from drake_dae.scenario.forms.typed_yaml import load_yaml
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.simulation.records.record import Recorded
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
@@ -202,6 +216,47 @@ def test_a_context_of_another_system_is_refused():
     ):
         with pytest.raises(ModelError, match="'two_link'"):
             refused()
+
+
+def test_a_context_of_another_loop_is_refused_in_a_sentence(tmp_path):
+    """Drake's own text of it has no remedy, and a link to an issue."""
+    (loop, _), (_, context) = (build_scenario(scenario("two_link_wall")) for _ in "ab")
+    for refused in (
+        lambda: simulate(loop.diagram, context, 0.01),
+        lambda: loop.record(context),
+        lambda: loop.set_state(context, arm("two_link").structure.states[0]),
+        lambda: start_values(loop, context),
+        lambda: compile_diagram(loop.diagram).values(context),
+        lambda: export_code(loop, context, "a", tmp_path),
+        lambda: make_animation(loop, loop.record(loop.diagram.CreateDefaultContext()), context),
+    ):
+        with pytest.raises(ModelError, match=r"'(closed_loop|two_link_arm)'"):
+            refused()
+
+
+def test_an_estimator_of_the_state_needs_its_rate():
+    dae = with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
+    with pytest.raises(ModelError, match="state_rate"):
+        StateEstimator(TrackingLaw(dae, poles(-4.0)), Observing(10.0), 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "kept"),
+    [
+        (lambda a: FlexibleJoints(a), "stiffness"),
+        (lambda a: Encoders(resolution=a), "resolution"),
+        (lambda a: DcMotors(a, 1.0, 1.0), "torque_constant"),
+        (lambda a: ConstantReference(a), "values"),
+        (lambda a: Record(a, {}), "time"),
+        (lambda a: Recorded(a[:, None], [Signal("a")]), "values"),
+        (lambda a: Parameter("a", a), "value"),
+    ],
+)
+def test_what_is_made_of_a_callers_array_does_not_change_with_it(make, kept):
+    given = np.array([1.0, 2.0])
+    made = make(given)
+    given[:] = -1.0
+    np.testing.assert_array_equal(np.ravel(getattr(made, kept)), [1.0, 2.0])
 
 
 def test_one_number_does_not_fill_a_position():

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.analysis.examined_states import ExaminedStates, check_consistent
-from drake_dae.analysis.findings import Assumption, Finding
 from drake_dae.analysis.reference_check import check_reference
-from drake_dae.analysis.report import Analysis
+from drake_dae.analysis.report import Analysis, Assumption, Finding
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number
 from drake_dae.dae.states.contact_margin import ContactMargins

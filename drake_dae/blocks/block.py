@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -65,6 +66,8 @@ class Requirement:
     margin: ca.SX
     reason: str
     fault: FailureKind = FailureKind.SINGULAR
+
+    OUTSIDE: ClassVar[FailureKind] = FailureKind.OUTSIDE
 
     @classmethod
     def regular(cls, pivot: ca.SX, matrix: str) -> "Requirement":

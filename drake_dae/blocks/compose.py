@@ -80,7 +80,7 @@ class Composed:
     Attributes:
         block: The block. Its inputs are `cuts` and `fixed`.
         cuts: Name of an input -> the output port of a leaf that is not in the block.
-        fixed: Name of an input -> the input port of a leaf that has a fixed value.
+        fixed: Name of an input -> the input port of a leaf that is exported or has a fixed value.
         states, parameters: Leaf -> its slice of the block's column.
         held: (leaf, index of its group) -> the name of a group of the block, and its slice there.
     """
@@ -110,7 +110,8 @@ def compile_diagram(
     The diagram may contain `TracedSystem`s, and every system that Drake converts to symbolic
     expressions: its primitives, and LeafSystems templated on the scalar type. Nested diagrams are
     flattened. Systems on which no output depends, such as loggers, are left out. Output ports of
-    other systems, such as a MultibodyPlant or a RandomSource, become inputs of the block.
+    other systems, such as a MultibodyPlant or a RandomSource, become inputs of the block, and so do
+    the diagram's own input ports.
 
     Algebraic loops need no check: Drake finds them, by ports, when it builds the diagram.
 
@@ -210,6 +211,11 @@ class _Walk:
         self.values: dict[Port, ca.SX] = {}
         self.used: set[System] = set()  # Those whose states matter.
         self.owners: set[System] = set()  # Those with parameters of their own.
+        self.exported = {
+            place: diagram.get_input_port(i).get_name()
+            for i in range(diagram.num_input_ports())
+            for place in _inputs(diagram, i)
+        }
         self._twins = self._find_twins()
 
     def name(self, system: System) -> str:
@@ -309,14 +315,14 @@ class _Walk:
         place = system, int(port.get_index())
         if place in self.leaves.sources:
             return self.port(self.leaves.sources[place])
-        if port.HasValue(self.local(system)):
-            label = f"{self.name(system)}.{name}"
+        assert block is not None
+        if not port.HasValue(self.local(system)) and name in block.defaults:
+            return self.expressions(system, [block.defaults[name]])[0]
+        if place in self.exported or port.HasValue(self.local(system)):
+            label = self.exported.get(place, f"{self.name(system)}.{name}")
             if label not in self.inputs:
                 self._new_input(self.fixed, label, place, port.size())
             return self.inputs[label]
-        assert block is not None
-        if name in block.defaults:
-            return self.expressions(system, [block.defaults[name]])[0]
         if not port.size():
             return NOTHING
         raise ModelError(

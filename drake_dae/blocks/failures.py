@@ -61,7 +61,7 @@ def simulation_error(
         case FailureKind.OVERFLOW:
             return NonFiniteError(
                 f"{failure.function}: its input {bad} is beyond all measure {where}: it grows "
-                "without bound. Check the gains and the errors of the model",
+                "without bound",
                 time,
                 state,
             )
@@ -141,8 +141,7 @@ def endless_steps(
     """
     return SimulationError(
         f"{name}: the last {steps} steps led from t = {start:.12g} s only to {end:.12g} s"
-        f"{_at(state)} where it grows without bound, or jumps. Check the gains and the errors of "
-        "the model; if these are in order, choose a fixed step",
+        f"{_at(state)} where it grows without bound, or jumps. A fixed step passes a jump",
         end,
         state,
     )

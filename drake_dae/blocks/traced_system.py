@@ -196,6 +196,20 @@ def check_context(system: System, context: Context) -> None:
         ) from None
 
 
+def context_in(system: System, root: Context) -> Context:
+    """The context of a system in that of a diagram that contains it.
+
+    Raises:
+        ModelError: It belongs to a diagram without this system.
+    """
+    try:
+        return system.GetMyMutableContextFromRoot(root)
+    except RuntimeError:
+        raise ModelError(
+            f"the context is that of another diagram, which has not this '{system.get_name()}'"
+        ) from None
+
+
 def _shown(port: InputPort | OutputPort) -> str:
     """A port with its size, if it has vectors."""
     is_vector = port.get_data_type() == PortDataType.kVectorValued

@@ -51,7 +51,8 @@ class Parser(argparse.ArgumentParser):
 
     def json(self, text: str) -> None:
         """Adds `--json`."""
-        self.flag("--json", f'{text} as JSON; for an error, its text under "error"')
+        text = f'{text} as JSON, all else on stderr; for an error, its text under "error"'
+        self.flag("--json", text)
 
 
 def program() -> str:

@@ -1,7 +1,6 @@
 """`drake-dae new`, `analyze`: a scenario for a robot of one's own, and one that is examined."""
 
 import argparse
-import json
 import logging
 import re
 import shlex
@@ -9,6 +8,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
+from typing import Any
 
 from pydrake.systems.framework import Context
 
@@ -113,7 +113,7 @@ def _analyze_options(parser: Parser) -> None:
     parser.epilog = "exit code: 0, or 2 if a problem was found (the lines PROBLEM)"
 
 
-def _analyze(options: argparse.Namespace) -> int:
+def _analyze(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Examines the robot of a scenario and what its reference takes.
 
     Of the robot: relative degrees, index, Assumptions (1)-(5), zero dynamics. Of the reference: the
@@ -123,9 +123,8 @@ def _analyze(options: argparse.Namespace) -> int:
     path = find_scenario(options.scenario)
     with waiting(f"analyzing {path.stem}"):
         report = find_feasibility(load_scenario(path, options.settings))
-    as_json = {"scenario": path.stem, **report.to_dict()}
-    print(json.dumps(as_json, indent=2) if options.json else f"{path.stem}\n\n{report}")
-    return 2 if report.problems else 0
+    print(f"{path.stem}\n\n{report}")
+    return 2 if report.problems else 0, {"scenario": path.stem, **report.to_dict()}
 
 
 COMMANDS = {"new": (_new_options, _new), "analyze": (_analyze_options, _analyze)}

@@ -1,13 +1,12 @@
 """`drake-dae simulate`: runs a scenario and writes its files into a folder."""
 
 import argparse
-import json
 import os
 import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import count
@@ -45,26 +44,16 @@ def _options(parser: Parser) -> None:
     parser.flag("--open", "open the animation in a browser at the end")
     parser.flag("--rollout", "run the whole loop as one function, without Drake's Simulator")
     parser.flag("--check", "exit code 2 for a run that missed its task")
-    parser.json("print the verdict and the files, and all else on stderr,")
+    parser.json("print the verdict and the files")
 
 
-def _command(options: argparse.Namespace) -> int:
+def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Runs a scenario and writes its record, a summary and an animation into a folder.
 
     The first line of the summary says whether the run is GOOD, BAD or UNDECIDED, and why. A rollout
     is faster for many runs (see sweep), not for one; its record has every fixed step, or 1000 rows
     under error control.
     """
-    if not options.json:
-        return _simulate(options)[0]
-    with redirect_stdout(sys.stderr):
-        code, results = _simulate(options)
-    print(json.dumps(results, indent=2))
-    return code
-
-
-def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Runs a scenario; returns the exit code, and the results for JSON."""
     # The scenario, and whether its files may be written.
     path = find_scenario(options.scenario)
     scenario, remarks = load_scenario(path, options.settings), list[str]()
@@ -95,9 +84,7 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     print(took, *notes, sep="\n", flush=True)
 
     # The run, in a folder of its own.
-    name = f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
-    unused = (Path("runs", name if i == 1 else f"{name}-{i}") for i in count(1))
-    folder = options.out or next(path for path in unused if not path.exists())
+    folder = options.out or _new_folder(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
     folder.mkdir(parents=True, exist_ok=True)
     for file in (*FILES, PART):
         (folder / file).unlink(missing_ok=True)
@@ -112,6 +99,16 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     if code == 0 and options.check and results.get("missed"):
         code = 2
     return code, {"scenario": path.stem, "folder": str(folder), **results}
+
+
+def _new_folder(name: str) -> Path:
+    """Makes a folder below runs/ that no other run has."""
+    for i in count(1):
+        folder = Path("runs", name if i == 1 else f"{name}-{i}")
+        with suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            break
+    return folder
 
 
 @contextmanager
@@ -267,4 +264,4 @@ class _Run:
             print(f"watch it: {program()} play {named}{plots}", flush=True)
 
 
-COMMANDS = {"simulate": (_options, _command)}
+COMMANDS = {"simulate": (_options, _simulate)}

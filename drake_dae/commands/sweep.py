@@ -1,11 +1,9 @@
 """`drake-dae sweep`: runs a scenario many times with other values."""
 
 import argparse
-import json
 import re
 import sys
 from collections import Counter
-from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -69,26 +67,16 @@ def _options(parser: Parser) -> None:
         help="how long a run may take by the clock until its process is ended (3600)",
     )
     parser.flag("--check", "exit code 2 if a run did not finish")
-    parser.json("print outcomes and figures, and all else on stderr,")
+    parser.json("print outcomes and figures")
     parser.path("--out", "FOLDER", "folder for the results (default: runs/<scenario>-sweep)")
 
 
-def _command(options: argparse.Namespace) -> int:
+def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Runs a scenario once for every combination of the values of some keys, on all cores.
 
     It writes a table and a plot with figures of each run. The same command continues a study that
     was killed, and tries runs again whose process died or was too slow (exit code 1).
     """
-    if not options.json:
-        return _sweep(options)[0]
-    with redirect_stdout(sys.stderr):
-        code, report = _sweep(options)
-    print(json.dumps(report, indent=2))
-    return code
-
-
-def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Runs the study; returns the exit code, and the results for JSON."""
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     variations = parse_variations(options.vary, options.random, options.seed, options.together)
@@ -134,4 +122,4 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return 2 if missing and options.check else 0, report
 
 
-COMMANDS = {"sweep": (_options, _command)}
+COMMANDS = {"sweep": (_options, _sweep)}

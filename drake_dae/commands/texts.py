@@ -18,13 +18,12 @@ def _list_options(parser: Parser) -> None:
     parser.json("print names and descriptions")
 
 
-def _list(options: argparse.Namespace) -> int:
+def _list(options: argparse.Namespace) -> tuple[int, dict[str, str]]:
     """Lists the shipped scenarios."""
     found = {name: description(path) for name, path in shipped_scenarios().items()}
     width = max(map(len, found), default=0)
-    lines = [f"{name.ljust(width)}  {text}" for name, text in found.items()]
-    print(json.dumps(found, indent=2) if options.json else "\n".join(lines))
-    return 0
+    print(*(f"{name.ljust(width)}  {text}" for name, text in found.items()), sep="\n")
+    return 0, found
 
 
 def _print_options(parser: Parser) -> None:

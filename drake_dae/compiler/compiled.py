@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.computations import HELD, Block, Update
+from drake_dae.blocks.traced_system import context_in
 from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
 from drake_dae.compiler.trace import Expressions, TracedCall
@@ -131,7 +132,7 @@ class CompiledDiagram:
         """The states in a context; discrete ones are NaN where a block `begins` and has not."""
         state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
         for system, part in self.states:
-            local = system.GetMyContextFromRoot(context)
+            local = context_in(system, context)
             state[part] = local.get_continuous_state_vector().CopyToVector()
         for system, part in self.held:
             local, block = system.GetMyContextFromRoot(context), self.blocks[system]
@@ -217,7 +218,7 @@ class CompiledDiagram:
         """
         values = np.zeros(self.sizes["parameters"])
         for system, part in self.parameters:
-            local = system.GetMyContextFromRoot(context)
+            local = context_in(system, context)
             values[part] = np.concatenate(numeric_parameters(local))
         for system, name, part in self.fixed:
             local, port = system.GetMyContextFromRoot(context), system.GetInputPort(name)

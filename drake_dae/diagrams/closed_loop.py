@@ -12,6 +12,7 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.traced_system import context_in
 from drake_dae.dae.system.signals import Signal
 from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import seed_noise
@@ -110,7 +111,7 @@ class ClosedLoop:
         Raises:
             ModelError: The shape is wrong.
         """
-        self.plant.set_state(self.plant.GetMyMutableContextFromRoot(context), state)
+        self.plant.set_state(context_in(self.plant, context), state)
 
     def changes(self, context: Context) -> tuple[PhaseChange, ...]:
         """The start of each phase of a run, with the reason; none without phases.
@@ -118,7 +119,7 @@ class ClosedLoop:
         Args:
             context: The diagram's context.
         """
-        return self.controller.changes(self.controller.GetMyContextFromRoot(context))
+        return self.controller.changes(context_in(self.controller, context))
 
     def record(self, context: Context, after: float | None = None) -> Record:
         """The record of a run: the logged signals up to now, and signals computed from them.
@@ -130,6 +131,7 @@ class ClosedLoop:
             context: The diagram's context.
             after: Only later samples than this time, in s; None for all.
         """
+        context_in(self.plant, context)  # The log has no name.
         logged = Record.from_log(self.log, self.signals, context, after)
         return self.with_errors(logged, context).while_finite()
 
@@ -144,7 +146,7 @@ class ClosedLoop:
         plant, controller, at_controller = self.plant, self.controller, None
         values = {name: recorded.values for name, recorded in record.signals.items()}
         if context is not None:
-            at_controller = controller.GetMyContextFromRoot(context)
+            at_controller = context_in(controller, context)
             along = self.plant_parameters(record, context)
             values["parameters"] = controller.law.system.parameters_of(plant.dae, along)
         derived = controller.derived(at_controller, record.time, values)
@@ -162,7 +164,7 @@ class ClosedLoop:
             context: The diagram's context after the run.
         """
         plant = self.plant
-        own = plant.parameters(plant.GetMyContextFromRoot(context))
+        own = plant.parameters(context_in(plant, context))
         values = np.tile(own, (record.time.size, 1))
         if "exogenous" in record:
             values[:, plant.exogenous_places] = record["exogenous"]
@@ -170,7 +172,13 @@ class ClosedLoop:
 
     @checked(WiringError)
     def predicted_error(self, record: Record) -> FloatArray:
-        """The predicted error (30), (31) of a record, one column for each output."""
+        """The predicted error (30), (31) of a record, one column for each output.
+
+        Raises:
+            ModelError: The record has no rows.
+        """
+        if not record.time.size:
+            raise ModelError("the record has no rows, from which an error is predicted")
         parameters = self.controller.law.system.parameter_values
         if self.exogenous is not None:
             moving = self.exogenous.reference(record.time[0])

@@ -6,6 +6,7 @@ from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.framework import Context, DiagramBuilder, System
 from pydrake.systems.primitives import RandomSource
 
+from drake_dae.blocks.traced_system import context_in
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
@@ -103,4 +104,4 @@ def add_noise(
 def seed_noise(noise: RandomSource | None, context: Context, seed: int) -> None:
     """Sets the seed of a sensor's noise in the context of the diagram, if there is noise."""
     if noise is not None:
-        noise.SetRandomContext(noise.GetMyMutableContextFromRoot(context), RandomGenerator(seed))
+        noise.SetRandomContext(context_in(noise, context), RandomGenerator(seed))

@@ -24,7 +24,7 @@ class JointFriction(Load):
 
     It does not stick: below the Coulomb torque a joint creeps with at most v_s. The parameters
     "<joint>.coulomb" and "<joint>.viscous" are F_c and d. A law compensates the friction that its
-    model has; with the values 0 in the model, and others in `plant_parameters`, it is unknown.
+    model has; with the values 0 in the model, and others in `plant.parameters`, it is unknown.
 
     Attributes:
         joints: Names of joint positions.

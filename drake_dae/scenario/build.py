@@ -26,16 +26,15 @@ from drake_dae.robots.known_forces import ScaledForce
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.controllers.task_controller import check_task, task_controller
 from drake_dae.scenario.forms.keys import at, each, violated
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, references_of
 from drake_dae.scenario.parts.parts import Poles
-from drake_dae.scenario.plants import RobotToSimulate
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.scenario.task_controller import check_task, task_controller
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 
@@ -155,15 +154,9 @@ def make_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> P
         ScenarioError: The robot cannot be simulated so; the message names the key.
     """
     check_disturbances(scenario.plant.disturbances, model.links)
-    robot = RobotToSimulate(
-        model,
-        structure,
-        partial(add_robot, scenario.robot, payloads=scenario.plant.payloads),
-        scenario.plant.parameters,
-        scenario.plant.disturbances,
-    )
+    add = partial(add_robot, scenario.robot, payloads=scenario.plant.payloads)
     try:
-        return scenario.plant.plant(robot)
+        return scenario.plant.plant(model, structure, add)
     except InconsistentStateError as error:  # Its default state is projected.
         raise ScenarioError(("start.positions", str(error))) from error
 

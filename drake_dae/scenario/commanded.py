@@ -1,7 +1,6 @@
 """Builds a scenario so that a person can move references, surfaces and links while it runs."""
 
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -59,42 +58,27 @@ def build_commanded(scenario: Scenario) -> Commanded:
     if scenario.plant.carries:
         text = "Drake's own contact cannot be traced: take a !CompliantContact in its place"
         raise ScenarioError(("plant", text))
-    left_out = dict[str, str]()
-    with suppress(DrakeDaeError):
-        return _build(scenario, _with_all_parts(scenario, left_out), left_out)
-    # A part does not fit: add one after the other, and omit those that fail.
-    left_out, extended = {}, scenario
-    commanded = _build(scenario, extended, left_out)
+    extended, left_out = scenario, list[str]()
     for name, add in _PARTS.items():
         result = add(extended)
-        try:
-            if isinstance(result, str):
-                raise ScenarioError(("", result))
-            commanded = _build(scenario, result, left_out)
-            extended = result
-        except DrakeDaeError as error:
-            left_out[name] = f"{name}: {error}"
-    return replace(commanded, left_out=tuple(left_out.values()))
-
-
-def _with_all_parts(scenario: Scenario, left_out: dict[str, str]) -> Scenario:
-    """Adds all possible parts, and puts the reasons for the others into `left_out`."""
-    for name, add in _PARTS.items():
-        result = add(scenario)
         if isinstance(result, str):
-            left_out[name] = f"{name}: {result}"
+            left_out.append(f"{name}: {result}")
         else:
-            scenario = result
-    return scenario
+            extended = result
+    try:
+        return _build(scenario, extended, left_out)
+    except DrakeDaeError as error:
+        commanded = _build(scenario, scenario, left_out)  # Its own errors come first.
+        reasons = [f"{name}: {error}" for name in _PARTS]
+        return replace(commanded, left_out=tuple(reasons))
 
 
-def _build(original: Scenario, extended: Scenario, left_out: Mapping[str, str]) -> Commanded:
+def _build(original: Scenario, extended: Scenario, left_out: Sequence[str]) -> Commanded:
     """Builds the loop of an extended scenario, with the initial state of the original one."""
     completed, loop = build_completed(extended, commanded=True)
     # The original exogenous signals decide whether the loop starts at rest.
     initial = replace(completed.scenario, exogenous=original.exogenous)
-    context = start_scenario(initial, loop)
-    return Commanded(completed.scenario, loop, context, tuple(left_out.values()))
+    return Commanded(completed.scenario, loop, start_scenario(initial, loop), tuple(left_out))
 
 
 def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:

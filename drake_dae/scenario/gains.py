@@ -25,11 +25,11 @@ from drake_dae.references import Reference
 from drake_dae.robots.links.links import velocities_are_rates
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.task_controller import opening_contact
 from drake_dae.systems.task.fade import fade
 from drake_dae.systems.task.phases import Approach, Press
 
@@ -56,7 +56,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     disturbance and friction, and measured force, each if it is left out; and for a task the gains
     without contact, soft along the distance. With encoders and rigid joints the gains are those of
     `advised_gains` for the noise of the encoders; otherwise those of `contact_gains`. A scenario
-    with `gains`, or with ideal contact, is unchanged.
+    with `law.gains`, or with ideal contact, is unchanged.
 
     Args:
         scenario: The scenario, with all of its outputs.

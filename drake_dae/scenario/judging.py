@@ -34,13 +34,13 @@ from drake_dae.robots.constraints import Constraint
 from drake_dae.robots.links_behind import LinkBehind, links_behind
 from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.build import tracking_law
-from drake_dae.scenario.controllers.task_controller import check_task
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
 from drake_dae.scenario.robot_file.links import RobotLinks
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.task_controller import check_task
 from drake_dae.simulation.judgement import FindingKind, Outcome, RunFinding, judge
 from drake_dae.simulation.limits import limited_values, robot_limits
 from drake_dae.simulation.records.record import Record

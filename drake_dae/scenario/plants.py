@@ -1,12 +1,11 @@
 """The plants of a scenario: each member of this family makes a plant."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from importlib import import_module
 from typing import ClassVar, cast
 
-from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
@@ -24,23 +23,8 @@ from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_plant import RobotPlant
 
-
-@dataclass(frozen=True, eq=False)
-class RobotToSimulate:
-    """The robot for which a plant is made.
-
-    Attributes:
-        model, structure: The robot, and the structure of its system.
-        add_robot: A function that adds the robot with its payloads to a MultibodyPlant.
-        parameters: Parameter name -> the value in the plant, if it differs from the law's.
-        disturbances: Disturbance forces on the plant.
-    """
-
-    model: RobotModel
-    structure: Structure
-    add_robot: Callable[[DrakePlant, SceneGraph], None]
-    parameters: Mapping[str, ArrayLike]
-    disturbances: Sequence[DisturbanceForce]
+AddRobot = Callable[[DrakePlant, SceneGraph], None]
+"""Adds a robot with its payloads to a MultibodyPlant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,8 +73,8 @@ class ScenarioPlant(ABC):
         """
 
     @abstractmethod
-    def plant(self, robot: RobotToSimulate) -> Plant:
-        """Makes the plant.
+    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
+        """Makes the plant of a robot, with the structure of its system.
 
         Raises:
             ScenarioError: The robot cannot be simulated so; the message names the key.
@@ -101,22 +85,18 @@ class ScenarioPlant(ABC):
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
 
-    def plant(self, robot: RobotToSimulate) -> Plant:
-        return RobotPlant(robot.model, structure=robot.structure)
+    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
+        return RobotPlant(model, structure=structure)
 
 
 @dataclass(frozen=True)
 class MultibodyPlant(ContactMaterial, ScenarioPlant):
     """The plant is a `ContactPlant`: Drake's own contact, in a discrete MultibodyPlant.
 
-    A ball at the tool touches the surfaces of the constraints. With point
-    contact the force is stiffness times depth. With hydroelastic contact the ball is rigid, and the
-    pressure of the surface is modulus times depth / thickness.
-
-    If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
-    distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
-    a) off the surface. A smaller radius reduces this deviation from ideal contact; a stiffer
-    contact does not. A tool that stays normal to its surface does not roll.
+    A ball at the tool touches the surfaces of the constraints. With point contact the force is
+    stiffness times depth. With hydroelastic contact the ball is rigid, and the pressure of the
+    surface is modulus times depth / thickness. Where the tool tilts, the ball rolls, the farther
+    off ideal contact the larger its radius.
     """
 
     carries: ClassVar[bool] = True
@@ -132,15 +112,15 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
         names = [f.name for f in (*fields(PointMaterial), *fields(ScenarioPlant))]
         return CompliantContact(**{name: getattr(self, name) for name in names})
 
-    def plant(self, robot: RobotToSimulate) -> Plant:
+    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
         with at("plant or plant.parameters"):
             return ContactPlant(
-                robot.model,
-                robot.add_robot,
+                model,
+                add_robot,
                 self,
-                structure=robot.structure,
-                parameters=robot.parameters,
-                disturbances=robot.disturbances,
+                structure=structure,
+                parameters=self.parameters,
+                disturbances=self.disturbances,
             )
 
 
@@ -165,9 +145,9 @@ class CompliantContact(PointMaterial, ScenarioPlant):
     def begin(self, plant: Plant, context: Context) -> None:
         cast(CompliantPlant, plant).set_contact(context, self)
 
-    def plant(self, robot: RobotToSimulate) -> Plant:
+    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
         with at("plant or plant.parameters"):  # Whose numbers are set in a context.
-            return CompliantPlant(robot.model, self, structure=robot.structure)
+            return CompliantPlant(model, self, structure=structure)
 
 
 @dataclass(frozen=True)
@@ -197,12 +177,12 @@ class OwnPlant(ScenarioPlant):
                 f"'{brief(self.maker)}'"
             )
 
-    def plant(self, robot: RobotToSimulate) -> Plant:
+    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
         module, _, name = self.maker.partition(":")
         with at("plant.maker"):
             try:
                 kind = getattr(import_module(module), name)
-                plant = kind(robot.model, robot.structure)
+                plant = kind(model, structure)
             except DrakeDaeError:
                 raise
             except Exception as error:

@@ -1,7 +1,7 @@
 """Runs of a scenario by `rollout`, for the command and for studies."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
 
@@ -39,20 +39,15 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
     plant = scenario.plant.rolled
     if plant is scenario.plant:
         return scenario, ""
-    name, before = type(plant).__name__, type(scenario.plant).__name__
-    viscous = [c for c in scenario.constraints if getattr(c, "viscous_friction", None)]
-    parameters = {**plant.parameters, **_without_viscous(c.name for c in viscous)}
-    plant = replace(plant, parameters=parameters)
+    # Drake's contact has no viscous friction.
+    viscous = [c.name for c in scenario.constraints if getattr(c, "viscous_friction", None)]
+    none = {f"{name}.viscous_friction": 0.0 for name in viscous}
+    plant = replace(plant, parameters={**plant.parameters, **none})
     return replace(scenario, plant=plant), (
-        f"the rollout runs !{name} in place of !{before}: the same equations of contact, traced. "
-        "Drake's solver stops at a relative residual of 1e-6, and joints stop at their limits in "
-        "Drake's plant alone"
+        f"the rollout runs !{type(plant).__name__} in place of !{type(scenario.plant).__name__}: "
+        "the same equations of contact, traced. Drake's solver stops at a relative residual of "
+        "1e-6, and joints stop at their limits in Drake's plant alone"
     )
-
-
-def _without_viscous(names: Iterable[str]) -> dict[str, float]:
-    """The parameters for no viscous friction of contacts, since Drake's contact has none."""
-    return {f"{name}.viscous_friction": 0.0 for name in names}
 
 
 def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
@@ -65,28 +60,22 @@ def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
     Raises:
         ModelError: There are too many.
     """
-    config, rows = scenario.integrator, ROWS
-    if time_step:
-        _check_rows(scenario.duration / time_step, "time_step", time_step, scenario.duration)
-        end = config.start_time + scenario.duration
-        inside = time_step * np.arange(config.start_time // time_step + 1, ceil(end / time_step))
-        near = SAME * time_step
-        inside = inside[(inside > config.start_time + near) & (inside < end - near)]
-        return np.concatenate([[config.start_time], inside, [end]])
-    if not config.use_error_control:
-        steps = scenario.duration / config.max_step_size
-        _check_rows(steps, "max_step_size", config.max_step_size, scenario.duration)
-        rows = max(1, ceil(steps - 0.01))
-    times: FloatArray = config.start_time + np.linspace(0.0, scenario.duration, rows + 1)
-    return times
-
-
-def _check_rows(count: float, name: str, step: float, duration: float) -> None:
-    if count > MOST_ROWS:
+    config, duration = scenario.integrator, scenario.duration
+    start, end = config.start_time, config.start_time + duration
+    fixed = time_step or (0.0 if config.use_error_control else config.max_step_size)
+    if fixed and duration / fixed > MOST_ROWS:
         raise ModelError(
-            f"{name} {step:g} s makes {count:.2g} rows for {duration:g} s; a rollout keeps at most "
-            f"{MOST_ROWS:g}"
+            f"steps of {fixed:g} s make {duration / fixed:.2g} rows for {duration:g} s; a rollout "
+            f"keeps at most {MOST_ROWS:g}"
         )
+    if time_step:
+        inside = time_step * np.arange(start // time_step + 1, ceil(end / time_step))
+        near = SAME * time_step
+        inside = inside[(inside > start + near) & (inside < end - near)]
+        return np.concatenate([[start], inside, [end]])
+    rows = max(1, ceil(duration / fixed - 0.01)) if fixed else ROWS
+    times: FloatArray = start + np.linspace(0.0, duration, rows + 1)
+    return times
 
 
 def roll_scenario(
@@ -111,61 +100,40 @@ def roll_scenario(
         InconsistentStateError: The start is not on N*.
     """
     start, parameters = start_values(loop, context)
-    watched = _RolloutWatch(scenario, loop, look)
+    sensors, seeds = scenario.sensors, dict[str, int]()
+    if sensors.force is not None:
+        seeds["force_noise"] = sensors.force.seed
+    if sensors.encoders is not None:
+        seeds[ENCODER_NOISE] = encoder_seed(sensors.encoders.seed)
+    watch, due = DivergenceWatch(loop.plant, scenario.duration), time.perf_counter() + PERIOD
+    seen: float | None = None
+    failure: SimulationError | None = None
+
+    def see(rows: Record, is_last: bool = False) -> None:
+        nonlocal seen, due, failure
+        due = time.perf_counter() + PERIOD
+        if scenario.judgement.may_diverge or failure is not None or not rows.time.size:
+            return
+        seen = float(rows.time[-1])
+        try:
+            watch.look(rows, is_last=is_last)
+        except SimulationError as error:
+            failure = error
+
+    def watched(record: RecordAfter) -> bool:
+        if time.perf_counter() > due:
+            see(record(seen))
+        return failure is not None or look(record)
+
     (rollout,) = run_loop(
         loop,
         start,
         parameters,
         rollout_times(scenario, loop.plant.time_step),
         config=scenario.integrator,
-        seeds=[_seeds(scenario)],
+        seeds=[seeds],
         lasting=lasting,
         look=watched,
     )
-    return diagnosed(loop, watched.judged(rollout))
-
-
-def _seeds(scenario: Scenario) -> dict[str, int]:
-    """The seed of each source of noise."""
-    seeds = {}
-    if scenario.sensors.force is not None:
-        seeds["force_noise"] = scenario.sensors.force.seed
-    if scenario.sensors.encoders is not None:
-        seeds[ENCODER_NOISE] = encoder_seed(scenario.sensors.encoders.seed)
-    return seeds
-
-
-class _RolloutWatch:
-    """Ends a rollout that diverges."""
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        loop: ClosedLoop,
-        look: Callable[[RecordAfter], bool] = lambda record: False,
-    ) -> None:
-        self._watch = DivergenceWatch(loop.plant, scenario.duration)
-        self._look, self._may_diverge = look, scenario.judgement.may_diverge
-        self._time: float | None = None
-        self._next = time.perf_counter() + PERIOD
-        self._failure: SimulationError | None = None
-
-    def __call__(self, record: RecordAfter) -> bool:
-        if time.perf_counter() >= self._next:
-            self._see(record(self._time))
-            self._next = time.perf_counter() + PERIOD
-        return self._failure is not None or self._look(record)
-
-    def _see(self, rows: Record, *, is_last: bool = False) -> None:
-        if self._may_diverge or self._failure is not None or not rows.time.size:
-            return
-        self._time = float(rows.time[-1])
-        try:
-            self._watch.look(rows, is_last=is_last)
-        except SimulationError as error:
-            self._failure = error
-
-    def judged(self, rollout: Rollout) -> Rollout:
-        """The rollout, or its part up to the time at which it diverges."""
-        self._see(rollout.record.after(self._time), is_last=rollout.failure is None)
-        return rollout if self._failure is None else rollout.ended(self._failure)
+    see(rollout.record.after(seen), is_last=rollout.failure is None)
+    return diagnosed(loop, rollout if failure is None else rollout.ended(failure))

@@ -14,9 +14,9 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.model import RobotModel
-from drake_dae.scenario.controllers.task_controller import opening_contact
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.task_controller import opening_contact
 
 _SLACK = 1e-6
 """The allowed excess over a joint limit at the start, rad or m: references may start at the

@@ -103,8 +103,9 @@ class CompiledRun:
             _copy_fixed(system, context, self._copies[system], local, leaves)
         at_block = self._block.GetMyMutableContextFromRoot(own)
         for name, (system, i) in composed.fixed.items():
-            value = system.get_input_port(i).Eval(system.GetMyContextFromRoot(context))
-            self._block.GetInputPort(name).FixValue(at_block, value)
+            port, local = system.get_input_port(i), system.GetMyContextFromRoot(context)
+            if port.HasValue(local):
+                self._block.GetInputPort(name).FixValue(at_block, port.Eval(local))
         self._simulator = Simulator(self._diagram, own)
         ApplySimulatorConfig(config, self._simulator)
         own.SetAccuracy(config.accuracy)

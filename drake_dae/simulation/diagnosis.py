@@ -346,8 +346,7 @@ class RunDiagnosis:
         return [
             f"the fixed steps of {step:.3g} s are too long for the fastest rate of the loop, "
             f"{rate:.3g} 1/s, such as that of elastic joints: take steps of at most "
-            f"{LONGEST / rate:.2g} s, "
-            "or error control"
+            f"{LONGEST / rate:.2g} s, or error control"
         ]
 
 

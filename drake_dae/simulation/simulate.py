@@ -27,6 +27,7 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
+from drake_dae.blocks.traced_system import check_context
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, SimulationError
 from drake_dae.simulation.compiled_run import NO_EVENTS, CompiledRun
 from drake_dae.simulation.diagnosis import RunDiagnosis
@@ -114,6 +115,7 @@ def simulate(
         SimulationError: The run cannot continue, or diverges; the exception has time and state.
     """
     config = config or SimulatorConfig()
+    check_context(diagram, context)
     check_duration(duration)
     check_config(config)
     _check_times(config.start_time, duration)

@@ -13,7 +13,7 @@ from problems.found import NO, OPEN, YES, findings
 from runs import some
 
 from drake_dae.analysis.analyze import analyze
-from drake_dae.analysis.findings import Finding
+from drake_dae.analysis.report import Finding
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.stability import Verdict

@@ -13,7 +13,7 @@ from problems.found import findings
 from runs import some
 
 from drake_dae.analysis.analyze import analyze
-from drake_dae.analysis.findings import Finding
+from drake_dae.analysis.report import Finding
 from drake_dae.errors import ModelError
 
 

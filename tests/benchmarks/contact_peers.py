@@ -312,8 +312,8 @@ class MeasuredPlant(ContactPlant):
 class _Measured(plants.MultibodyPlant):
     """The plant of a scenario, as a `MeasuredPlant`."""
 
-    def plant(self, robot):
-        return MeasuredPlant(super().plant(robot), 0.0)
+    def plant(self, *robot):
+        return MeasuredPlant(super().plant(*robot), 0.0)
 
 
 @cache

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from command_line import BARE, QUICK, SHORT, command, error_line, shown_on_a_terminal
 from recordings import animation
-from runs import some
 
 import drake_dae
 from drake_dae import Record, load_scenario
@@ -23,7 +22,7 @@ from drake_dae.cli import main
 from drake_dae.commands import scenarios, simulate
 from drake_dae.commands.folder import FILES, PART
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
-from drake_dae.pictures.plots import PATHS, PLOTS
+from drake_dae.pictures.plots import PLOTS
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
 
 PLOTTED = "write.plots=true"
@@ -83,26 +82,6 @@ def test_the_page_holds_the_animation(demo):
         assert len(track.times) == 65  # 2 s at 32 frames a second.
     hand = tracks["/drake/visualizer/seven_joint_arm/link7", "position"].values
     assert np.ptp(hand[:, 1]) > 0.1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "link", "force"),
-    some([("five_bar", "five_bar/right2", "pin.fx"), ("two_arms", "right/link7", "grasp.fx")]),
-)
-def test_a_closed_loop_of_links(name, link, force, tmp_path, capsys):
-    """Without a surface there is none to draw, but the force that closes the loop is."""
-    short = ["--set", "duration=0.5", "--set", PLOTTED]
-    assert main(["simulate", name, "--out", str(tmp_path), *short]) == 0
-    files = sorted(path.name for path in tmp_path.iterdir())
-    assert files == sorted({*FILES} - {PATHS})  # Nothing moves on a surface.
-    tracks = animation((tmp_path / "animation.html").read_text())
-    assert np.ptp(tracks[f"/drake/visualizer/{link}", "position"].values) > 0.01
-    assert (f"/contact/{force.split('.')[0]}/force", "position") in tracks
-    printed = capsys.readouterr().out
-    assert force in printed
-    # Round-off of forces that shall be zero is no contact that opens.
-    assert "pulls" not in printed
 
 
 @pytest.mark.slow
@@ -255,13 +234,6 @@ def test_list(capsys):
     assert told == [load_scenario(path).description for path in shipped_scenarios().values()]
     starts = {len(line) - len(line.split(maxsplit=1)[1]) for line in lines}
     assert len(starts) == 1
-
-
-def test_version(capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(["--version"])
-    assert caught.value.code == 0
-    assert capsys.readouterr().out == f"{drake_dae.__version__}\n"
 
 
 @pytest.mark.parametrize("arguments", [[], ["simulat"], ["simulate", "a", "b"]])

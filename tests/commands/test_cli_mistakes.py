@@ -67,27 +67,11 @@ def test_a_folder_is_no_device(command, capsys):
     assert "'/dev/null'" in error_line(capsys)
 
 
-def test_a_scenario_is_not_overwritten_by_its_own_run(tmp_path, capsys):
-    path = tmp_path / "scenario.yaml"
-    text = find_scenario("two_link_wall").read_text()
-    path.write_text(f"# My wall.\n{text}")
-    assert main(["simulate", str(path), "--out", str(tmp_path), *SHORT, *BARE]) == 1
-    assert "scenario.yaml" in error_line(capsys)
-    assert path.read_text() == f"# My wall.\n{text}"
-
-
 def test_a_folder_that_cannot_be_written_to(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         assert main(["simulate", "two_link_wall", "--out", str(folder), *SHORT, *BARE]) == 1
         assert f"{folder}" in error_line(capsys)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_read_only_folder(tmp_path, capsys):
-    tmp_path.chmod(0o500)
-    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *BARE]) == 1
-    assert "Permission denied" in error_line(capsys)
 
 
 @pytest.mark.parametrize(
@@ -133,20 +117,6 @@ def test_a_reference_out_of_reach_ends_the_run_and_keeps_the_record(tmp_path, ca
     assert animation((tmp_path / "animation.html").read_text())
 
 
-def test_an_error_while_writing_is_one_line(tmp_path, monkeypatch, capsys):
-    def fill(self, path):
-        raise OSError(28, "No space left on device", str(path))
-
-    monkeypatch.setattr(Record, "save", fill)
-    assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT, *QUICK]) == 1
-    reason = "No space left on device"
-    assert error_line(capsys) == f"error: {tmp_path}/record.npz: {reason}"
-    # The record is there in its other form, and nothing unfinished stays.
-    left = ["record.part", "scenario.yaml", "summary.txt"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == left
-    assert Record.load(tmp_path / "record.part").time[-1] == 0.2
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("room", [0, 5000])
 def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monkeypatch, capsys):
@@ -179,20 +149,6 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
     if room:
         record = Record.load(tmp_path / "record.part")
         assert 0.1 < record.time[-1] < 5.0
-
-
-@pytest.mark.slow
-def test_the_reason_of_a_failure_is_printed_too_when_files_fail(tmp_path, monkeypatch, capsys):
-    def fill(self, path):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Record, "save", fill)
-    move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
-    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=0.5"]
-    assert main([*arguments, "--set", move, *QUICK]) == 1
-    first, second = capsys.readouterr().err.splitlines()
-    assert "record.npz: No space left on device" in first
-    assert "t = 0.1" in second
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from problems import pendulum
 from runs import some
 
 from drake_dae import DaePlant, analyze
-from drake_dae.analysis.findings import Finding
+from drake_dae.analysis.report import Finding
 from drake_dae.dae.structure.assumptions import ViolationKind
 from drake_dae.dae.structure.constrained import find_constraint_structure
 from drake_dae.dae.structure.structure import find_structure

@@ -6,7 +6,7 @@ import pytest
 from runs import some
 
 from drake_dae import analyze
-from drake_dae.analysis.findings import Finding
+from drake_dae.analysis.report import Finding
 from drake_dae.dae.structure.structure import find_structure
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.pinned_motion import EndCause

@@ -100,11 +100,8 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
     ("settings", "words"),
     [
         # Keys.
-        ("foo=1", ["scenario: ", "'foo'"]),
         ("duratoin=1", ["scenario: ", "'duration'"]),
-        ("start.error=1", ["start: ", "'errors'"]),
         ("constraints.0.surface.radius=1", ["constraints.0.surface: ", "!Plane"]),
-        (f"{SPHERE} {{center: [0, 0, 0]}}", ["constraints.0.surface: ", "!Sphere", "'radius'"]),
         ("constraints.0={frame: tool}", ["constraints.0: ", "'surface'"]),
         # Settings.
         ("duration", ["--set duration: "]),
@@ -114,19 +111,9 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("duration=[1", ["duration: ", "line 1: "]),
         ("duration=1: 2", ["duration: ", "line 1: ", "'1'"]),
         ("duration=1\nfoo: 2", ["duration: ", "line 2: "]),
-        ("duration.x=1", ["duration: ", "10.0", "'x'"]),
         ("constraints.2=1", ["constraints: ", "'2'", "0"]),
-        ("constraints.wall.frame=tool", ["constraints: ", "'wall'", "0"]),
         # Types.
         ("duration=abc", ["duration: ", "'abc'"]),
-        ("duration=.nan", ["duration: "]),
-        ("duration=", ["duration: "]),
-        ("constraints={}", ["constraints: ", "{}"]),
-        ("robot=arm.urdf", ["robot: ", "'arm.urdf'"]),
-        ("constraints.0.frame=3", ["constraints.0.frame: ", "3"]),
-        ("write.plots=maybe", ["write.plots: ", "'maybe'"]),
-        (f"{MOVE} {{start: [0], end: [1], end_time: 1, order: 2.5}}", ["tool.z.order: ", "whole"]),
-        ("law.gains.all=[-4+1j]", ["law.gains.all.0: ", "'-4+1j'"]),
         # The robot's file.
         ("robot.file=no.urdf", ["robot.file: ", "/no.urdf"]),
         ("robot.file=package://x/y.urdf", ["robot.file: ", "'x'"]),
@@ -136,7 +123,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ),
         # Constraints.
         ("constraints.0.frame=tol", ["constraints.0: ", "'tol'", "'tool'", "link2"]),
-        ("constraints.0.point=[1, 2]", ["constraints.0.point: ", "3", "[1, 2]"]),
         ("constraints.0.name=''", ["constraints.0.name: "]),
         (f"constraints=[{WALL}, {WALL}]", ["constraints.1.name: ", "'wall'"]),
         (
@@ -151,15 +137,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("constraints.0.surface.point=[3, 0, 0]", ["start.positions: ", "wall.distance"]),
         # Welds and pins.
         ("constraints.0=!Weld {}", ["0: ", "!PointOnSurface", "!WeldedFrames", "!Coinc"]),
-        ("constraints.0=!WeldedFrames {frame: tool}", ["!WeldedFrames", "'frame'", "_a"]),
-        (
-            f"{WELD} frame_b: tool, pose: {{rpy_deg: [0, 90]}}}}",
-            ["constraints.0.pose.rpy_deg: ", "3", "[0, 90]"],
-        ),
-        (
-            f"{WELD} frame_b: tool, pose: {{translation: []}}}}",
-            ["constraints.0.pose.translation: ", "3", "[]"],
-        ),
         (
             f"{WELD} frame_b: tool, pose: {{rpy: [0, 0, 0]}}}}",
             ["constraints.0.pose: ", "'rpy'", "rpy_deg"],
@@ -190,15 +167,12 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("law.gains.outputs={tool.z: [-1]}", ["gains: ", "'all'", "'outputs'"]),
         ("law.gains=!Poles {outputs: {tool.q: [-1]}}", ["gains: ", "tool.q"]),
         ("law.gains=!Coefficients {all: [16]}", ["gains: ", "'tool.z'", "2", "1"]),
-        ("law.gains=!Matrices {groups: [[[[1]]]]}", ["gains: ", "2", "1"]),
         ("law.gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),
         ("law.gains=!Matrices {groups: [[[[1, 0], [1]], [[1]]]]}", ["gains: groups: "]),
         # References.
         ("references={}", ["references: ", "tool.z", "wall.force"]),
-        ("references=[1, 2]", ["references: ", "[1, 2]"]),
         ("references={tool: 1}", ["references: ", "wall.force"]),
         ("references={tool.z: a}", ["references.tool.z: ", "!C"]),
-        ("references={tool.z: true}", ["references.tool.z: ", "!Constant"]),
         ("references.wall.forc=1", ["references.wall.forc: ", "'wall.force'"]),
         ("references.tool=1", ["references: ", "'tool.z'", "'tool'"]),
         ("references.tool.z, =1", ["references.tool.z, : ", "''"]),

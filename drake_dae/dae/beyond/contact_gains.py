@@ -131,6 +131,8 @@ def contact_damping(
 ) -> float:
     """Returns the damping c for which a contact of the stated stiffness settles fastest.
 
+    It is the optimum, without a margin.
+
     On a compliant contact, F = -k phi, a law with `constraint_damping=poles(-c)` leaves
 
         phi'' + c phi' = A (F - lambda_d),    so    phi'' + c phi' + A k phi = -A lambda_d,

@@ -9,6 +9,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.traced_system import context_in
 from drake_dae.errors import InconsistentStateError
 from drake_dae.pictures.scene.framing import ViewAngles, direction_of, framed
 from drake_dae.pictures.scene.surroundings import scene_points
@@ -139,7 +140,7 @@ def follow(
     Raises:
         ModelError: The plant is not a robot.
     """
-    plant, plant_context = loop.plant, loop.plant.GetMyContextFromRoot(context)
+    plant, plant_context = loop.plant, context_in(loop.plant, context)
     model = plant.robot("a picture of a run")
     parameters = plant.parameters(plant_context)
     acting = ConstraintWrenches(model, parameters)

@@ -7,6 +7,7 @@ from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.blocks.traced_system import context_in
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
@@ -61,8 +62,8 @@ def export_code(
     parts = parts_of(loop)
     plant, controller, whole = parts.plant, parts.controller, parts.compiled
     law, structure = controller.law, plant.structure
-    plant_parameters = plant.current_parameters(plant.GetMyContextFromRoot(context))
-    law_parameters = controller.all_parameters(controller.GetMyContextFromRoot(context))
+    plant_parameters = plant.current_parameters(context_in(plant, context))
+    law_parameters = controller.all_parameters(context_in(controller, context))
     prefix, file = prefix_of(name), file_of(name)
     vectors = _vectors(law, structure, plant_parameters, law_parameters)
     calls = _calls(law, structure)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from numbers import Integral
 from threading import Lock
 from typing import Any
 
@@ -168,6 +169,8 @@ def problems_of(
         events = Events(events.times[is_before], events.due[is_before])
     if parameters is None:
         parameters = compiled.values(compiled.context)
+    if seeds is not None:
+        seeds = [int(seed) if isinstance(seed, Integral) else seed for seed in seeds]
     states = _table("starts", starts, size + program.kept_places.size)
     rows = _table("parameters", parameters, compiled.sizes["parameters"])
     count = max(len(states), len(rows), len(seeds or ()))

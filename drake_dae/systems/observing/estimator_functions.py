@@ -311,7 +311,8 @@ def state_filters(
         v / q if v > 0.0 and q > 0.0 else None for q, v in zip(position, velocity, strict=True)
     ]
     rates, fast = (observing.rate, observing.force_rate or observing.rate), observing.state_rate
-    assert fast is not None
+    if fast is None:
+        raise ModelError("a StateEstimator needs the state_rate of its Observing, got None")
     free, constrained = (
         [ChainFilter.of(fast, rate, period, ratio) for ratio in ratios] for rate in rates
     )

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 from drake_dae import analyze
-from drake_dae.analysis.findings import Finding
+from drake_dae.analysis.report import Finding
 from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.zero_dynamics.floquet import StabilityAlong
 from drake_dae.dae.zero_dynamics.stability import Verdict

@@ -28,7 +28,8 @@ from pydrake.systems.primitives import (
 from runs import both
 from scipy.linalg import expm
 
-from drake_dae import compile_diagram, export_code, rollout, start_values
+from drake_dae import export_code, rollout, start_values
+from drake_dae.compiler.compile import compile_diagram
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout import program
 
@@ -217,7 +218,7 @@ def test_two_sources_of_noise_of_one_run_have_numbers_of_their_own(compiled):
     diagram = builder.Build()
     start, parameters = start_values(diagram, diagram.CreateDefaultContext())
     times = np.arange(10) * 0.1 + 0.05
-    seeds = [3, 4, 3]
+    seeds = np.array([3, 4, 3])
     found = rollout(
         diagram,
         [start] * 3,

@@ -58,7 +58,7 @@ SYSTEMS = {
 def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], LeafSystem]):
     system = make()
     last = ref(system)
-    if "AutoDiff" not in type(system).__name__:
+    if isinstance(system, LeafSystem):
         builder = DiagramBuilder()
         builder.AddSystem(system)
         diagram = builder.Build()
