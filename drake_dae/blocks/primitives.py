@@ -1,9 +1,11 @@
 """Drake's own systems as blocks, by their conversion to symbolic expressions."""
 
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.symbolic import Expression, Variable
 from pydrake.systems.framework import PortDataType, System
 
@@ -18,12 +20,22 @@ def symbolic_block(system: System) -> Block | None:
     None if it does not convert, has an abstract state, several rates, or computes something that
     symbolic expressions cannot represent.
     """
+    if system not in _KNOWN:
+        _KNOWN[system] = _traced(system)
+    return _KNOWN[system]
+
+
+_KNOWN: WeakKeyDictionary[System, Block | None] = WeakKeyDictionary()
+"""The blocks of systems that were asked for, since a conversion takes long."""
+
+
+def _traced(system: System) -> Block | None:
     default = system.CreateDefaultContext()
-    if default.num_abstract_states() or default.num_abstract_parameters():
+    is_abstract = default.num_abstract_states() or default.num_abstract_parameters()
+    if is_abstract or isinstance(system, MultibodyPlant):  # Whose conversion takes seconds.
         return None
     try:
-        other = system.ToSymbolic()
-        return _converted(system, other)
+        return _converted(system, system.ToSymbolic())
     except (RuntimeError, ModelError, SystemExit):
         return None
 

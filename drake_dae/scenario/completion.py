@@ -99,7 +99,10 @@ def completions(
     forces = [signal.name for output in steered for signal in output.signals(bound)]
     if missing:
         _check_forces(forces, near)
-    goals = _Goals(scenario, rows, forces, missing, near)
+    # Some rows of a planar arm are constant.
+    some = [np.abs(postures.at(q).gradients).max(axis=1) for q in postures.guesses(4)]
+    along = [row for row in rows.points(near) if max(one[row] for one in some) > 1e-9]
+    goals = _Goals(scenario, rows, forces, missing, near, along)
     named, begin = goals.rows, goals.path[0][0]
     errors = scenario.start.errors
     begin = begin + [errors.get(rows.signals[row].name, 0.0) for row in named]
@@ -419,7 +422,13 @@ class _Goals:
     """
 
     def __init__(
-        self, scenario: Scenario, rows: _Rows, forces: Sequence[str], missing: int, near: Posture
+        self,
+        scenario: Scenario,
+        rows: _Rows,
+        forces: Sequence[str],
+        missing: int,
+        near: Posture,
+        along: Sequence[int],
     ) -> None:
         key = "references"
         references: Mapping[str, Any] = scenario.references
@@ -432,7 +441,7 @@ class _Goals:
         for name, reference in references.items():
             at_key, meaning = f"{key}.{name}", list[int | None]()
             for part in map(str.strip, name.split(",")):
-                meaning += _meaning(part, at_key, rows, forces, missing, near)
+                meaning += _meaning(part, at_key, rows, forces, missing, along)
             if isinstance(reference, Reference) and reference.size != len(meaning):
                 text = f"{reference.size} values for {len(meaning)} outputs"
                 raise ScenarioError((at_key, text))
@@ -492,7 +501,7 @@ def _values_of(reference: Any, size: int) -> _Values:
 
 
 def _meaning(
-    name: str, key: str, rows: _Rows, forces: Sequence[str], missing: int, near: Posture
+    name: str, key: str, rows: _Rows, forces: Sequence[str], missing: int, along: Sequence[int]
 ) -> Sequence[int | None]:
     """The rows that a name in references denotes; None for a force."""
     signals = [signal.name for signal in rows.signals]
@@ -501,9 +510,9 @@ def _meaning(
         places = denoted(name, outputs, [2] * rows.given + [0] * len(forces))
         return [place if place < rows.given else None for place in places]
     if missing:  # Of a point the rows along its surface first.
-        along = [signals[row] for row in rows.points(near)]
-        others = [*along, *(signal for signal in signals[rows.given :] if signal not in along)]
-        of_point = [signal for signal in along if signal.rpartition(".")[0] == name]
+        first = [signals[row] for row in along]
+        others = [*first, *(signal for signal in signals[rows.given :] if signal not in first)]
+        of_point = [signal for signal in first if signal.rpartition(".")[0] == name]
         with suppress(ReferenceSignalError):
             chosen = of_point or [others[k] for k in denoted(name, others, [2] * len(others))]
             return [signals.index(signal) for signal in chosen]

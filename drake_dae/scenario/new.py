@@ -128,14 +128,14 @@ def new_scenario(
     end = process_time() + seconds
     is_url = file.startswith("package://")
     with at("robot.file"):
-        robot, tip, point, why = _robot(
+        robot, tip, point, last, why = _robot(
             file if is_url or not file else os.path.realpath(file), tip, point
         )
     read = robot_links(robot, SceneGraph(), drawn=False)
     links, tried = read[0], list[str]()
     progress("looking for a place")
     if not any(point) and "point" in why:
-        point = _far_end(links, tip)
+        point = _far_end(links, tip, last) or point
     places, names = _places(links, tip, point), [s.name for s in links.position_signals]
     for fraction, place in product(_FRACTIONS, places[:_PLACES]):
         scenario = _scenario(robot, tip, point, place, names, surface, fraction)
@@ -150,7 +150,7 @@ def new_scenario(
             problem = str(error)
         if not problem:
             return scenario, _text(scenario, {**why, "surface": place.why}, folder)
-        tried.append(f"{name} at {center} m, {scenario.description}: {problem[:160]}")
+        tried.append(f"{name} at {center} m, {fraction:g} of the usual circle: {problem[:160]}")
     text = (
         f"no place was found where '{tip}' can move along a {surface}. Tried: "
         + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
@@ -159,8 +159,8 @@ def new_scenario(
     raise ScenarioError(("robot", text))
 
 
-def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, dict[str, str]]:
-    """The robot with its base, locked joints and drives; the tip; and key -> why it is so."""
+def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str, dict[str, str]]:
+    """The robot; the tip and the last joint that moves it; and key -> why it is so."""
     plant, robot = _read(file)
     why = {"packages": "where package://<name>/ leads", "leave_out": "what no equation has"}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
@@ -251,7 +251,8 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, dict
             f"({', '.join(names[joint.index()] for joint in chain)}), and a contact takes one "
             "direction to press and another to move along; give another tip, as --tip LINK:x,y,z"
         )
-    return replace(robot, locked=locked, actuators=actuators), tip, point, why
+    last = names[chain[-1].index()]
+    return replace(robot, locked=locked, actuators=actuators), tip, point, last, why
 
 
 def _read(file: str) -> tuple[MultibodyPlant, Robot]:
@@ -332,30 +333,47 @@ def _directions(plant: MultibodyPlant, chain: Sequence[Joint], tip: str, point: 
     return most
 
 
-def _far_end(links: MultibodyExpressions, tip: str) -> Vector:
-    """The middle of the face of the box around a link that is farthest from its joint, m.
+def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
+    """The middle of the face of the box around a link that is farthest from the last joint, m.
 
-    Without geometry it is beyond the center of mass, at the end of an equivalent rod.
+    Without geometry it is beyond the center of mass, at the end of an equivalent rod. None if both
+    are at the joint's axis.
     """
     plant = links.plant
-    frame = GetScopedFrameByName(plant, tip)
-    body = frame.body()
-    joint = next(joint for joint in joints_of(plant) if joint.child_body().index() == body.index())
-    origin = joint.frame_on_child().GetFixedPoseInBodyFrame()
+    body, joint = GetScopedFrameByName(plant, tip).body(), joint_names(plant)[last]
+    context = plant.CreateDefaultContext()
+    origin = joint.frame_on_child().CalcPose(context, body.body_frame())
     axis = origin.rotation() @ joint.revolute_axis() if isinstance(joint, RevoluteJoint) else None
+    mass_at = body.default_com() if body.default_mass() > 0.0 else origin.translation()
+    choices = [[2.0 * mass_at - origin.translation()]]
     points = [o.points for o in links.outlines if o.name == body.name() and len(o.points) > 1]
-    faces = [2.0 * body.default_com() - origin.translation()]
     if points:
         low, high = np.vstack(points).min(axis=0), np.vstack(points).max(axis=0)
         sides = product(range(3), (low, high))
-        faces = [np.where(np.arange(3) == k, side, (low + high) / 2.0) for k, side in sides]
+        middle = (low + high) / 2.0
+        choices.insert(0, [np.where(np.arange(3) == k, side, middle) for k, side in sides])
 
     def distance(place: FloatArray) -> float:
         lever = place - origin.translation()
         return float(np.linalg.norm(lever if axis is None else np.cross(axis, lever)))
 
-    x, y, z = (float(value) + 0.0 for value in np.round(max(faces, key=distance), 4))
-    return (x, y, z)
+    size = float(
+        np.linalg.norm(
+            np.ptp(
+                [
+                    plant.EvalBodyPoseInWorld(context, plant.get_body(BodyIndex(i))).translation()
+                    for i in range(1, plant.num_bodies())
+                ],
+                axis=0,
+            )
+        )
+    )
+    for places in choices:
+        farthest = max(places, key=distance)
+        if distance(farthest) > 0.01 * size:
+            x, y, z = (float(value) + 0.0 for value in np.round(farthest, 4))
+            return (x, y, z)
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -509,8 +527,9 @@ def _scenario(
     axes = "".join("xyz"[way] for way in place.ways)
     near = dict(zip(names, (np.round(place.q, 4) + 0.0).tolist(), strict=True))
     shape = "circle" if len(middle) > 1 else "line"
+    stem = Path(robot.file).name.split(".")[0]
     return Scenario(
-        description=f"a {shape} of {radius:g} m in {period:g} s on a {name}",
+        description=f"{stem} draws a {shape} on a {name} and presses on it",
         robot=robot,
         constraints=[PointOnSurface(tip, surface, point, name)],
         # On a strongly curved surface an axis fixed to the normal hinders motion along it.
@@ -545,7 +564,7 @@ def _text(scenario: Scenario, why: dict[str, str], folder: str | Path | None) ->
         "# `drake-dae simulate FILE`; --meshcat shows it. `drake-dae analyze FILE` tells margins.",
     ]
     for line in dump_yaml(data).splitlines():
-        note = why.get(line.strip(" -").partition(":")[0], "")
+        note = why.get(line.removeprefix("  ").removeprefix("- ").partition(":")[0], "")
         fits = len(line) + len(note) < 97
         indent = line[: len(line) - len(line.lstrip(" "))]
         lines += [f"{line}  # {note}"] if note and fits else [f"{indent}# {note}"] * bool(note)

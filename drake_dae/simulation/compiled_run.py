@@ -68,6 +68,7 @@ class CompiledRun:
         self._context, self.steps, leaves = context, 0, Leaves.of(diagram)
         self._logs = [s for s in leaves.systems if isinstance(s, VectorLogSink)]
         kept = [s for s in leaves.systems if s not in self._logs and not _is_traced(s)]
+        copies = {system: _copy(system) for system in (*self._logs, *kept)}
         outputs = {
             f"{system.get_name()}.{port.get_name()}": leaves.sources[system, i]
             for system in (*self._logs, *kept)
@@ -80,7 +81,7 @@ class CompiledRun:
         (choice, *_) = [p.dae.compiled for p in _plants(diagram)]
         builder = DiagramBuilder()
         self._block = builder.AddSystem(TracedSystem(composed.block, compiled=choice))
-        self._copies = {system: builder.AddSystem(_copy(system)) for system in (*self._logs, *kept)}
+        self._copies = {system: builder.AddSystem(copy) for system, copy in copies.items()}
         for (system, i), (source, k) in leaves.sources.items():
             if system in self._copies and source in self._copies:
                 written = self._copies[source].get_output_port(k)

@@ -1,5 +1,7 @@
 """Where a robot starts: within its limits, without whole turns."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from runs import some
@@ -56,3 +58,12 @@ def test_a_start_outside_of_limits_is_refused(tmp_path):
     (tmp_path / "far.urdf").write_text(narrow)
     with pytest.raises(ScenarioError, match=r"start.*one = "):
         build_scenario(scenario)
+
+
+def test_a_point_of_a_planar_arm_is_named_by_the_rows_that_move(tmp_path):
+    """y of the hand is constant: one value is that of z."""
+    scenario = reaching(tmp_path, 0.4, "{two: 0.3}")
+    open_ = replace(scenario, outputs=[], references={"hand": 0.4, "wall.force": 5.0})
+    named = complete_scenario(open_).scenario
+    assert [output.axes for output in named.outputs] == ["z"]
+    assert list(named.references) == ["hand", "wall.force"]
