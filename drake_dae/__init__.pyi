@@ -143,7 +143,7 @@ from .systems.plants.robot_plant import RobotPlant as RobotPlant
 from .systems.sensing.encoders import Encoders as Encoders
 from .systems.sensing.encoders import StateSensor as StateSensor
 from .systems.sensing.force_sensor import ForceSensor as ForceSensor
-from .systems.task.contacts.open_contact import open_contact as open_contact
+from .systems.task.contacts import open_contact as open_contact
 from .systems.task.controller import TaskController as TaskController
 from .systems.task.phases import Approach as Approach
 from .systems.task.phases import Condition as Condition

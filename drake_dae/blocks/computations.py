@@ -1,11 +1,11 @@
 """The computations of a block as traced functions: the interface between diagram and compiler."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import casadi as ca
-from pydrake.systems.framework import Context, EventStatus, State, System
+from pydrake.systems.framework import Context, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
@@ -21,9 +21,6 @@ DERIVATIVE = "$derivative"
 """The time derivative of a block's continuous state, among the outputs of its computations; the
 next discrete state is HELD there."""
 
-MARGINS = "$margins"
-"""The output of a guard; see `Guard`."""
-
 
 @dataclass(frozen=True, eq=False)
 class Computation:
@@ -37,15 +34,12 @@ class Computation:
             computations of the block. Results named "" are not used.
         traced: The same function, whose last result is finite if its values are valid, and which
             has the reason if they are not; None if valid arguments always give valid values.
-        choice: A source that is a number from 0, and other sources, of which only the one with this
-            number must be valid. None if all must be valid.
     """
 
     function: ca.Function
     sources: tuple[str, ...]
     outputs: tuple[str, ...]
     traced: TracedFunction | None = None
-    choice: tuple[str, ...] | None = None
 
     @classmethod
     def of(
@@ -100,35 +94,6 @@ class Projection:
 
 
 @dataclass(frozen=True, eq=False)
-class TracedChanges:
-    """The changes of a block as functions, for exports: no Python makes them there.
-
-    Attributes:
-        begin: The computation of HELD at the start of a run, which does not read HELD.
-        update: The update with all changes at its instant, in place of those of the block.
-    """
-
-    begin: Computation
-    update: Update
-
-
-@dataclass(frozen=True, eq=False)
-class Guard:
-    """A change of a block's states at one of its updates, in place of that update.
-
-    Attributes:
-        computation: Its output is MARGINS, numbers that are positive until the block changes.
-        react: (context, state) -> the status of Drake's event. It reads the block's context, and
-            changes a copy of its state.
-        reaction: Returns the changes as functions.
-    """
-
-    computation: Computation
-    react: Callable[[Context, State], EventStatus]
-    reaction: Callable[[], TracedChanges]
-
-
-@dataclass(frozen=True, eq=False)
 class DrakeStepped:
     """The part of a block that is not traced: Drake steps it at t_k = k period.
 
@@ -174,9 +139,7 @@ class Block:
         scale: The sizes of its continuous states, shape (n,); ones if None.
         unwired: Name of an input port -> its value if it has neither a wire nor a fixed value.
         moving: The indices of its parameters that come through an input port "exogenous".
-        guard: Its changes at some of its updates; None if there are none.
         stepped: The part that Drake steps; None if all of it is traced.
-        begins: Whether `initial` gives HELD at the start of each run, whatever the context has.
         draws: Whether its update uses new random numbers.
         model: The owner of its first parameters, such as a DaeSystem; None if no other block shares
             it.
@@ -196,22 +159,12 @@ class Block:
     scale: FloatArray | None = None
     unwired: Mapping[str, Computation] = field(default_factory=dict)
     moving: tuple[int, ...] = ()
-    guard: Guard | None = None
     stepped: DrakeStepped | None = None
-    begins: bool = False
     draws: bool = False
     model: object = None
     under: Callable[[], Computation | None] | None = None
     signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
     ports: Mapping[str, tuple[Signal, ...]] = field(default_factory=dict)
-
-    def with_reaction(self) -> "Block":
-        """The same block; its updates make the changes of its guard."""
-        if self.guard is None:
-            return self
-        reaction = self.guard.reaction()
-        begin, update = reaction.begin, reaction.update
-        return replace(self, updates=(update,), initial=begin, begins=True, guard=None)
 
 
 def not_traced(what: str) -> ModelError:
@@ -243,8 +196,6 @@ class Traced(Protocol):
        in agreement with Drake's `HasDirectFeedthrough`.
     6. Outputs that cannot be traced are omitted; a block that cannot be traced at all raises a
        ModelError with the reason, in one sentence.
-    7. A block that changes at some of its updates otherwise has a guard, one of whose margins is
-       not positive at these.
     """
 
     def traced(self) -> Block:

@@ -191,7 +191,6 @@ class _Run:
         with ending_signals(ending := Interruption()), waiting("rolling out"):
             rollout = roll_scenario(self.scenario, self.loop, self.context, look=look)
         self.recorded = rollout.record.after
-        self.context = rollout.context or self.context
         if rollout.failure is not None:
             raise rollout.failure
         times, wall = rollout.record.time, time.perf_counter() - began

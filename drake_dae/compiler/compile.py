@@ -1,4 +1,4 @@
-"""Compiles a Drake diagram to CasADi functions: derivative, updates, outputs, guards."""
+"""Compiles a Drake diagram to CasADi functions: derivative, updates, outputs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +12,6 @@ from drake_dae.arrays import unknown_name
 from drake_dae.blocks.computations import (
     DERIVATIVE,
     HELD,
-    MARGINS,
     NOISE,
     PARAMETERS,
     STATE,
@@ -66,9 +65,8 @@ def compile_part(
     """Compiles the part of a diagram between some output ports and others.
 
     Systems upstream of the inputs are ignored, so they need not be traceable (for example a
-    MultibodyPlant with Drake's contact). Phases of a sampled task change by updates. The inputs are
-    the last entries of the parameters; see `CompiledDiagram.inputs`. Raises as `compile_diagram`
-    does.
+    MultibodyPlant with Drake's contact). The inputs are the last entries of the parameters; see
+    `CompiledDiagram.inputs`. Raises as `compile_diagram` does.
 
     Args:
         diagram: The diagram.
@@ -80,7 +78,7 @@ def compile_part(
         {name: leaf_port(port) for name, port in inputs.items()},
         {name: leaf_port(port) for name, port in outputs.items()},
     )
-    return _compiled(wires, list(outputs), context, reacts=True)
+    return _compiled(wires, list(outputs), context)
 
 
 def with_twins(compiled: CompiledDiagram) -> CompiledDiagram:
@@ -105,7 +103,6 @@ def _compiled(
     context: Context | None,
     twins: Mapping[System, System] | None = None,
     is_short: bool = False,
-    reacts: bool = False,
 ) -> CompiledDiagram:
     if outputs is None:
         outputs = [
@@ -117,12 +114,8 @@ def _compiled(
         if name not in wires.outputs:
             raise ModelError(unknown_name("output port of the diagram", name, wires.outputs))
     context = context or wires.diagram.CreateDefaultContext()
-    expressions = Expressions(wires, context, twins or {}, is_short, reacts)
+    expressions = Expressions(wires, context, twins or {}, is_short)
     ports = [wires.outputs[name] for name in outputs]
-    for system in wires.systems:
-        # A block that ends runs counts, though no output depends on it; not in a part of a diagram.
-        if getattr(system, "ends_runs", False) and not wires.inputs:
-            expressions.block(system)
     _trace_dependencies(expressions, ports)
     blocks = {
         system: expressions.used[system] for system in wires.systems if system in expressions.used
@@ -148,9 +141,6 @@ def _compiled(
     arguments = [columns[name] for name in (*ARGUMENTS, "noise")]
     rates = _rates(expressions, blocks, places["held"], arguments)
     values |= {f"update_{i}": updated for i, (_, updated) in enumerate(rates)}
-    guarded, watched = [each for each in blocks.values() if each.guard], list[ColumnPlace]()
-    if guarded:
-        values["watch"], watched = _guards(expressions, guarded)
     _check_stepped(blocks, places["state"])
     return CompiledDiagram(
         wires,
@@ -164,7 +154,6 @@ def _compiled(
         tuple(places["noise"]),
         tuple(rate for rate, _ in rates),
         blocks,
-        tuple(watched),
         expressions,
         columns,
         values,
@@ -189,8 +178,6 @@ def _trace_dependencies(expressions: Expressions, outputs: Sequence[Port]) -> No
                 expressions.output(system, DERIVATIVE)
             for update in block.updates:
                 expressions.call(block, update.computation)
-            if block.guard is not None:
-                expressions.call(block, block.guard.computation)
             if block.stepped is not None:
                 expressions.source(block, HELD)
                 expressions.source(block, block.stepped.into)
@@ -203,13 +190,12 @@ def _check_stepped(blocks: Mapping[System, Block], states: Sequence[ColumnPlace]
     stepped = [block.system.get_name() for block in blocks.values() if block.stepped is not None]
     if not stepped:
         return
-    guarded = [block.system for block in blocks.values() if block.guard is not None]
-    others = [*(system for system, _ in states), *guarded]
+    others = [system for system, _ in states]
     if others or len(stepped) > 1:
         other = others[0].get_name() if others else stepped[1]
         raise ModelError(
             f"a rollout cannot combine '{stepped[0]}', which has Drake's own contact, with "
-            f"'{other}', which has a continuous state, phases or contact of its own. Sample the "
+            f"'{other}', which has a continuous state. Sample the "
             "law, with a force sensor without a time constant, or run the loop by simulate"
         )
 
@@ -265,23 +251,3 @@ def _rates(
             places = tuple(parts[block.system][:count])
             rates.append((UpdateRate(stepped.period, 0.0, True, function, places, block), values))
     return rates
-
-
-def _guards(
-    expressions: Expressions, blocks: Sequence[Block]
-) -> tuple[list[ca.SX], list[ColumnPlace]]:
-    """Margins and validity of all guards; the slice of each block among the margins."""
-    margins, places = ca.SX(0, 1), list[ColumnPlace]()
-
-    def stack_guards() -> list[ca.SX]:
-        nonlocal margins
-        for block in blocks:
-            assert block.guard is not None
-            call = expressions.call(block, block.guard.computation)
-            value = call.results[call.computation.outputs.index(MARGINS)]
-            margins, part = appended(margins, value)
-            places.append(ColumnPlace(block.system, part))
-        return []
-
-    _, valid = expressions.checked(stack_guards)
-    return [margins, valid], places

@@ -37,8 +37,6 @@ class CompiledDiagram:
         inputs: The inputs of a part of a diagram, also parameters: (name, slice).
         rates: The updates, one function for each period, offset and kind.
         blocks: System -> block, in the order of Drake's states.
-        watched: For blocks with a guard: the slice of each block among
-            the margins of `watch`.
     """
 
     wires: Wires
@@ -52,7 +50,6 @@ class CompiledDiagram:
     noise: tuple[ColumnPlace, ...]
     rates: tuple[UpdateRate, ...]
     blocks: Mapping[System, Block]
-    watched: tuple[ColumnPlace, ...]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
     _values: Mapping[str, Sequence[ca.SX]] = field(repr=False)
@@ -77,37 +74,18 @@ class CompiledDiagram:
         """(time, state, held, parameters) -> all outputs stacked, validity."""
         return self._function("row", self._values["row"])
 
-    @cached_property
-    def watch(self) -> ca.Function:
-        """(time, state, held, parameters) -> margins of `watched`, validity.
-
-        Requires that `watched` is not empty.
-        """
-        return self._function("watch", self._values["watch"])
-
-    @property
-    def watched_rates(self) -> int:
-        """A bit mask of the `rates` at whose samples the guards of `watched` are checked."""
-        updates = [update for system, _ in self.watched for update in self.blocks[system].updates]
-        return sum({1 << self.rate_index(update) for update in updates})
-
     def rate_index(self, update: Update) -> int:
         """The index in `rates` of the function that computes an update."""
         keys = [(rate.period, rate.offset, rate.is_unrestricted) for rate in self.rates]
         return keys.index((update.period, update.offset, update.is_unrestricted))
-
-    @property
-    def changes(self) -> bool:
-        """Whether a block has a guard, as a task of phases."""
-        return bool(self.watched)
 
     @cached_property
     def staged(self) -> Mapping[str, ca.Function]:
         """Name -> function, with all that depends only on time and parameters precomputed.
 
         "given" is (time, parameters) -> the precomputed column. "rate", "row", "newton",
-        "update_0", ... and "watch" are the functions of these names, with this column as
-        an additional argument after the parameters.
+        "update_0", ... are the functions of these names, with this column as an additional
+        argument after the parameters.
         """
         column, values, substituted = self._expressions.given_column()
         arguments = [self._columns["time"], self._columns["parameters"]]
@@ -128,8 +106,8 @@ class CompiledDiagram:
                 scales[part] = scale
         return scales
 
-    def start(self, context: Context, has_begun: bool = False) -> tuple[FloatArray, FloatArray]:
-        """The states in a context; discrete ones are NaN where a block `begins` and has not."""
+    def start(self, context: Context) -> tuple[FloatArray, FloatArray]:
+        """The continuous and the discrete states in a context."""
         state, held = np.zeros(self.sizes["state"]), np.zeros(self.sizes["held"])
         for system, part in self.states:
             local = context_in(system, context)
@@ -137,7 +115,7 @@ class CompiledDiagram:
         for system, part in self.held:
             local, block = system.GetMyContextFromRoot(context), self.blocks[system]
             groups = [block.stepped.held(local)] if block.stepped else discrete_states(local)
-            held[part] = np.nan if block.begins and not has_begun else np.concatenate(groups)
+            held[part] = np.concatenate(groups)
         return state, held
 
     def set_context(
@@ -189,11 +167,7 @@ class CompiledDiagram:
         initial = self.blocks[system].initial
         assert initial is not None
         call = self._expressions.call(self.blocks[system], initial)
-        value = call.results[initial.outputs.index(HELD)]
-        for other, part in self.held:
-            if other is not system and self.blocks[other].begins:
-                value = ca.substitute(value, self._columns["held"][part], self._initial_held(other))
-        return value
+        return call.results[initial.outputs.index(HELD)]
 
     def initialization(self, held: FloatArray) -> ca.Function | None:
         """(time, state, held, parameters) -> the discrete state at the start of a run.

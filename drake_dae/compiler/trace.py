@@ -34,7 +34,6 @@ class TracedCall:
         computed: The results that are computed here, without those that are passed on.
         is_precomputable: Whether it depends only on time and parameters. Its results are then new
             symbols, so that they can be computed once for all evaluations at one time.
-        gate: The validity of the chosen argument, see `Computation.choice`; else 0.
     """
 
     block: Block
@@ -44,14 +43,13 @@ class TracedCall:
     dependencies: tuple["TracedCall", ...]
     computed: tuple[ca.SX, ...]
     is_precomputable: bool
-    gate: ca.SX
 
     @property
     def valid(self) -> ca.SX:
         """An expression that is finite if the results are valid, provided the arguments are."""
         if self.computation.traced is not None:
             return self.results[-1]
-        return ca.sum1(ca.vertcat(self.gate, *self.computed))
+        return ca.sum1(ca.vertcat(0, *self.computed))
 
 
 class Expressions:
@@ -67,7 +65,6 @@ class Expressions:
             parameters. Both then use the controller's symbols.
         is_short: Whether the derivative of such a plant is computed by `Block.under` of its
             controller, where the controller is connected directly to the plant.
-        reacts: Whether updates make the changes of a `Guard`, where it has `TracedChanges`.
 
     Attributes:
         time: The time in s.
@@ -88,9 +85,7 @@ class Expressions:
         context: Context,
         twins: Mapping[System, System] | None = None,
         is_short: bool = False,
-        reacts: bool = False,
     ) -> None:
-        self._reacts = reacts
         self.time = ca.SX.sym("time")
         self.calls: list[TracedCall] = []
         self.used: dict[System, Block] = {}
@@ -111,8 +106,7 @@ class Expressions:
     def block(self, system: System) -> Block:
         """The block of a system: its computations and updates."""
         if system not in self.used:
-            block = system.traced() if isinstance(system, Traced) else primitive(system)
-            self.used[system] = block.with_reaction() if self._reacts else block
+            self.used[system] = system.traced() if isinstance(system, Traced) else primitive(system)
         return self.used[system]
 
     def port(self, port: Port) -> ca.SX:
@@ -153,31 +147,13 @@ class Expressions:
             )
         self._open.append(key)
         self._dependencies.append({})
-        validity: dict[str, ca.SX] = {}
-        arguments = []
-        for name in computation.sources:
-            if computation.choice is not None and name in computation.choice[1:]:
-                # The gate decides whether this argument has to be valid.
-                self._dependencies.append({})
-                arguments.append(self.source(block, name))
-                inner = self._dependencies.pop().values()
-                validity[name] = sum((call.valid for call in inner), ca.SX(0))
-            else:
-                arguments.append(self.source(block, name))
+        arguments = [self.source(block, name) for name in computation.sources]
         self._open.pop()
         dependencies = tuple(self._dependencies.pop().values())
-        gate = ca.SX(0)
-        if computation.choice is not None:
-            number, *options = computation.choice
-            chosen = arguments[computation.sources.index(number)]
-            for i, option in enumerate(options):
-                gate += ca.if_else(ca.fabs(chosen - i) < 0.5, validity[option], 0)
         results = computation.function.call(arguments)
         is_passed_on = [result.is_valid_input() for result in results]
-        is_precomputable = (
-            not {STATE, HELD, NOISE} & set(computation.sources)
-            and not validity
-            and all(call.is_precomputable for call in dependencies)
+        is_precomputable = not {STATE, HELD, NOISE} & set(computation.sources) and all(
+            call.is_precomputable for call in dependencies
         )
         if is_precomputable:
             results = [self._precomputed(result) for result in results]
@@ -189,7 +165,6 @@ class Expressions:
             dependencies,
             tuple(result for result, old in zip(results, is_passed_on, strict=True) if not old),
             is_precomputable,
-            gate,
         )
         self._calls[key] = call
         self.calls.append(call)

@@ -19,8 +19,7 @@ from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.simulation.records.record import Record, computed_record, recorded_values
-from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.control.contract import Controller, PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
@@ -113,13 +112,12 @@ class ClosedLoop:
         """
         self.plant.set_state(context_in(self.plant, context), state)
 
-    def changes(self, context: Context) -> tuple[PhaseChange, ...]:
-        """The start of each phase of a run, with the reason; none without phases.
+    def changes(self, record: Record) -> tuple[PhaseChange, ...]:
+        """The start of each phase of a run, with the reason, from its record; none without phases.
 
-        Args:
-            context: The diagram's context.
+        Phases of which the record has no sample are left out.
         """
-        return self.controller.changes(context_in(self.controller, context))
+        return self.controller.changes({name: record[name] for name in record.signals})
 
     def record(self, context: Context, after: float | None = None) -> Record:
         """The record of a run: the logged signals up to now, and signals computed from them.

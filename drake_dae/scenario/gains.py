@@ -30,7 +30,7 @@ from drake_dae.scenario.parts import parts as parts
 from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import opening_contact
-from drake_dae.systems.task.fade import fade
+from drake_dae.systems.task.automaton import SMOOTH, fading
 from drake_dae.systems.task.phases import Approach, Press
 
 _SOFTER = 5.0
@@ -323,7 +323,7 @@ class _Touch:
 
             u = lambda + K_i sum (lambda - F) T - c d' / A,    d'' = A (u - F),    F = k d,
 
-        with the depth d and the reference lambda, a `fade` from the felt force to the goal. F is
+        with the depth d and the reference lambda, fading from the felt force to the goal. F is
         linear in the speed v of the touch, F = F_lambda(t) + v F_v(t), so that the largest v is the
         least F_lambda / -F_v of all times with F_v < 0.
 
@@ -335,7 +335,7 @@ class _Touch:
         oscillation = 2.0 * pi / (self.stiffness * self.mobility) ** 0.5
         times = np.arange(0.0, over + _PERIODS * oscillation, self.period)
         powers = np.minimum(times / over, 1.0)[:, None] ** np.arange(6)
-        reference = goal + powers @ np.array(fade([felt - goal], [0], over)[0])
+        reference = goal + (felt - goal) * (powers @ fading(SMOOTH)[0])
         of_reference = self._force(felt / self.stiffness, 0.0, reference)
         of_speed = self._force(0.0, 1.0, 0.0 * reference)
         opens = of_speed < 0.0

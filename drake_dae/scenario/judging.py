@@ -46,7 +46,7 @@ from drake_dae.simulation.limits import limited_values, robot_limits
 from drake_dae.simulation.records.record import Record
 from drake_dae.simulation.simulate import RunStatistics
 from drake_dae.simulation.summary import RunSummary
-from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.control.contract import PhaseChange
 from drake_dae.trace.functions import TracedFunction
 
 SAMPLES, MOST_SAMPLES = 1001, 20_000
@@ -338,7 +338,7 @@ def judge_run(
         statistics: The statistics of the run; None for a failed run, or one of an earlier time.
         failure: Why it ended early; empty if it did not.
     """
-    model, changes = loop.plant.robot("a scenario"), loop.changes(context)
+    model, changes = loop.plant.robot("a scenario"), loop.changes(record)
     limits = robot_limits(model, scenario.judgement.friction_cones)
     own, stop = loop.plant_parameters(record, context), record.time.size
     if failure:  # The last numbers of a run that broke off are not those of its motion.

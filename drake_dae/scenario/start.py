@@ -145,7 +145,7 @@ def _check_outside(
     On a contact that gives way it may be as deep as the force that counts as none presses it.
     """
     task, material = scenario.task, scenario.plant.material
-    if task is None or (plan := task.make().plan).contacts[0]:
+    if task is None or (made := task.make()).contacts[0]:
         return
     for contact in opening_contact(scenario, model):
         if (touch := contact.touch(model.links)) is None:
@@ -159,8 +159,8 @@ def _check_outside(
         ):
             raise ModelError(
                 f"start.positions put the point of '{contact.name}' {depth:.3g} m behind its "
-                f"surface, and {plan.phases[0].name} begins in front of it; start outside, or turn "
-                "the normal of the surface around if its free side is the other one"
+                f"surface, and {made.phases[0].name} begins in front of it; start outside, or "
+                "turn the normal of the surface around if its free side is the other one"
             )
 
 

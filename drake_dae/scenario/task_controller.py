@@ -10,7 +10,7 @@ from drake_dae.robots.model import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.task.contacts.open_contact import open_contact
+from drake_dae.systems.task.contacts import open_contact
 from drake_dae.systems.task.controller import TaskController
 
 
@@ -23,7 +23,7 @@ def check_task(scenario: Scenario) -> None:
     refused = {"references": "a task has the references of its phases; leave them out"}
     problems = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
     if (task := scenario.task) is not None:
-        names = [name for name in task.make().signals if name not in task.signals]
+        names = [name for name in task.make().watched("signal") if name not in task.signals]
         problems += [(f"task.signals.{name}", "needed: a phase watches it") for name in names]
     if isinstance(scenario.plant, IdealConstraints):
         text = (
@@ -46,7 +46,7 @@ def task_controller(
         scenario: The scenario.
         model: Its robot.
         law: The law in contact.
-        period: The time between its samples in s; 0 for none.
+        period: The time between its samples in s; 0 for 1 ms.
 
     Raises:
         ScenarioError: Something does not fit; the message names its key.
@@ -66,7 +66,7 @@ def task_controller(
     with at("task"):
         # The noise of the sum over the points.
         return TaskController(
-            task.make(noise * len(points) ** 0.5), law, free_law, sample_period=period
+            task.make(noise * len(points) ** 0.5), law, free_law, sample_period=period or 1e-3
         )
 
 

@@ -10,7 +10,7 @@ from drake_dae.analysis.limits import LimitKind, SignalRange
 from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.dae.system.signals import Signal
 from drake_dae.simulation.records.record import Record
-from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.control.contract import PhaseChange
 
 SHARE = 0.01
 """The default tolerance of an output, as a fraction of the range of references in its unit."""
@@ -159,18 +159,18 @@ def judge(
         found.append(RunFinding(FindingKind.ENDED, text, Outcome.BAD, time=end))
     # Of a compliant contact the whole force is recorded, which cannot pull.
     kinds = {*LimitKind} - ({LimitKind.FORCE} if "contact_force" in record else set())
-    for excess in (r.excess for r in ranges if r.kind in kinds):
-        if excess is not None:
-            numbers = excess.signal, excess.value, excess.limit, excess.time
-            found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *numbers))
+    beyond = [r.excess for r in ranges if r.kind in kinds and r.excess is not None]
+    for excess in sorted(beyond, key=lambda e: -abs(e.value / e.limit) if e.limit else -np.inf):
+        numbers = excess.signal, excess.value, excess.limit, excess.time
+        found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *numbers))
     found += more
     if changes:
         found += _of_task(changes)
-    else:
+    elif not ended:  # Else it has not had the time.
         pushing = {r.signal.name for r in ranges if r.kind is LimitKind.FORCE and r.low == 0.0}
         found += _of_contacts(record, pushing)
         found += _of_outputs(record, predicted, outputs, reasons)
-        if not ended and outputs:
+        if outputs:
             found += _of_prediction(record, predicted, accuracy, reasons)
     order = (Outcome.BAD, Outcome.UNDECIDED, None)
     first = (FindingKind.TASK, FindingKind.REFERENCE)  # Of the remarks.
@@ -182,13 +182,17 @@ def judge(
 def _of_task(changes: Sequence[PhaseChange]) -> Iterator[RunFinding]:
     """Whether a task was done, given up, or had not ended yet; and which failures it got over."""
     last, decides = changes[-1], None
-    pairs = zip((None, *changes), changes, strict=False)
-    failures = [c for b, c in pairs if c.failed and not (b is not None and b.chosen == "leave")]
-    leaves = last.failed and last.chosen == "leave" and last.phase != "done"
-    if leaves or (last.phase == "held" and last.failed):
-        last, decides = (failures or [last])[-1], Outcome.BAD
-        left = ", and has left the contact" if last.chosen == "leave" and not leaves else ""
-        text, failures = f"the task was given up at {last.time:.4g} s{left}: {last.reason}", []
+    # After "leave" the change that led there has the reason.
+    failures = [change for change in changes if change.failed and change.phase != "held"]
+    if last.failed and last.phase in ("held", "leave"):
+        left = ""
+        if last.phase == "held" and failures and changes[-2].phase == "leave":
+            last, left = failures[-1], ", and has left the contact"
+        text, decides = (
+            f"the task was given up at {last.time:.4g} s{left}: {last.reason}",
+            Outcome.BAD,
+        )
+        failures = []
     elif last.phase == "held":
         text, failures = f"the task ended as chosen at {last.time:.4g} s: {last.reason}", []
     elif last.phase == "done":

@@ -29,7 +29,7 @@ from drake_dae.scenario.start import start_scenario
 
 ENDED = ("done", "held")
 BAD = ("RAW", "HARD", "HANGS")
-REACTIONS = ("hold", "stop", "fail", "leave")
+REACTIONS = ("hold", "leave")
 DURATIONS = (6.0, 60.0)
 """In s; a task that has not ended in the first time is run for the second."""
 _NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
@@ -145,7 +145,7 @@ def outcome(text: str, is_model: bool, folder: Path) -> str:
             completed, loop = build_completed(load_scenario(file, [f"duration={duration}"]))
             context = start_scenario(completed.scenario, loop)
             found = roll_scenario(completed.scenario, loop, context)
-            changes = loop.changes(found.context or context)
+            changes = loop.changes(found.record)
             if found.failure is not None or changes[-1].phase in ENDED:
                 break
     except DrakeDaeError as error:

@@ -32,7 +32,7 @@ def rolled(example, *settings):
     chosen, _ = for_rollout(load_scenario(file, [*example.settings(), *settings]))
     completed, loop = build_completed(chosen)
     found = roll_scenario(completed.scenario, loop, start_scenario(completed.scenario, loop))
-    return loop, found, loop.changes(found.context)
+    return loop, found, loop.changes(found.record)
 
 
 def test_the_arm_finds_and_polishes_a_part_that_is_5_mm_and_5_degrees_off(example):

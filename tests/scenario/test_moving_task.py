@@ -54,7 +54,7 @@ def test_a_task_follows_a_wall_that_moves(settings, file):
     chosen = load_scenario(file, settings)
     loop, context = build_scenario(chosen)
     done = roll_scenario(chosen, loop, context)
-    record, changes = done.record, loop.changes(done.context)
+    record, changes = done.record, loop.changes(done.record)
     assert [change.phase for change in changes] == [
         "Approach",
         "Press",

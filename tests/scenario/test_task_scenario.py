@@ -73,7 +73,7 @@ def test_shipped_task_polishes_its_eight(tmp_path):
     """Within 0.02 mm and 0.1 N two seconds after the transition; the touch does not bounce."""
     completed, loop = build_completed(scenario("wall_polish"))
     rolled = roll_scenario(completed.scenario, loop, start_scenario(completed.scenario, loop))
-    record, changes = rolled.record, loop.changes(rolled.context)
+    record, changes = rolled.record, loop.changes(rolled.record)
     assert loop.generator is None
     assert [change.phase for change in changes][-1] == "done"
     times = {change.phase: change.time for change in changes}
@@ -97,8 +97,8 @@ def test_several_integrals_serve_a_task_whose_contact_opens(file):
     """The task holds them itself while the contact is open."""
     measured = "sensors.force={sample_period: 0.001}"
     settings = [measured, "law.integral=[tool.z, wall.force]", "task.phases.1.tolerance=3"]
-    loop, context, record = run_scenario(load_scenario(file, settings))
-    assert loop.changes(context)[-1].phase == "done"
+    loop, _, record = run_scenario(load_scenario(file, settings))
+    assert loop.changes(record)[-1].phase == "done"
     assert_allclose(record["tracking_error"][-1, 1], 0.0, atol=0.05)
 
 
@@ -122,11 +122,9 @@ def test_a_touch_lasts_up_to_the_computed_speed(file, mass):
         completed, loop = build_completed(
             load_scenario(file, [*settings, f"task.phases.0.speed={speed}", "task.retries=0"])
         )
-        if speed > computed * 1.01:
-            assert "Press" in completed.notes[-1]
         context = start_scenario(completed.scenario, loop)
         rolled = roll_scenario(completed.scenario, loop, context)
-        changes = loop.changes(rolled.context)
+        changes = loop.changes(rolled.record)
         touched = changes[1].time
         near = (rolled.record.time >= touched) & (rolled.record.time < touched + 0.4)
         return rolled.record["constraint_force"][near, 0].min()
@@ -208,18 +206,6 @@ def test_a_phase_takes_a_file_beside_the_scenario(file):
     loop, _ = build_scenario(load_scenario(file, [f"task.phases.2.references.tool.z={rows}"]))
     reference = loop.controller.task.phases[2].references["tool.z"]
     assert reference.file == str(file.parent / "path.csv")
-
-
-@pytest.mark.slow
-def test_a_summary_reports_that_a_task_stops_its_run(file, tmp_path, capsys):
-    words = ["--set", "task.phases.0.within=0.1", "--set", "task.phases.0.if_late=stop"]
-    words += ["--set", "write={plots: false, animation: false}", "--out", str(tmp_path / "run")]
-    assert main(["simulate", str(file), *words]) == 0
-    told = capsys.readouterr().out
-    assert "\n0.1 s: held, Approach " in told
-    assert " 0.9 s " in told
-    assert main(["simulate", str(file), *words, "--set", "duration=0.05"]) == 0
-    assert "stops the run" not in capsys.readouterr().out
 
 
 def test_a_task_does_not_start_outside_of_limits(tmp_path):

@@ -20,7 +20,7 @@ def polished(*settings):
     times = np.linspace(0.0, DURATION, round(1000 * DURATION) + 1)
     (run,) = rollout(loop, *start_values(loop, context), times)
     assert run.failure is None, run.failure
-    changes = {change.phase: change.time for change in loop.changes(run.context)}
+    changes = {change.phase: change.time for change in loop.changes(run.record)}
     return chosen, loop, run.record, changes
 
 

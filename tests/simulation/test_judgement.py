@@ -9,7 +9,7 @@ from drake_dae import Record, Signal
 from drake_dae.analysis.limits import LimitKind, SignalRange
 from drake_dae.simulation.judgement import FindingKind, Outcome, judge, late_rms
 from drake_dae.simulation.records.record import Recorded
-from drake_dae.systems.control.phase_change import PhaseChange
+from drake_dae.systems.control.contract import PhaseChange
 
 TIMES = np.linspace(0.0, 10.0, 1001)
 WALL = Signal("wall.force", "N")
@@ -179,12 +179,12 @@ def test_an_early_end_is_bad():
     assert re.match(r"BAD: .*10 s: singular there$", str(found))
 
 
-def change(time, phase, place, reason, chosen="next", failed=False):
-    return PhaseChange(time, phase, place, False, reason, 0.0, 0.1, 0.0, chosen, failed)
+def change(time, phase, place, reason, failed=False):
+    return PhaseChange(time, phase, place, False, reason, 0.0, 0.1, 0.0, failed)
 
 
 BEGIN = [change(0.0, "Approach", 0, "the task begins"), change(2.0, "Press", 1, "a force")]
-AWAY = change(2.0, "away", 3, "Approach has waited 2 s for a force of 0.5 N", "away", True)
+AWAY = change(2.0, "away", 3, "Approach has waited 2 s for a force of 0.5 N", True)
 LEAVE = "Press is ended by a force of 31 N"
 
 
@@ -194,7 +194,7 @@ LEAVE = "Press is ended by a force of 31 N"
         ([*BEGIN, change(4.0, "done", 2, "the end of 2 s")], "good", r"4 s, in 2 phases$"),
         ([BEGIN[0], change(4.0, "done", 1, "the end")], "good", r"4 s, in 1 phase$"),
         (
-            [*BEGIN, change(4.0, "held", 2, "the contact was lost", "hold", True)],
+            [*BEGIN, change(4.0, "held", 2, "the contact was lost", True)],
             "bad",
             r"4 s: the contact was lost$",
         ),
@@ -205,16 +205,16 @@ LEAVE = "Press is ended by a force of 31 N"
         ([BEGIN[0], AWAY, change(4.0, "done", 4, "a distance")], "good", r"4 s, in 2 phases$"),
         # One that leaves is bad where a phase has failed, and cannot become good any more.
         (
-            [BEGIN[0], change(2.0, "leave", 1, LEAVE, "leave", True)],
+            [BEGIN[0], change(2.0, "leave", 1, LEAVE, True)],
             "bad",
             r"2 s: Press .*31 N$",
         ),
-        ([BEGIN[0], change(2.0, "leave", 1, LEAVE, "leave")], "undecided", "leave"),
+        ([BEGIN[0], change(2.0, "leave", 1, LEAVE)], "undecided", "leave"),
         (
             [
                 BEGIN[0],
-                change(2.0, "leave", 1, LEAVE, "leave"),
-                change(3.0, "held", 2, "after a force", "stop"),
+                change(2.0, "leave", 1, LEAVE),
+                change(3.0, "held", 2, "after a force"),
             ],
             "good",
             r"3 s: after a force$",

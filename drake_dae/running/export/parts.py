@@ -24,7 +24,7 @@ class LoopParts:
         plant, controller: The blocks of the plant and the law.
         diagram: The diagram.
         compiled: The functions of the diagram; None if a block cannot be traced, has Drake's own
-            contact, or changes at times that a simulation has to find.
+            contact, or the controller plans its references itself.
     """
 
     plant: Any
@@ -61,7 +61,7 @@ def parts_of(loop: ClosedLoop | Diagram) -> LoopParts:
             compiled = program_of(loop).compiled
         except ModelError:
             compiled = None
-        if compiled is not None and (compiled.changes or compiled.has_stepped):
+        if compiled is not None and (loop.generator is None or compiled.has_stepped):
             compiled = None
         return LoopParts(loop.plant, loop.controller, loop.diagram, compiled)
     compiled = compile_diagram(loop)

@@ -53,7 +53,7 @@ def run_stepped(
         held_of_rows[rows:stop], rows = held, stop
         if rows == times.size:
             break
-        if count % LOOKED == 0 and settings.look(record, problem.context):
+        if count % LOOKED == 0 and settings.look(record):
             ending = RunEnding.PAUSED
             break
         moment, due = float(at), int(problem.due[count])

@@ -41,11 +41,6 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
     program = program_of(loop)
     state, held = program.compiled.start(context)
     values = program.compiled.values(context)
-    if program.compiled.changes and np.isnan(held).any():
-        # The initialization of a block need not be an expression.
-        begun = context.Clone()
-        program.compiled.diagram.ExecuteInitializationEvents(begun)
-        held = np.where(np.isnan(held), program.compiled.start(begun)[1], held)
     held = program.compiled.initialized(context.get_time(), state, held, values)
     return np.concatenate([state, held[program.kept_places]]), values
 

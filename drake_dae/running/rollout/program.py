@@ -8,7 +8,7 @@ from threading import RLock
 from typing import Any, TypeVar
 
 import numpy as np
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Diagram
 
 from drake_dae.compiler.compile import compile_diagram, with_twins
 from drake_dae.compiler.compiled import CompiledDiagram
@@ -31,8 +31,7 @@ class RolloutProgram:
     Attributes:
         compiled: Its functions.
         signals: The columns of a row: name of a signal -> names and units of its entries.
-        complete: Adds derived signals to a record; and events, from a context after the run, where
-            blocks reacted to changes.
+        complete: Adds derived signals to a record.
         name: Its name in messages.
         choice: Whether it becomes machine code by default.
         ends_updated: Whether the last row comes after the updates of its time: as in Drake's logs
@@ -42,7 +41,7 @@ class RolloutProgram:
 
     compiled: CompiledDiagram
     signals: Mapping[str, Sequence[Signal]]
-    complete: Callable[[Record, Context | None], Record]
+    complete: Callable[[Record], Record]
     name: str
     choice: Compiled = "auto"
     ends_updated: bool = True
@@ -132,4 +131,4 @@ def _of_diagram(diagram: Diagram) -> RolloutProgram:
             "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
         )
     name = diagram.get_name() or "the diagram"
-    return RolloutProgram(compiled, compiled.signals, lambda record, context: record, name)
+    return RolloutProgram(compiled, compiled.signals, lambda record: record, name)

@@ -9,13 +9,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.running.rollout.changes import run_with_changes
 from drake_dae.running.rollout.drake_stepped import run_stepped
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
@@ -27,7 +26,7 @@ from drake_dae.running.rollout.program import MAKING, RolloutProgram, program_of
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
-from drake_dae.simulation.diagnosis import explained
+from drake_dae.simulation.diagnosis import explained, too_long
 from drake_dae.simulation.records.record import (
     Record,
     RecordAfter,
@@ -58,8 +57,6 @@ class Rollout:
     Attributes:
         steps: The number of its steps.
         failure: The reason of an early end, with time and state; None if it reached its end.
-        context: The diagram's context after the run, if it has blocks with changes at samples, as
-            phases of a task. Otherwise None.
     """
 
     steps: int
@@ -67,12 +64,11 @@ class Rollout:
     _program: RolloutProgram = field(repr=False)
     _times: FloatArray = field(repr=False)
     _rows: FloatArray = field(repr=False)
-    context: Context | None = field(default=None, repr=False)
 
     @cached_property
     def record(self) -> Record:
         """The signals at the times of the rows, up to the end of the run."""
-        return _record_of(self._program, self._times, self._rows, context=self.context)
+        return _record_of(self._program, self._times, self._rows)
 
     def ended(self, failure: SimulationError) -> Self:
         """Returns the run as one that ended with a failure; its record ends at the failure."""
@@ -133,19 +129,24 @@ def rollout(
     found = run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
     if not isinstance(loop, ClosedLoop) or sum(r.failure is not None for r in found) > DIAGNOSED:
         return found
-    return [diagnosed(loop, one) for one in found]
+    return [diagnosed(loop, one, config) for one in found]
 
 
-def diagnosed(loop: ClosedLoop, rollout: Rollout) -> Rollout:
-    """A rollout whose failure says its cause, if that is a singular state or the reference."""
+def diagnosed(loop: ClosedLoop, rollout: Rollout, config: SimulatorConfig | None = None) -> Rollout:
+    """A rollout whose failure says its cause, as that of a simulation does."""
     if rollout.failure is None or not rollout.record.time.size:
         return rollout
     reference = None if loop.generator is None else loop.generator.reference
     start = float(rollout.record.time[0]), rollout.record["state"][0]
     structure = loop.controller.law.structure
-    return replace(
-        rollout, failure=explained(rollout.failure, loop.plant, structure, reference, start)
-    )
+    failure = explained(rollout.failure, loop.plant, structure, reference, start)
+    if failure is rollout.failure:
+        context = loop.diagram.CreateDefaultContext()
+        loop.plant.set_state(loop.plant.GetMyMutableContextFromRoot(context), start[1])
+        state = context.get_continuous_state_vector().CopyToVector()
+        config = config or SimulatorConfig()
+        failure = too_long(failure, loop.diagram, context, config, (start[0], state))
+    return replace(rollout, failure=failure)
 
 
 def run_loop(
@@ -179,10 +180,10 @@ def run_loop(
         problems = problems_of(program, starts, parameters, moments, seeds)
         kinds = _kinds(program, problems)
 
-    def stop(rows: Callable[[], FloatArray], context: Context | None) -> bool:
+    def stop(rows: Callable[[], FloatArray]) -> bool:
         if look is None:
             return False
-        return look(lambda after: _record_of(program, moments, rows(), after, context))
+        return look(lambda after: _record_of(program, moments, rows(), after))
 
     settings = Settings.of(config, program.compiled.scale, stop)
     seconds = len(problems) * float(np.ptp(moments)) if lasting is None else lasting
@@ -264,8 +265,6 @@ def _runs(
         run = partial(machine.run, code, program, settings=settings)
     else:
         run = partial(interpreted.run, functions_of(program), settings)
-    if program.compiled.changes:
-        run = partial(run_with_changes, functions_of(program), run)
     if program.compiled.has_stepped:
         run = partial(run_stepped, functions_of(program), code, settings=settings)
     if code is None or len(problems) == 1 or program.compiled.has_stepped:
@@ -277,9 +276,9 @@ def _runs(
 
 def _rollout(program: RolloutProgram, problems: Problems, index: int, run: Run) -> Rollout:
     failure = None
-    if run.ending not in (RunEnding.DONE, RunEnding.PAUSED, RunEnding.STOPPED):
+    if run.ending not in (RunEnding.DONE, RunEnding.PAUSED):
         failure = failure_of(program, problems[index], run)
-    return Rollout(run.steps, failure, program, problems.times, run.rows, run.context)
+    return Rollout(run.steps, failure, program, problems.times, run.rows)
 
 
 def _record_of(
@@ -287,7 +286,6 @@ def _record_of(
     times: FloatArray,
     rows: FloatArray,
     after: float | None = None,
-    context: Context | None = None,
 ) -> Record:
     """Returns the record of a run, or of its rows after a time in s."""
     times = times[: len(rows)]
@@ -296,4 +294,4 @@ def _record_of(
     for name, entries in program.signals.items():
         start, stop = stop, stop + len(entries)
         signals[name] = recorded_values(columns[start:stop].T, tuple(entries))
-    return program.complete(computed_record(times[first:], signals), context)
+    return program.complete(computed_record(times[first:], signals))

@@ -8,13 +8,12 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context
 from scipy.integrate import RK23, RK45
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError, SimulationError
 
-Look = Callable[[Callable[[], FloatArray], Context | None], bool]
+Look = Callable[[Callable[[], FloatArray]], bool]
 
 SHARE = 1e-3
 """The error of a step over the accuracy: rows between long steps are then as accurate as these."""
@@ -59,10 +58,7 @@ FIXED = {
 
 
 class RunEnding(IntEnum):
-    """How the stepping ended; stepper.c has the same list.
-
-    At a CHANGE, a block has to react before the next step. STOPPED: a block ended the run.
-    """
+    """How the stepping ended; stepper.c has the same list."""
 
     DONE = 0
     PAUSED = 1
@@ -71,8 +67,6 @@ class RunEnding(IntEnum):
     STUCK = 4
     SPOILT = 5
     SLOW = 6
-    CHANGE = 7
-    STOPPED = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +78,8 @@ class Settings:
         tableau: The method of fixed steps; None for error control by DOP853.
         absolute: The absolute tolerance of a step for each state, shape (n,).
         relative: The relative tolerance.
-        look: Called from time to time with a function that returns the rows up to then, and with
-            the context of `RunProblem`; returns whether to stop.
+        look: Called from time to time with a function that returns the rows up to then; returns
+            whether to stop.
     """
 
     longest: float
@@ -133,9 +127,6 @@ class RunProblem:
         due: The rates that are due at each update, as bits.
         noise: The random numbers of each update, shape (len(events), number of entries).
         project: (time, state, held) -> the state on N*; raises InconsistentStateError.
-        earlier: In a piece of a run, the rows of all pieces before. The first row of the piece is
-            then no row of the record.
-        context: The Drake context of blocks that react; None without such blocks.
     """
 
     times: FloatArray
@@ -146,12 +137,6 @@ class RunProblem:
     due: np.ndarray
     noise: FloatArray
     project: Callable[[float, FloatArray, FloatArray], FloatArray]
-    earlier: tuple[FloatArray, ...] = ()
-    context: Context | None = None
-
-    def whole(self, rows: FloatArray) -> FloatArray:
-        """Returns the rows of all pieces, from those of this one."""
-        return np.concatenate([*self.earlier, rows[1:]]) if self.earlier else rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +153,6 @@ class Run:
         mark: The time a thousand steps ago, in s.
         next: The end of a step that was not accepted, in s.
         trial_time, trial: The earliest trial after `time` that failed; not finite if none did.
-        context: A Drake context after the run, if blocks reacted to changes.
         error: An exception that a block raised.
     """
 
@@ -183,5 +167,4 @@ class Run:
     next: float
     trial_time: float
     trial: FloatArray
-    context: Context | None = None
     error: SimulationError | None = None

@@ -20,7 +20,6 @@ from drake_dae.scenario.forms import values
 from drake_dae.scenario.forms.forms import Family, Key, keys_of
 from drake_dae.scenario.parts import parts, written
 from drake_dae.systems.task import phases
-from drake_dae.systems.task.phases.phase import Phase
 
 
 def _family(*classes: type, plain: type | None = None) -> Family:
@@ -79,7 +78,7 @@ FAMILIES: dict[type, Family] = {
         plants.IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
     ),
     parts.Gains: _family(parts.Poles, parts.Coefficients, parts.Matrices),
-    Phase: _family(
+    phases.Phase: _family(
         phases.Approach, phases.Press, phases.Move, phases.Dwell, phases.Release, phases.Retreat
     ),
 }

@@ -31,7 +31,7 @@ class ScenarioTask:
         tare_time: The time in s at the beginning for which a task without contact measures the bias
             of the force sensor. No phase ends before, and the bias is subtracted afterwards. 0 for
             no taring.
-        retries: How many times phases may return to the approach; then the run ends with an error.
+        retries: How many times a phase may be entered again, where it does not say it itself.
         signals: Name -> reference of a signal that conditions of phases watch.
         gains: The gains of the law without contact, with the distance among its outputs; those of
             `law.gains` if left out.
@@ -47,7 +47,7 @@ class ScenarioTask:
     gains: Gains | None = None
 
     def __post_init__(self) -> None:
-        signals = self.make().signals
+        signals = self.make().watched("signal")
         for name in self.signals:
             if name not in signals:
                 text = unknown_name("signal of a condition", name, signals)

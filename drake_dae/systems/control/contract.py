@@ -1,6 +1,7 @@
 """The contract of a controller: the rules for wiring, records and starts."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pydrake.systems.framework import Context
@@ -14,7 +15,6 @@ from drake_dae.dae.system.system import DaeSystem
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.control.phase_change import PhaseChange
 from drake_dae.systems.plants.contract import NOWHERE, Plant
 
 if TYPE_CHECKING:
@@ -30,6 +30,41 @@ SIGNAL = "signal_"
 
 Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
 """Outputs z and their desired values, shape (k,) each, and their names and units."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class PhaseChange:
+    """The start of a phase of a task.
+
+    Attributes:
+        time: The time, in s.
+        phase: The name of the phase that begins, "Approach" for example; "done" if the task is
+            done, "held" if the robot rests for another reason.
+        place: Its index in the task, from 0; the number of phases when done or held.
+        in_contact: Whether the law for contact is active from then on.
+        reason: Why the previous phase ended.
+        force: The measured force of the contact then, in N.
+        distance: The distance by the law's model then, in m.
+        distance_rate: Its derivative, in m/s.
+        failed: Whether the phase before failed; of "held", whether the task was given up.
+    """
+
+    time: float
+    phase: str
+    place: int
+    in_contact: bool
+    reason: str
+    force: float
+    distance: float
+    distance_rate: float
+    failed: bool = False
+
+    def __str__(self) -> str:
+        return (
+            f"{self.time:.6g} s: {self.phase}, {self.reason}; {self.force:.4g} N, "
+            f"{self.distance:.4g} m, {self.distance_rate:.3g} m/s"
+        )
 
 
 @checked(ModelError)
@@ -59,7 +94,7 @@ class Controller(System):
     7. Starts. With `takes_over` its references start at the current outputs; otherwise they come
        from a generator, and a run starts at their start. A run starts on the manifold of
        `start_structure`.
-    8. Phases. `changes` are the times at which phases of a run began, with reasons, and
+    8. Phases. `changes` are the starts of the phases of a run, with reasons, from its record, and
        `phase_names` the names of the phases and of the rest after them; both are empty without
        phases.
     """
@@ -152,8 +187,8 @@ class Controller(System):
         """
         raise NotImplementedError
 
-    def changes(self, context: Context) -> tuple[PhaseChange, ...]:
-        """The start of each phase of a run, with the reason."""
+    def changes(self, values: Mapping[str, FloatArray]) -> tuple[PhaseChange, ...]:
+        """The start of each phase of a run, with the reason, from the signals of its record."""
         return ()
 
 

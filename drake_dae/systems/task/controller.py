@@ -1,12 +1,11 @@
-"""A task as a controller: the law in contact, the law of the free robot, and a supervisor."""
+"""A task as a controller: the law in contact, the law of the free robot, and the phases."""
 
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
@@ -16,29 +15,31 @@ from drake_dae.dae.system.signals import Signal
 from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems.control.contract import Compared, Controller, Derived, check_same_sizes
-from drake_dae.systems.control.controller import TrackingController
-from drake_dae.systems.control.phase_change import PhaseChange
-from drake_dae.systems.control.switch import LawSwitch
-from drake_dae.systems.parameterized import function_along
+from drake_dae.systems.control.contract import (
+    Compared,
+    Controller,
+    Derived,
+    PhaseChange,
+    check_same_sizes,
+)
+from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.task.contacts.open_contact import CONTACT, FREE, LAWS, contact_laws
-from drake_dae.systems.task.contacts.outputs import TaskOutputs
-from drake_dae.systems.task.progress import ReferenceSegment, places_at
-from drake_dae.systems.task.supervisor import TaskSupervisor
+from drake_dae.systems.task.automaton import CHANGE, Automaton
+from drake_dae.systems.task.changes import changes_of
+from drake_dae.systems.task.contacts import opening_contact
 from drake_dae.systems.task.task import Task
 
 
 @checked(ModelError)
-class TaskController(Diagram, Controller):
+class TaskController(ParameterizedSystem, Controller):
     """A task in phases: approach, touch, press, move, release, retreat.
 
     In contact, the law (28) of the robot with the contact is active and tracks the contact force;
     otherwise the law of the robot without it, which tracks the distance in place of the force. Each
-    phase has goals, and ends by the measured force, the distance by the model or the time. The
-    references of a phase start with the values and all derivatives of those before, and go to its
-    goals by a polynomial; a reference that did not exist before, such as the force after a touch,
-    starts at the measured value.
+    phase has goals, and ends by the measured force, the distance by the model or the time, at a
+    sample. The references of a phase start with the values and all derivatives of those before, and
+    go to its goals by a polynomial; a reference that did not exist before, such as the force after
+    a touch, starts at the measured value.
 
     The control may jump when the law changes, since both laws explain the same motion by different
     forces. When a robot touches a frictionless surface and the free law presses with lambda, that
@@ -52,8 +53,7 @@ class TaskController(Diagram, Controller):
 
     Of a plant it needs only the state x and the measured constraint forces. If the laws are for a
     system with a disturbance, one observer serves both, since its equation contains the measured
-    force and so holds for closed and open contacts. Guards are evaluated at samples. The whole
-    history of a run is in its context.
+    force and so holds for closed and open contacts.
 
     Input ports:
         estimated_state: x, shape (n,).
@@ -62,17 +62,18 @@ class TaskController(Diagram, Controller):
         exogenous: The exogenous signals of the laws with their derivatives, as of a surface that
             moves, or an observer's estimates; see `ParameterizedSystem`.
         hold: While it is not 0, no integral is updated, shape (1,); 0 without a wire.
-        signal_<name>: A signal that phases wait for, shape (1,); it is present above 1/2. 0 without
-            a wire.
+        signal_<name>: A signal that phases wait for, shape (1,); 0 without a wire.
 
     Output ports:
         control: u, shape (p,).
         phase: The index of the phase in the task, shape (1,); after the last one their number.
-        ending: 0 while the task goes on, then how it has ended, shape (1,); see `TaskSupervisor`.
+        ending: 0 while the task goes on; 1 when it is done; 2 when the robot rests by "hold" or
+            "leave" after a success, 3 when the task is given up, shape (1,).
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
             of k points. In contact the distances are zero, otherwise the forces.
         contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
+        change: The last change of phase, shape (10,); `changes` reads it from a record.
         integral, free_integral: The integrals of each law, if it has any. They are not updated
             while the other law is active; those in contact also not while no force is measured, and
             during the transition after a touch, so that the force of an impact is not integrated.
@@ -87,95 +88,31 @@ class TaskController(Diagram, Controller):
 
     Attributes:
         task, law, free_law, sample_period: The arguments.
-        supervisor, controller: Blocks in it: the latter has the first law in contact.
-        contact: The contact that opens and closes.
-        columns: The places of the outputs of both laws in a record.
         output_signals: Names and units of `desired_output`.
-        outputs: (x, lambda, parameters) -> the outputs, in the order of `desired_output`, and the
-            derivatives of the distances, shape (p + 2 k,) for a contact of k points.
 
     Raises:
         ModelError: The laws do not belong together, or a phase has a reference that does not fit.
     """
 
     __slots__ = SHARED_DICTIONARY
-    takes_over, shown = True, ("desired_output", "ending")
+    takes_over, shown = True, ("phase", "ending", "contact_reference")
 
     def __init__(
-        self,
-        task: Task,
-        law: TrackingLaw,
-        free_law: TrackingLaw,
-        *,
-        sample_period: float,
+        self, task: Task, law: TrackingLaw, free_law: TrackingLaw, *, sample_period: float = 1e-3
     ) -> None:
-        super().__init__()
         if not 0.0 < sample_period < inf:
-            raise ModelError(
-                f"sample_period must be positive, got {sample_period:g} s: contact may be lost and "
-                "regained at any time, so that a task decides in samples (in a scenario: sampling)"
-            )
+            raise ModelError(f"sample_period must be positive, got {sample_period:g} s")
         self.task, self.law, self.free_law = task, law, free_law
-        self.phase_names = (*(phase.name for phase in task.plan.phases), "end")
+        self.phase_names = (*(phase.name for phase in task.all_phases), "end")
         self.sample_period = sample_period
-        pair = contact_laws(law, free_law)
-        self.contact, self.columns = pair.contact, TaskOutputs(pair)
-        self.outputs, self.output_signals = self.columns.function, self.columns.signals
-        builder = DiagramBuilder()
-        measured = law.system.num_constraints
-        supervisor = TaskSupervisor(task, pair, self.columns, measured, sample_period)
-        self.supervisor = builder.AddSystem(supervisor)
-        for name in ("estimated_state", "measured_force", "hold"):
-            builder.ExportInput(self.supervisor.GetInputPort(name), name)
-        for port in self.supervisor.signal_ports.values():
-            builder.ExportInput(port, port.get_name())
-        names = [f"{name}_law" for name in LAWS]
-        switch = builder.AddSystem(LawSwitch(law.system.num_controls, names))
-        builder.Connect(self.supervisor.GetOutputPort("law"), switch.GetInputPort("law"))
-        self.controllers = []
-        for which, its_law in enumerate(pair.laws):
-            controller = builder.AddSystem(TrackingController(its_law, sample_period=sample_period))
-            controller.set_name(f"{LAWS[which]}_controller")
-            builder.ConnectInput("estimated_state", controller.GetInputPort("estimated_state"))
-            reference = self.supervisor.GetOutputPort(f"{LAWS[which]}_reference")
-            builder.Connect(reference, controller.GetInputPort("reference"))
-            if its_law.measured_force:
-                measured = controller.GetInputPort("measured_force")
-                if task.tare_time:
-                    builder.Connect(self.supervisor.GetOutputPort("tared_force"), measured)
-                else:
-                    builder.ConnectInput("measured_force", measured)
-            if its_law.exogenous_degrees:
-                port = controller.GetInputPort("exogenous")
-                if which == FREE:
-                    builder.ExportInput(port, "exogenous")
-                    if self.supervisor.HasInputPort("exogenous"):
-                        builder.ConnectInput("exogenous", self.supervisor.GetInputPort("exogenous"))
-                else:
-                    builder.ConnectInput("exogenous", port)
-            if count := len(its_law.integral.outputs):
-                hold = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-                hold.set_name(f"{LAWS[which]}_hold")
-                builder.Connect(
-                    self.supervisor.GetOutputPort(f"{LAWS[which]}_hold"), hold.get_input_port()
-                )
-                builder.Connect(hold.get_output_port(), controller.GetInputPort("hold"))
-                shown = "integral" if which == CONTACT else "free_integral"
-                builder.ExportOutput(controller.GetOutputPort("integral"), shown)
-            builder.Connect(controller.GetOutputPort("control"), switch.GetInputPort(names[which]))
-            self.controllers.append(controller)
-        self.controller = self.controllers[CONTACT]
-        self.exogenous_layout = self.controller.exogenous_layout
-        self.exogenous_places = self.controller.exogenous_places
-        control = switch.GetOutputPort("control")
-        builder.ExportOutput(control, "control")
-        if task.controls:
-            builder.Connect(control, self.supervisor.GetInputPort("control"))
-        names = ["phase", "ending", "desired_output", "contact_reference"]
-        for name in [*names, "tared_force"] if task.tare_time else names:
-            builder.ExportOutput(self.supervisor.GetOutputPort(name), name)
-        builder.BuildInto(self)
-        self.set_name("task_controller")
+        contact, system = opening_contact(law, free_law), law.system
+        distances = [system.constraint_output_signals[row] for row in contact.forces]
+        self.output_signals = (*system.output_signals, *distances)
+        # The columns of these distances and of their derivatives in constraint_residual.
+        first = np.cumsum([0, *law.structure.constraint_degrees])[list(contact.forces)]
+        self._distances, self._motion = first, np.concatenate([first, first + 1])
+        block = Automaton(task, contact, (free_law, law), sample_period).block()
+        super().__init__(system, block, law.exogenous_degrees, sees_steps=True)
 
     @checked(ModelError)
     def rest_state(
@@ -198,50 +135,12 @@ class TaskController(Diagram, Controller):
         values = law.system.parameter_vector(parameters)
         return ZeroDynamics(law.system, structure=law.structure).state(goal, guess, values)
 
-    def changes(self, context: Context) -> tuple[PhaseChange, ...]:
-        """The start of each phase of a run, with the reason; empty before a run.
-
-        Args:
-            context: The context of this system.
-        """
-        return tuple(segment.change for segment in self.segments(context))
-
-    def segments(self, context: Context) -> tuple[ReferenceSegment, ...]:
-        """The references of a run, one segment for each phase.
-
-        Args:
-            context: The context of this system.
-        """
-        return self.supervisor.progress(self.GetSubsystemContext(self.supervisor, context)).segments
-
-    def desired_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        """The values of `desired_output` at times of a run, one row each.
-
-        At the time of a change it is the value of the phase before.
-
-        Args:
-            context: The context of this system after the run.
-            times: The times, in s, shape (k,).
-        """
-        moments, segments = vector("times", times, None), self.segments(context)
-        if not segments:
-            raise ModelError(f"{self.get_name()}: the task has not begun in this context")
-        return np.array(
-            [
-                segments[i].desired(self.columns, time)
-                for i, time in zip(places_at(segments, moments), moments, strict=True)
-            ]
-        ).reshape(moments.size, -1)
-
-    @property
-    def phase_signals(self) -> tuple[Signal, ...]:
-        """The names of the phases in a record: "1 Approach", "2 Press", ..., "end"."""
-        *names, end = self.phase_names
-        return (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal(end))
+    def changes(self, values: Mapping[str, FloatArray]) -> tuple[PhaseChange, ...]:
+        return changes_of(self.task, values["change"])
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
-        named: dict[str, Sequence[Signal]] = {"phase": (Signal("phase"),)}
+        named = {"change": CHANGE, "desired_output": self.output_signals}
         for name, law in (("integral", self.law), ("free_integral", self.free_law)):
             if law.integral.outputs:
                 named[name] = law.integral.signals
@@ -249,10 +148,14 @@ class TaskController(Diagram, Controller):
 
     @property
     def start_structure(self) -> ConstraintStructure:
-        return (self.law if self.task.plan.contacts[0] else self.free_law).structure
+        return (self.law if self.task.contacts[0] else self.free_law).structure
 
     def all_parameters(self, context: Context) -> FloatArray:
-        return self.controller.all_parameters(self.GetSubsystemContext(self.controller, context))
+        self.check_context(context)
+        return np.array(self._values(context)[: self.law.all_parameters().size])
+
+    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
+        return super().parameters_along(context, times)[:, : self.law.all_parameters().size]
 
     def check_plant(self, plant: Plant) -> None:
         check_same_sizes(plant.dae, self.law.system, "task", "the laws for the plant's robot")
@@ -267,59 +170,33 @@ class TaskController(Diagram, Controller):
     ) -> Derived:
         """The signals of a task in a record.
 
-        The outputs are the positions, the forces and the distances of the contact; in contact the
-        desired distances are zero, otherwise the desired forces. "distance" has the distances, then
-        their derivatives, and "phase" is 1 for the current phase and 0 for all others.
+        The outputs are the positions, the forces and the distances of the contact. "distance" has
+        the distances, then their derivatives, and "phase" is 1 for the current phase and 0 for all
+        others.
         """
-        signals, columns = self.output_signals, self.columns
-        every = function_along(self.outputs, {**values, "force": values["constraint_force"]})
-        outputs, rates = every[:, : columns.size], every[:, columns.size :]
-        own = [signals[column] for column in columns.distances]
-        desired = np.zeros_like(outputs)
-        if times.size and context is not None:  # A run that failed at its start has no segments.
-            desired = self.desired_along(context, times)
-        places = values["phase"].astype(int)
-        names = self.phase_signals
+        signals, residual = self.output_signals, values["constraint_residual"]
+        outputs = np.concatenate([values["controlled_output"], residual[..., self._distances]], -1)
+        own = signals[len(self.law.degrees) :]
+        *names, end = self.phase_names
+        phases = (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal(end))
+        places = values["change"][..., 1:2].astype(int)
         return {
-            "phase": ((places == np.arange(len(names))).astype(float), names),
+            "phase": ((places == np.arange(len(phases))).astype(float), phases),
             "distance": (
-                np.hstack([outputs[:, columns.distances], rates]),
+                residual[..., self._motion],
                 (*own, *(signal.derivative(1) for signal in own)),
             ),
             "controlled_output": (outputs, signals),
-            "desired_output": (desired, signals),
-            "tracking_error": (outputs - desired, signals),
+            "tracking_error": (outputs - values["desired_output"], signals),
         }
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared:
-        parameters = self.controller.current_parameters(
-            self.GetSubsystemContext(self.controller, context)
-        )
-        (outputs,) = self.outputs(shown("state"), shown("constraint_force"), parameters)
-        desired = self.GetOutputPort("desired_output").Eval(context)
-        return outputs[: self.columns.size], desired, self.output_signals
+        distances = shown("constraint_residual")[self._distances]
+        outputs = np.concatenate([shown("controlled_output"), distances])
+        return outputs, self.GetOutputPort("desired_output").Eval(context), self.output_signals
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
     ) -> FloatArray:
         """Zero: the references of each phase begin as those before it end."""
-        return np.zeros((times.size, self.columns.size))
-
-    def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
-        """Changes a parameter of the laws' model in a context, as `TrackingController` does.
-
-        Args:
-            context: The context of this system.
-            name: The name of the parameter.
-            value: The new value, shape (k,), or a number for all entries.
-
-        Raises:
-            ModelError: No parameter has that name, or the value does not fit.
-        """
-        for controller in self.controllers:
-            controller.set_parameter(
-                self.GetMutableSubsystemContext(controller, context), name, value
-            )
-        values = self.controller.parameters(self.GetSubsystemContext(self.controller, context))
-        supervisor_context = self.GetMutableSubsystemContext(self.supervisor, context)
-        supervisor_context.get_mutable_numeric_parameter(0).SetFromVector(values)
+        return np.zeros((times.size, len(self.output_signals)))

@@ -1,15 +1,25 @@
-"""A task: phases in a valid order."""
+"""A task: phases, and which of them may follow which."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import ceil, inf
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import positive
+from drake_dae.arrays import positive, unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.systems.task.phases import Phase
-from drake_dae.systems.task.phases.condition import Watched
-from drake_dae.systems.task.phases.plan import PhasePlan, check_forces, named
+from drake_dae.systems.task.phases import (
+    APPROACH,
+    DONE,
+    ENDS,
+    HOLD,
+    LEAVE,
+    NEXT,
+    Outcome,
+    Phase,
+    Release,
+    Watched,
+)
 
 _STEADY = 6.0
 """The least `contact_force` in standard deviations of the filtered noise: one sample in 1e9 exceeds
@@ -17,6 +27,9 @@ it."""
 
 _STRONGEST = 10.0
 """The largest factor by which the low-pass reduces noise; its time constant is then 50 samples."""
+
+_RESERVED = (*ENDS, "held", "end")
+"""Words that cannot be names of phases."""
 
 
 @checked(ModelError)
@@ -39,13 +52,12 @@ class Task:
         tare_time: The time in s at the start of a task that starts free, over which the mean of the
             measured force is taken as the sensor's bias. No phase ends before; then the bias is
             subtracted for guards, laws and observers. 0 for no taring.
-        retries: How many times a task may go back by "approach"; then the run ends with an error.
-        plan: The order of the phases.
+        retries: How many times a phase may be entered again, where it does not say it itself.
 
     Raises:
         ModelError: There are no phases; one begins in contact although the one before does not end
-            in contact, or the other way round; a successor is not a phase, or the task may not end;
-            or a number is not valid.
+            in contact, or the other way round; a successor is not a phase; or a number is not
+            valid.
     """
 
     phases: Sequence[Phase]
@@ -54,7 +66,6 @@ class Task:
     force_noise: float = 0.0
     tare_time: float = 0.0
     retries: int = 10
-    plan: PhasePlan = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         positive("contact_force", self.contact_force)
@@ -70,16 +81,100 @@ class Task:
                 f"contact_force: noise of {self.force_noise:g} N hides a force of "
                 f"{self.contact_force:g} N; it must be {least:.2g} N or more"
             )
-        object.__setattr__(self, "phases", tuple(self.phases))
+        object.__setattr__(self, "phases", _named(self.phases))
         if not self.phases:
             raise ModelError("a task needs phases, such as Approach(0.05), Press(20.0), Release()")
         if self.tare_time and self.phases[0].begins_in_contact:
             raise ModelError("tare_time: a task that begins in contact finds no bias; leave it out")
-        phases = named(self.phases)
-        check_forces(phases, self.contact_force)
-        plan = PhasePlan(phases, self.retries)
-        object.__setattr__(self, "phases", phases)
-        object.__setattr__(self, "plan", plan)
+        for place, phase in enumerate(self.phases):
+            if (force := phase.felt(self.contact_force)) < self.contact_force:
+                raise ModelError(
+                    f"{self.where(place)}: force: {force:g} N counts as no force, since it is less "
+                    f"than the contact_force of {self.contact_force:g} N; give more, or a smaller "
+                    "contact_force"
+                )
+            for outcome in self._outcomes(place):
+                self._check(place, outcome)
+
+    @cached_property
+    def all_phases(self) -> tuple[Phase, ...]:
+        """The phases, then the Release of "leave" if one of them chooses it."""
+        words = {word for phase in self.phases for word in phase.successors}
+        # A model error may be larger than contact_force, and holds the tool.
+        leave = Release(name=LEAVE, within=5.0, on_success=HOLD)
+        return (*self.phases, *([leave] if LEAVE in words else []))
+
+    @cached_property
+    def contacts(self) -> tuple[bool, ...]:
+        """Whether each of `all_phases` begins in contact.
+
+        At the start the robot is in contact if the first phase that says so begins in contact. One
+        without a say that ends by a force begins without it.
+        """
+        known = (
+            bool(phase.begins_in_contact)
+            for phase in self.phases
+            if phase.begins_in_contact is not None or phase.in_contact_after(False)
+        )
+        is_closed, contacts = next(known, False), []
+        for phase in self.all_phases:
+            if phase.begins_in_contact is not None:
+                is_closed = phase.begins_in_contact
+            contacts.append(is_closed)
+            is_closed = phase.in_contact_after(is_closed)
+        return tuple(contacts)
+
+    def is_closed_after(self, place: int, outcome: Outcome) -> bool:
+        """Whether the robot is in contact after a phase, as far as its outcome says."""
+        before = self.contacts[place]
+        return self.all_phases[place].in_contact_after(before) if outcome == "success" else before
+
+    def successors(self, place: int, outcome: Outcome) -> tuple[list[int], bool]:
+        """What follows a phase.
+
+        Args:
+            place: Its index.
+            outcome: How it has ended.
+
+        Returns:
+            The indices of phases, of which the first follows whose retries are not used up; and
+            whether the task is done if there is none, or given up.
+        """
+        chain, at, word = list[int](), place, self.all_phases[place].successor(outcome)[0]
+        while True:
+            to = self.place_of(at, word)
+            if word == LEAVE and not self.is_closed_after(place, outcome):
+                to = None
+            if to is None or to in chain:
+                return chain, word in (NEXT, DONE) and to is None
+            chain.append(to)
+            at, word = to, self.all_phases[to].if_spent
+
+    def place_of(self, place: int, word: str) -> int | None:
+        """The index of the phase to which a word of a phase leads; None where the robot rests."""
+        if word == NEXT:
+            return place + 1 if place + 1 < len(self.phases) else None
+        if word == APPROACH:  # Back to the last phase that leads into contact.
+            leads = [
+                i for i in range(place + 1) if self.is_closed_after(i, "success") > self.contacts[i]
+            ]
+            return leads[-1] if leads else None
+        names = [phase.name for phase in self.all_phases]
+        return names.index(word) if word in names else None
+
+    def retries_of(self, place: int) -> int:
+        """How many times a phase may be entered again."""
+        own = self.all_phases[place].retries
+        return self.retries if own is None else own
+
+    def where(self, place: int) -> str:
+        """A phase, for messages."""
+        return f"phase {place + 1} of the task, {self.all_phases[place].name}"
+
+    def watched(self, of: Watched) -> tuple[str, ...]:
+        """The names of the "signal" or "control" that phases watch; "" for the largest control."""
+        conditions = [each for phase in self.phases for each in (*phase.until, *phase.guards)]
+        return tuple(dict.fromkeys(each.name for each in conditions if each.of == of))
 
     @property
     def force_gain(self) -> float:
@@ -95,9 +190,6 @@ class Task:
     def tare_samples(self, sample_period: float) -> int:
         """The number of samples in the mean for the bias of the force; 0 without a tare_time.
 
-        Args:
-            sample_period: The sample period, in s.
-
         Raises:
             ModelError: There are so few samples that the noise of their mean may count as a touch.
         """
@@ -112,24 +204,37 @@ class Task:
             )
         return count
 
-    @property
-    def contacts(self) -> tuple[bool, ...]:
-        """Whether each phase begins in contact, and whether the robot rests in contact at last."""
-        return self.plan.contacts
+    def _outcomes(self, place: int) -> list[Outcome]:
+        can_lose = self.phases[place].holds_contact and self.contacts[place]
+        return ["success", "guard", "late", *(["lost"] if can_lose else [])]  # type: ignore[list-item]
 
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """The names of the signals that its phases watch."""
-        return self._watched("signal")
-
-    @property
-    def controls(self) -> tuple[str, ...]:
-        """The names of the controls that its phases watch; "" for the largest."""
-        return self._watched("control")
-
-    def _watched(self, of: Watched) -> tuple[str, ...]:
-        conditions = [each for phase in self.phases for each in phase.conditions]
-        return tuple(dict.fromkeys(each.name for each in conditions if each.of == of))
+    def _check(self, place: int, outcome: Outcome) -> None:
+        """Refuses words that lead nowhere, and phases that cannot follow another one."""
+        phase, where = self.phases[place], self.where(place)
+        for word, key in (phase.successor(outcome), (phase.if_spent, "if_spent")):
+            if word == APPROACH and self.place_of(place, word) is None:
+                raise ModelError(
+                    f"{where}: {key}: approach goes back to an Approach, and there is none before "
+                    "it"
+                )
+            names = [each.name for each in self.phases]
+            if word not in (*ENDS, *names):
+                known = unknown_name("phase", word, names)
+                raise ModelError(f"{where}: {key}: {known}; or take {', '.join(ENDS)}")
+        is_closed = self.is_closed_after(place, outcome)
+        key = phase.successor(outcome)[1]
+        for to in self.successors(place, outcome)[0]:
+            begins, text = self.contacts[to], ""
+            if outcome == "lost" and begins and self.is_closed_after(to, "success"):
+                text = "it begins in contact, but the contact is lost; choose another by if_lost"
+            elif begins and not is_closed:
+                text = "it begins in contact, but the robot is free; an Approach must lead there"
+            elif outcome == "success" and is_closed and not begins:
+                text = (
+                    "it begins with a free robot, but it is in contact; a Release must lead there"
+                )
+            if text:
+                raise ModelError(f"{self.where(to)}, after {phase.name} by {key}: {text}")
 
     def __repr__(self) -> str:
         return f"Task({', '.join(phase.name for phase in self.phases)})"
@@ -140,3 +245,26 @@ class Task:
             f"{index + 1}. {phase.name}, until {phase.awaits(self.contact_force)}"
             for index, phase in enumerate(self.phases)
         )
+
+
+def _named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
+    """The phases with distinct names: those with the name of their class are numbered.
+
+    Raises:
+        ModelError: Two phases have one name, or a name is a reserved word.
+    """
+    chosen = [phase.name for phase in phases if phase.name != type(phase).__name__]
+    renamed = list[Phase]()
+    for index, phase in enumerate(phases):
+        where, name, number = f"phase {index + 1} of the task", phase.name, 1
+        if name in _RESERVED or name != name.strip():
+            raise ModelError(f"{where}: '{name}' is no name of a phase; give it another one")
+        if chosen.count(name) > 1:
+            raise ModelError(f"{where}: more than one phase has the name '{name}'")
+        if name == type(phase).__name__:
+            taken = {*chosen, *(other.name for other in renamed)}
+            while name in taken:
+                number += 1
+                name = f"{phase.name} {number}"
+        renamed.append(phase if phase.name == name else replace(phase, name=name))
+    return tuple(renamed)

@@ -79,7 +79,7 @@ def test_a_loop_with_a_task_has_its_phases(tmp_path):
     """Drake's contact law with a sampled task, through its touch and the press after it."""
     settings = ["task.signals={ready: !PointToPoint {start: [0], end: [1], end_time: 0.5}}"]
     loop, context, record = in_drake("wall_guarded", *settings, duration=1.7)
-    part = loop_part(loop, context, ["desired_output"])
+    part = loop_part(loop, context)
     code = CIntegrated(write_integrated(part, "loop", context, "task", tmp_path, CONFIG))
     rows = []
     for time in record.time[:-1]:
@@ -88,8 +88,8 @@ def test_a_loop_with_a_task_has_its_phases(tmp_path):
     values = {key: np.array(rows)[:, places] for key, places in code.outputs.items()}
     for key in ("state", "control", "constraint_force", "desired_output"):
         assert_same(values[key], record, key, slice(-1))
-    np.testing.assert_array_equal(values["phase"][:, 0], record["phase"][:-1].argmax(axis=1))
-    assert {*values["phase"][:, 0]} == {0.0, 1.0, 2.0, 3.0}
+    np.testing.assert_array_equal(values["change"][:, 1], record["phase"][:-1].argmax(axis=1))
+    assert {*values["change"][:, 1]} == {0.0, 1.0, 2.0, 3.0}
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+import polishing
 import pytest
 from actuated import actuated
 from alone import alone
@@ -13,6 +14,7 @@ from pydrake.systems.analysis import Simulator
 from runs import some
 
 from drake_dae import (
+    Approach,
     CommandedReferences,
     CompliantPlant,
     DaePlant,
@@ -21,11 +23,15 @@ from drake_dae import (
     ForceSensor,
     Observing,
     PointMaterial,
+    Press,
     ReferenceGenerator,
+    Release,
     RobotModel,
     RobotPlant,
     SinusoidReference,
     StateEstimator,
+    Task,
+    TaskController,
     TrackingController,
     TrackingLaw,
     poles,
@@ -36,7 +42,6 @@ from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
-from drake_dae.systems.control.switch import LawSwitch
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 
@@ -137,7 +142,9 @@ BLOCKS = {
     "ControlLimits": lambda: ControlLimits([0.5, 2.0]),
     "ForceSensor with a lag": lambda: ForceSensor(2, 0.01, bias=0.1),
     "ForceSensor with samples": lambda: ForceSensor(2, sample_period=0.01, bias=[0.1, 0.2]),
-    "LawSwitch": lambda: LawSwitch(2, ["free", "contact"]),
+    "TaskController": lambda: TaskController(
+        Task([Approach(), Press(20.0), Release()]), *polishing.laws(), sample_period=0.01
+    ),
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
     "ControlHold of one control": lambda: ControlHold(1, Sampling(0.01)),
@@ -229,7 +236,7 @@ def test_a_block_reports_the_same_each_time_and_all_of_it(name):
     assert (DERIVATIVE in told) == bool(context.num_continuous_states())
     updated = [HELD in update.computation.outputs for update in one.updates]
     assert all(updated)
-    assert bool(updated or one.guard) == bool(context.num_discrete_state_groups())
+    assert bool(updated) == bool(context.num_discrete_state_groups())
 
 
 @pytest.mark.parametrize("name", some(BLOCKS, of=3))

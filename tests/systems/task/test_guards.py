@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose
 from polishing import FAR, OVER, PERIOD, SPEED, run_on, started, task_loop
 
 from drake_dae import Approach, Condition, Dwell, Move, PointToPointReference, Press, Record
-from drake_dae.errors import SimulationError
 from drake_dae.simulation.records.phases import phase_spans
 
 PRESS = Press(10.0, over=0.05)
@@ -21,7 +20,7 @@ def ended(phases, distance, end):
     loop = task_loop(phases)
     context = started(loop, distance)
     run_on(loop, context, end)
-    return loop, context, loop.changes(context)
+    return loop, context, loop.changes(loop.record(context))
 
 
 @pytest.mark.slow
@@ -40,7 +39,7 @@ def test_a_condition_ends_a_move_at_constant_speed_when_it_must(key, condition, 
     _, _, (_, held) = ended([move], FAR, 0.32)
     assert time <= held.time + 1e-3 * PERIOD
     assert_allclose(held.time, time, atol=2.0 * PERIOD)
-    assert (held.phase, held.failed, held.chosen) == ("held", key == "guards", "hold")
+    assert (held.phase, held.failed) == ("held", key == "guards")
     assert f"{condition.limit:g}" in held.reason
 
 
@@ -49,8 +48,9 @@ def test_conditions_of_force_and_control_hold_at_their_value():
     """At rest u = H - J' F, by MultibodyPlant; fewer newtons take more of it."""
     most = Condition("force", above=15.0)
     pushed = Move({"wall.force": 20.0}, 1.0, over=0.5, guards=[most])
-    with pytest.raises(SimulationError, match=r"Move.*15 N, with 15"):
-        ended([PRESS, pushed], 0.0, 1.0)
+    held = ended([PRESS, pushed], 0.0, 1.0)[2][-1]
+    assert (held.phase, held.failed) == ("held", True)
+    assert 15.0 < held.force < 15.1
     loop = task_loop([PRESS])
     q = loop.diagram.GetOutputPort("state").Eval(started(loop, 0.0))[:2]
     found = numbers("two_link", q, np.zeros(2))
@@ -59,11 +59,10 @@ def test_conditions_of_force_and_control_hold_at_their_value():
     for name in ("", signals[int(np.argmax(controls))].name):
         most = Condition("control", above=float(controls.max()), name=name)
         eased = Move({"wall.force": 2.0}, 2.0, over=2.0, guards=[most], on_failure="leave")
-        loop, context, changes = ended([PRESS, eased], 0.0, 3.0)
+        loop, _, changes = ended([PRESS, eased], 0.0, 3.0)
         assert [change.phase for change in changes] == ["Press", "Move", "leave", "held"]
         # The wall comes back by 1e-5 m/N, which takes some of it.
         assert_allclose(changes[2].force, 5.0, atol=0.3)
-        assert changes[-1].time == pytest.approx(loop.record(context).time[-1], abs=1e-6)
         assert changes[-1].time < 3.0
         assert not changes[-1].in_contact
 
@@ -92,16 +91,18 @@ def test_a_phase_waits_for_its_signal(comes):
     loop = task_loop([Dwell(until=[ready], over=0.05, within=0.3), Approach(0.1, over=0.1)])
     context = started(loop)
     run_on(loop, context, 0.1)
-    assert len(loop.changes(context)) == 1
+    assert len(loop.changes(loop.record(context))) == 1
     if comes:
         loop.diagram.GetInputPort("signal_ready").FixValue(context, [1.0])
         run_on(loop, context, 0.2)
-        change = loop.changes(context)[1]
+        change = loop.changes(loop.record(context))[1]
         assert (change.phase, change.reason) == ("Approach", "after a signal ready above 0.5")
         assert_allclose(change.time, 0.1, atol=1e-2)
         return
-    with pytest.raises(SimulationError, match=r"Dwell.*0\.3 s.*ready"):
-        run_on(loop, context, 0.5)
+    run_on(loop, context, 0.5)
+    change = loop.changes(loop.record(context))[1]
+    assert (change.phase, change.failed) == ("held", True)
+    assert_allclose(change.time, 0.3, atol=2.0 * PERIOD)
 
 
 @pytest.mark.slow
@@ -119,8 +120,8 @@ def test_a_run_that_is_interrupted_goes_on_as_one_that_is_not(tmp_path):
     # A plant in steps makes the one at the cut again, so that it is not quite the same.
     assert_allclose(second["state"][-1], first["state"][-1], rtol=0, atol=1e-3)
     told = [
-        [(change.phase, change.time) for change in loop.changes(context)]
-        for loop, context in zip((whole, cut), contexts, strict=True)
+        [(change.phase, change.time) for change in loop.changes(record)]
+        for loop, record in ((whole, first), (cut, second))
     ]
     assert told[0] == told[1]
     second.save(tmp_path / "record.npz")

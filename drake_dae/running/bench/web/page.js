@@ -5,7 +5,7 @@ async function makeEngine() {
   let tick = 0;
 
   function sample() {
-    const desired = loop.outputs[data.desired], place = loop.outputs.phase?.[0];
+    const desired = loop.outputs[data.desired], place = loop.outputs.change?.[1];
     const shown = Array.from(loop.view("shown", 0, sizes.scene + sizes.coordinates));
     return {
       time: loop.time,

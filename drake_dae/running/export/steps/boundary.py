@@ -130,7 +130,7 @@ def loop_part(
     """
     program = program_of(loop)
     compiled, signals = program.compiled, program.signals
-    if not isinstance(loop, Diagram) and (further or compiled.watched):
+    if not isinstance(loop, Diagram) and further:
         ports = {name: loop.diagram.GetOutputPort(name) for name in (*loop.signals, *further)}
         compiled = compile_part(loop.diagram, {}, ports, context)
     _check_time(compiled, "the loop")
@@ -179,16 +179,11 @@ def _diagram_and_plant(loop: ClosedLoop | Diagram) -> tuple[Diagram, Plant]:
 
 
 def check_events(compiled: CompiledDiagram, what: str) -> None:
-    """Checks that a part has no events of contacts or phases, and not Drake's own contact.
+    """Checks that a part has not Drake's own contact.
 
     Raises:
         ModelError: The part has one of them.
     """
-    if compiled.watched:
-        raise ModelError(
-            f"{what} has phases of a task ('{compiled.watched[0].system.get_name()}'), which its "
-            "own samples end: no export of it as one system knows them, and a rollout does"
-        )
     if compiled.has_stepped:
         raise ModelError(
             f"{what} has Drake's own contact ('{compiled.stepped[1].system.get_name()}'), which no "

@@ -165,11 +165,6 @@ class RunStepper:
             self.state = self.projected(self.time, self.state)
         while self.event < problem.events.size and problem.events[self.event] <= self.time:
             due, noise = int(problem.due[self.event]), problem.noise[self.event]
-            if due & self.functions.watched_rates:
-                inputs = self.time, state_before, self.held, problem.parameters
-                if (self.functions.margins(*inputs) <= 0.0).any():
-                    self.state, self.next = state_before, self.time
-                    raise RunEnded(RunEnding.CHANGE)
             # Unrestricted updates see the state before the projection, which is one of them.
             for state, is_unrestricted in ((state_before, True), (self.state, False)):
                 inputs = self.time, state, self.held, problem.parameters
@@ -226,7 +221,7 @@ class RunStepper:
             self._compute()
         finally:
             self.rows.append(last)
-        return self.problem.whole(np.concatenate(self._computed))
+        return np.concatenate(self._computed)
 
     def _compute(self) -> None:
         """Computes rows of the record from all states in `rows`.

@@ -24,7 +24,6 @@ class DiagramFunctions:
 
     Attributes:
         program: The diagram.
-        watched_rates: As of `CompiledDiagram`.
     """
 
     def __init__(self, program: RolloutProgram) -> None:
@@ -41,8 +40,6 @@ class DiagramFunctions:
             if rate.stepped is None
         ]
         self._stages: dict[bytes, BufferedFunction] = {}
-        self._watch = BufferedFunction(compiled.watch) if compiled.watched else None
-        self.watched_rates = compiled.watched_rates
 
     @cached_property
     def moving(self) -> np.ndarray:
@@ -89,14 +86,6 @@ class DiagramFunctions:
         """Returns the state on N* after two Newton steps; None if these do not reach it."""
         projected, left = self._newton(time, state, held, parameters)
         return projected.copy() if left[0] <= REACHED else None
-
-    def margins(
-        self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
-    ) -> FloatArray:
-        """Evaluates the guards of a diagram that has some; infinite where they have no value."""
-        assert self._watch is not None
-        margins, valid = self._watch(time, state, held, parameters)
-        return margins.copy() if isfinite(valid[0]) else np.full_like(margins, np.inf)
 
     def update(
         self,

@@ -44,7 +44,7 @@ def _run_controlled(course: RunStepper, settings: Settings) -> None:
     rate: FloatArray | None = None
     course.write()
     while course.time < moments[-1]:
-        if settings.look(course.so_far, course.problem.context):
+        if settings.look(course.so_far):
             raise RunEnded(RunEnding.PAUSED)
         if course.update(is_on=rate is not None):
             rate = None
@@ -153,7 +153,7 @@ def _run_fixed(course: RunStepper, settings: Settings, tableau: Tableau) -> None
     times = course.problem.times
     course.write()
     for start, end, is_row in fixed_steps(course.problem, settings.longest):
-        if course.steps % LOOKED == 0 and settings.look(course.so_far, course.problem.context):
+        if course.steps % LOOKED == 0 and settings.look(course.so_far):
             raise RunEnded(RunEnding.PAUSED)
         course.update()
         rates = course.stages(end - start, course.accepted_rate())

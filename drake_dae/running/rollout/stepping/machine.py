@@ -113,9 +113,7 @@ def go_on(
     values += [problem.events.size, problem.events, problem.due, problem.noise, *tables]
     arguments = [_argument(value) for value in values]
     ending, budget = RunEnding.PAUSED, FIRST
-    while ending is RunEnding.PAUSED and not settings.look(
-        lambda: problem.whole(rows[: run_state.row]), problem.context
-    ):
+    while ending is RunEnding.PAUSED and not settings.look(lambda: rows[: run_state.row]):
         began = time.perf_counter()
         ending = RunEnding(step(ctypes.byref(run_state), *arguments, _argument(budget)))
         passed = time.perf_counter() - began
@@ -157,8 +155,6 @@ def _source(program: RolloutProgram) -> str:
         "WIDTH": program.width,
         "GIVEN": calls["given"].numel_out(0),
         "PROJECTS": int(compiled.projects),
-        "WATCHED": compiled.watch.numel_out(0) if compiled.watched else 0,
-        "WATCHED_RATES": compiled.watched_rates,
     }
     for name, function in calls.items():
         # At least as many as the initializers in stepper.c.
@@ -178,7 +174,6 @@ def _source(program: RolloutProgram) -> str:
             _updated(*item) for item in enumerate(compiled.rates) if item[1].stepped is None
         ),
         "sample": _sampled(len(compiled.rates) - 1) if compiled.has_stepped else "",
-        "watch": _WATCH if compiled.watched else "  (void)time, (void)x, (void)g;",
     }
     return Template(SOURCE.read_text(encoding="utf-8")).substitute(words)
 
@@ -217,16 +212,6 @@ __attribute__((visibility("default"))) int sample(
   return apply(time, x, held, &g, noise, due, unrestricted) ? DONE : INVALID;
 }}
 """
-
-
-_WATCH = """\
-  double margins[WATCHED], valid;
-  const double *arg[WATCH_ARG] = {&time, x, g->held, g->parameters, g->given};
-  double *res[WATCH_RES] = {margins, &valid};
-  set_time(time, g);
-  dae_watch(arg, res, 0, 0, 0);
-  for (i = 0; isfinite(valid) && i < WATCHED; i++) due |= margins[i] <= 0.0;"""
-"""The C that evaluates the guards."""
 
 
 def c_places(number: int, rate: UpdateRate) -> str:

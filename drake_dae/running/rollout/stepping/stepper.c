@@ -15,7 +15,7 @@ $constants
 static const double REACHED = 1e-8, NEAR = 1e-5;
 
 /* How a call ended; Python has the same list. */
-enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW, CHANGE };
+enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW };
 
 $run
 /* Constants of a step, and functions of the time alone. */
@@ -86,14 +86,6 @@ static int project(double time, double *x, Given *g) {
   return 0;
 }
 
-/* Evaluates the guards; returns whether a block has to react. */
-static int watch(double time, const double *x, Given *g) {
-  int i, due = 0;
-  (void)i;
-$watch
-  return due;
-}
-
 /* Makes the updates of one kind that are due, all at once; returns 0 if one has no value. */
 static int apply(double time, const double *x, double *held, Given *g, const double *noise,
                  long long due, int unrestricted) {
@@ -114,10 +106,6 @@ static int update(Run *run, double *x, double *held, Given *g, long long num_eve
     int now = run->event < num_events && events[run->event] <= run->time;
     const double *drawn = noise + run->event * NOISE;
     if (run->pending & UNRESTRICTED) {
-      if (now && due[run->event] & WATCHED_RATES && watch(run->time, x, g)) {
-        run->next = run->time;
-        return CHANGE;
-      }
       if (now && !apply(run->time, x, held, g, drawn, due[run->event], 1)) return INVALID;
       run->pending &= ~UNRESTRICTED;
     }

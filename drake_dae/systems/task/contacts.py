@@ -1,4 +1,4 @@
-"""A system with one contact open: its distances are outputs in place of its forces."""
+"""The contact of a task, and a system with it open: distances are outputs in place of forces."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,10 +13,7 @@ from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 
 FREE, CONTACT = 0, 1
-"""The indices of the two laws of a task, and the numbers of their modes."""
-
-LAWS = ("free", "contact")
-"""Their names."""
+"""The indices of the two laws of a task."""
 
 
 @dataclass(frozen=True)
@@ -42,19 +39,6 @@ class OpeningContact:
     def others(self) -> list[int]:
         """The places besides `main`: differences of forces, or further distances."""
         return [place for place in self.places if place != self.main]
-
-
-@dataclass(frozen=True, eq=False)
-class ContactLaws:
-    """The laws of a robot while its contact opens and closes.
-
-    Attributes:
-        contact: The contact.
-        laws: The law while it is open, and the law while it is closed.
-    """
-
-    contact: OpeningContact
-    laws: tuple[TrackingLaw, TrackingLaw]
 
 
 @checked(ModelError)
@@ -135,11 +119,8 @@ def _contact(system: DaeSystem, forces: Sequence[int]) -> OpeningContact:
     )
 
 
-def contact_laws(law: TrackingLaw, free_law: TrackingLaw) -> ContactLaws:
-    """The laws of a task with the contact that is closed in one and open in the other.
-
-    Args:
-        law, free_law: The law in contact and that of the free robot.
+def opening_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
+    """The contact that is closed in one law and open in the other.
 
     Raises:
         ModelError: The laws are not for one robot with and without the contact.
@@ -186,4 +167,4 @@ def contact_laws(law: TrackingLaw, free_law: TrackingLaw) -> ContactLaws:
                 f"'{free.output_signals[place].name}' must have degree 2 or more, as where forces "
                 "move it"
             )
-    return ContactLaws(contact, (free_law, law))
+    return contact
