@@ -109,8 +109,11 @@ def _rule(hint: Any) -> tuple[str, Callable[[Any], object]]:
     if get_origin(hint) is Literal:
         words = get_args(hint)
         return " or ".join(map(repr, words)), lambda v: isinstance(v, str) and v in words
-    is_protocol = getattr(hint, "_is_protocol", False) and not hint._is_runtime_protocol
-    if is_protocol or hint is Any or not inspect.isclass(hint):  # Any is a class, too.
+    if getattr(hint, "_is_protocol", False):
+        names = [name for kind in hint.__mro__ for name in vars(kind) if name[0] != "_"]
+        has = inspect.getattr_static  # It evaluates no property.
+        return f"a {hint.__name__}", lambda v: all(has(v, n, None) is not None for n in names)
+    if hint is Any or not inspect.isclass(hint):  # Any is a class, too.
         return "anything", lambda v: True
     return f"a {hint.__name__}", lambda v: isinstance(v, hint)
 

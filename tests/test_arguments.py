@@ -28,6 +28,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 import drake_dae as dd
 from drake_dae.analysis.report import Assumption
+from drake_dae.blocks.block import Block
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
@@ -123,6 +124,7 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     int: lambda: 1,
     str: lambda: "tool",
     ca.SX: lambda: ca.SX.sym("p", 3),
+    Block: lambda: loop().plant.block,
     Assumption: lambda: SAMPLES[dd.Analysis]().assumptions[0],
     Diagram: lambda: loop().diagram,
     dd.Analysis: analysis,

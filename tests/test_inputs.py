@@ -29,7 +29,6 @@ from drake_dae import (
     Torus,
     TrackingLaw,
     build_scenario,
-    compile_diagram,
     dynamic_extension,
     export_code,
     find_structure,
@@ -226,7 +225,6 @@ def test_a_context_of_another_loop_is_refused_in_a_sentence(tmp_path):
         lambda: loop.record(context),
         lambda: loop.set_state(context, arm("two_link").structure.states[0]),
         lambda: start_values(loop, context),
-        lambda: compile_diagram(loop.diagram).values(context),
         lambda: export_code(loop, context, "a", tmp_path),
         lambda: make_animation(loop, loop.record(loop.diagram.CreateDefaultContext()), context),
     ):

@@ -128,15 +128,7 @@ def analyze(
 
 
 def examine(system: DaeSystem, chosen: ExaminedStates | None = None) -> Analysis:
-    """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics.
-
-    Args:
-        system: The system (1)-(3).
-        chosen: The states to examine; those that `analyze` draws by default if None.
-
-    Raises:
-        InconsistentStateError, ModelError: As for `analyze`.
-    """
+    """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics."""
     if chosen is None:
         chosen = ExaminedStates.drawn(system, None, COUNT, np.random.default_rng(SEED))
     given_states = chosen.guesses[: chosen.num_given]
@@ -183,15 +175,7 @@ def along(
     period: float | None,
     exogenous: Sequence[Reference],
 ) -> Analysis:
-    """Adds what `analyze` says along a reference, where there is a structure.
-
-    Args:
-        analysis: The result of `examine`.
-        reference, times, start, period, exogenous: As for `analyze`.
-
-    Raises:
-        ModelError: As for `analyze`.
-    """
+    """Adds what `analyze` says along a reference, where there is a structure."""
     system, states, structure = analysis.system, analysis.states, analysis.structure
     if structure is None:
         return analysis

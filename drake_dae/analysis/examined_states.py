@@ -22,14 +22,7 @@ _NEIGHBOURS = 5
 
 @dataclass(frozen=True, eq=False)
 class ExaminedStates:
-    """The states that an analysis starts from.
-
-    Attributes:
-        guesses: States near which consistent ones are sought, shape (count, n).
-        num_given: The number of states of the user, which come first; 0 if all are drawn.
-        bounds: The requested region; empty if there is none.
-        region: The requested region as a box; None without one.
-    """
+    """The states that an analysis starts from."""
 
     guesses: FloatArray
     num_given: int
@@ -40,12 +33,7 @@ class ExaminedStates:
     def drawn(
         cls, system: DaeSystem, bounds: Bounds | None, count: int, random: np.random.Generator
     ) -> "ExaminedStates":
-        """Draws random states in a region or around the nominal state, which comes first.
-
-        Raises:
-            ModelError: A name is not that of a state, or an interval is not two finite ordered
-                numbers.
-        """
+        """Draws random states in a region or around the nominal state, which comes first."""
         nominal = system.nominal_state
         drawn = nominal + system.nominal_spread * random.standard_normal((count, nominal.size))
         if bounds is None:
@@ -61,11 +49,7 @@ class ExaminedStates:
     def given(
         cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
     ) -> "ExaminedStates":
-        """Returns the states of the user and a few close to the first one.
-
-        Raises:
-            ModelError: The states are not finite numbers of shape (k, n).
-        """
+        """Returns the states of the user and a few close to the first one."""
         rows = numbers(f"{system.name}: states", states)
         shape = (len(rows) if rows.ndim else 0, system.num_states)
         if rows.shape != shape or not rows.size or not np.all(np.isfinite(rows)):
@@ -77,12 +61,7 @@ class ExaminedStates:
         return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows), {}, None)
 
     def describe(self, count: int, noun: str) -> str:
-        """Returns a text that says which states were examined.
-
-        Args:
-            count: The number of drawn states that are inside the domain and on N*.
-            noun: The noun for the examined states.
-        """
+        """Returns a text that says which states were examined."""
         if self.num_given:
             return f"{count_of(self.num_given, noun)} as given"
         region = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
@@ -96,17 +75,7 @@ class ExaminedStates:
 
 
 def check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:
-    """Checks that the user's states are consistent and inside the domain of the system.
-
-    Args:
-        manifold: N*.
-        states: The given states, shape (k, n).
-        projected: Those of them that are consistent and inside the domain, shape (l, n).
-
-    Raises:
-        InconsistentStateError: A state is not consistent; the message says which, and why.
-        ModelError: A state is outside the domain.
-    """
+    """Checks that the user's states are consistent and inside the domain of the system."""
     name = manifold.system.name
     for number, state in enumerate(states):
         if not manifold.is_consistent(state):

@@ -17,20 +17,7 @@ def check_reference(
     reference: Callable[[float], FloatArray],
     times: ArrayLike,
 ) -> None:
-    """Checks that each entry of a reference is the derivative of the entry before it.
-
-    They are compared with central differences of two step sizes. Where these disagree, as at a kink
-    of the highest derivative, nothing is checked.
-
-    Args:
-        system: The system (1)-(3).
-        layout: The layout of R(t).
-        reference: The function t -> R(t).
-        times: Times in s, shape (k,), between the first and last of which it is checked.
-
-    Raises:
-        ModelError: The size is wrong, or an entry is not the derivative of the one before.
-    """
+    """Checks that each entry of a reference is the derivative of the entry before it."""
     grid = numbers(f"{system.name}: times", times).reshape(-1)
 
     def value(time: float) -> FloatArray:

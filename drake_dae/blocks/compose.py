@@ -16,6 +16,7 @@ from pydrake.systems.framework import (
     System,
 )
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import NOTHING, Block, Held, Projection, Requirement, stacked
 from drake_dae.blocks.primitives import symbolic_block
@@ -98,6 +99,7 @@ class Composed:
         return {*self.states, *(system for system, _ in self.held)}
 
 
+@checked(ModelError)
 def compile_diagram(
     diagram: Diagram,
     outputs: Mapping[str, OutputPort] | None = None,

@@ -23,14 +23,7 @@ from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, FailureKind
 def cannot_go_on(
     time: float, state: FloatArray, reason: str, remedy: str = "choose other integrator settings"
 ) -> SimulationError:
-    """The exception of a run that ends for a reason of the integrator, or of Drake.
-
-    Args:
-        time: The time, in s.
-        state: The state, shape (n,).
-        reason: The reason, in words.
-        remedy: What to do if neither the loop nor its reference is the cause.
-    """
+    """The exception of a run that ends for a reason of the integrator, or of Drake."""
     where = f"at t = {time:.6g} s, state {show_state(state)}"
     text = f"the simulation cannot go on {where}: {reason.rstrip('.')}"
     return SimulationError(f"{text}. If nothing else is wrong, {remedy}", time, state)
@@ -39,14 +32,7 @@ def cannot_go_on(
 def simulation_error(
     failure: Failure, time: float, state: FloatArray, signals: Mapping[str, Sequence[Signal]]
 ) -> SimulationError:
-    """The exception for a function without a valid value.
-
-    Args:
-        failure: The failure of the function.
-        time: The time, in s.
-        state: The state, shape (n,).
-        signals: Name of an input -> names of its entries; by default the name of the input.
-    """
+    """The exception for a function without a valid value."""
     where = f"at t = {time:.6g} s, state {show_state(state)}"
     bad = ", ".join(
         signals[name][i].name if name in signals else name
@@ -89,14 +75,7 @@ def simulation_error(
 def no_step_leads_on(
     name: str, time: float, state: FloatArray, reason: SimulationError
 ) -> SimulationError:
-    """The exception if each trial step failed; it has the class of the reason.
-
-    Args:
-        name: The name of the block.
-        time: The time of the last accepted state, in s.
-        state: That state.
-        reason: The error of the earliest trial.
-    """
+    """The exception if each trial step failed; it has the class of the reason."""
     return reason.retold(
         f"{name}: no step leads on from t = {time:.6g} s{_at(state)} since each that was tried "
         f"failed, however short: {reason}",
@@ -108,16 +87,7 @@ def no_step_leads_on(
 def spoilt_step(
     name: str, start: float, end: float, state: FloatArray, reason: SimulationError | None
 ) -> SimulationError:
-    """The exception if an integrator without error control accepted a trial that failed.
-
-    It has the class of the reason.
-
-    Args:
-        name: The name of the block.
-        start, end: The times of the step, in s.
-        state: The state at its start.
-        reason: The error of the earliest trial; None if none failed.
-    """
+    """The exception if an integrator without error control accepted a trial that failed."""
     text = (
         f"{name}: the step from t = {start:.6g} s{_at(state)} to t = {end:.6g} s led to a state "
         f"that is not finite{'' if reason is None else f': {reason}'}. Take smaller steps, or an "
@@ -131,14 +101,7 @@ def spoilt_step(
 def endless_steps(
     name: str, steps: int, start: float, end: float, state: FloatArray
 ) -> SimulationError:
-    """The exception if many steps together advance the time very little.
-
-    Args:
-        name: The name of the block.
-        steps: The number of steps.
-        start, end: The times before and after them, in s.
-        state: The state after them.
-    """
+    """The exception if many steps together advance the time very little."""
     return SimulationError(
         f"{name}: the last {steps} steps led from t = {start:.12g} s only to {end:.12g} s"
         f"{_at(state)} where it grows without bound, or jumps. A fixed step passes a jump",
@@ -148,13 +111,7 @@ def endless_steps(
 
 
 def off_manifold(time: float, state: FloatArray, reason: InconsistentStateError) -> SimulationError:
-    """The exception if a state cannot be projected onto N*.
-
-    Args:
-        time: The time, in s.
-        state: The state, shape (n,).
-        reason: The error of the projection.
-    """
+    """The exception if a state cannot be projected onto N*."""
     return SimulationError(
         f"the state left the constraint too far at t = {time:.6g} s, state {show_state(state)}: "
         f"{reason}. Take smaller steps or a better accuracy",
@@ -168,13 +125,7 @@ def _at(state: FloatArray) -> str:
 
 
 def off_start(name: str, manifold: Manifold, residual: FloatArray) -> InconsistentStateError:
-    """The exception for a run that starts off N*.
-
-    Args:
-        name: The system's name.
-        manifold: N*.
-        residual: The residual of its equations, shape (k,).
-    """
+    """The exception for a run that starts off N*."""
     table = ", ".join(
         f"{signal.name} = {value:.3g} {signal.unit}"
         for signal, value in zip(manifold.residual_signals, residual, strict=True)
@@ -190,14 +141,7 @@ def off_start(name: str, manifold: Manifold, residual: FloatArray) -> Inconsiste
 def assembled_otherwise(
     name: str, left_out: Manifold, state: FloatArray, residual: FloatArray
 ) -> InconsistentStateError:
-    """The exception for a start that violates redundant constraints that were left out.
-
-    Args:
-        name: The system's name.
-        left_out: The manifold of these constraints.
-        state: The start, shape (n,).
-        residual: The residual of their equations, shape (k,).
-    """
+    """The exception for a start that violates redundant constraints that were left out."""
     worst = int(np.argmax(np.abs(residual)))
     signal = left_out.residual_signals[worst]
     return InconsistentStateError(
@@ -212,14 +156,7 @@ def assembled_otherwise(
 def singular_configuration(
     name: str, time: float, state: FloatArray, constraints: tuple[str, ...]
 ) -> SingularityError:
-    """The exception of a run that comes to a singular configuration of its constraints.
-
-    Args:
-        name: The name of the system.
-        time: The time, in s.
-        state: The state, shape (n,).
-        constraints: The constraints whose gradients become dependent.
-    """
+    """The exception of a run that comes to a singular configuration of its constraints."""
     error = SingularityError(
         f"{name}: the gradients of {', '.join(constraints)} become dependent at t = {time:.6g} s, "
         f"state {show_state(state)}: A(x) of Assumption (2) is singular in this configuration. "
@@ -238,15 +175,7 @@ def jammed_contact(
     parameters: FloatArray,
     force: FloatArray,
 ) -> PainleveError | None:
-    """The error of a Painleve paradox with its outcome; None if there is none.
-
-    Args:
-        structure: The structure of the system.
-        error: The error of a singular A(x), with time and state.
-        control: u, shape (p,).
-        parameters: Values of all parameters.
-        force: v there, shape (m,).
-    """
+    """The error of a Painleve paradox with its outcome; None if there is none."""
     dae, elimination = structure.system, structure.elimination
     frictional, matrix = dae.frictional_contacts, elimination.constraint_matrix
     outputs = {

@@ -25,6 +25,7 @@ from pydrake.systems.framework import (
     SystemScalarConverter,
 )
 
+from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed
 from drake_dae.blocks import computations
 from drake_dae.blocks.as_computations import computations_of
@@ -44,6 +45,7 @@ Evaluate = Callable[[Context], Any]
 _CHANGED, _UNCHANGED = EventStatus.Succeeded(), EventStatus.DidNothing()
 
 
+@checked(ModelError)
 class TracedSystem(LeafSystem):
     """A `Block` as a LeafSystem: its ports, states, parameters and updates.
 
@@ -176,7 +178,7 @@ class TracedSystem(LeafSystem):
         state.get_mutable_continuous_state().SetFromVector(projected)
         return _CHANGED
 
-    def traced(self) -> computations.Block:
+    def traced(self) -> computations.Computations:
         """The computations of the block."""
         return computations_of(self, self.block)
 

@@ -136,4 +136,5 @@ def roll_scenario(
         look=watched,
     )
     see(rollout.record.after(seen), is_last=rollout.failure is None)
-    return diagnosed(loop, rollout if failure is None else rollout.ended(failure))
+    rollout = rollout if failure is None else rollout.ended(failure)
+    return diagnosed(loop, rollout, scenario.integrator)

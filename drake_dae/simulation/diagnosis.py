@@ -129,7 +129,7 @@ def explained(
         told = f"{told}. There the drives cannot steer {', '.join(outputs)}{held}"
     told = (
         f"{told}. Keep the reference away from there, or choose another posture or other outputs. "
-        f"The run ended at t = {error.time:.6g} s"
+        f"The run ended at t = {error.time:.6g} s, state {show_state(error.state)}"
     )
     if not outputs and not (ending is not None and ending.matrix):
         return SimulationError(told, error.time, error.state)
@@ -254,11 +254,10 @@ class RunDiagnosis:
             found = self._explained(told)
             if found is not told:
                 return found
-        causes = [*self._cut_off(context), *self._too_long(context)]
-        if not causes:
-            return told
-        text = f"{causes[0]}. The run ended at t = {told.time:.6g} s"
-        return told.retold(text, told.time, told.state)
+        if names := self._cut_off(context):
+            text = f"{', '.join(names)} cut off at their limits: slower references need less"
+            return told.retold(f"{text}. {told}", told.time, told.state)
+        return too_long(told, self._diagram, context, self._config, (self._time, self._start))
 
     def _explained(self, error: SimulationError) -> SimulationError:
         assert self._plant is not None
@@ -277,7 +276,7 @@ class RunDiagnosis:
         ]
 
     def _cut_off(self, context: Context) -> Sequence[str]:
-        """That drives are at their limits."""
+        """The controls beyond the limits of the drives."""
         if self._limits is None or self._plant is None:
             return []
         try:
@@ -287,8 +286,7 @@ class RunDiagnosis:
         except (DrakeDaeError, RuntimeError):
             return []
         signals = self._plant.dae.control_signals
-        names = [signals[i].name for i in np.flatnonzero(excess)]
-        return [f"{', '.join(names)} cut off at their limits"] if names else []
+        return [signals[i].name for i in np.flatnonzero(excess)]
 
     def look(self, context: Context, steps: int) -> None:
         """Looks at the pace of a run under error control, from time to time.
@@ -334,20 +332,38 @@ class RunDiagnosis:
         if (found := self._explained(short)) is not short:
             raise found
 
-    def _too_long(self, context: Context) -> Sequence[str]:
-        """That fixed steps are too long for the fastest rate of the loop, at its start."""
-        config, step = self._config, self._config.max_step_size
-        is_explicit = not config.integration_scheme.startswith(IMPLICIT)
-        if config.use_error_control or not is_explicit or not self._start.size:
-            return []
-        rate = fastest_rate(self._diagram, context, self._time, self._start)
-        if not rate * step > LONGEST:
-            return []
-        return [
-            f"the fixed steps of {step:.3g} s are too long for the fastest rate of the loop, "
-            f"{rate:.3g} 1/s, such as that of elastic joints: take steps of at most "
-            f"{LONGEST / rate:.2g} s, or error control"
-        ]
+
+def too_long(
+    error: SimulationError,
+    diagram: System,
+    context: Context,
+    config: SimulatorConfig,
+    start: tuple[float, FloatArray],
+) -> SimulationError:
+    """The error of a run, with fixed steps that are too long for the fastest rate at its start."""
+    step, scheme = config.max_step_size, config.integration_scheme
+    if config.use_error_control or scheme.startswith(IMPLICIT) or not start[1].size:
+        return error
+    begun, rates = context.Clone(), [fastest_rate(diagram, context, *start)]
+    begun.SetTimeAndContinuousState(*start)
+    # A law that cancels springs takes their rates out of the loop, and not out of its steps.
+    for plant in (block for block in blocks_of(diagram) if isinstance(block, Plant)):
+        alone = plant.CreateDefaultContext()
+        for i in range(plant.num_input_ports()):
+            if size := plant.get_input_port(i).size():
+                plant.get_input_port(i).FixValue(alone, np.zeros(size))
+        state = plant.state(plant.GetMyContextFromRoot(begun))
+        if alone.num_continuous_states() == state.size:
+            rates.append(fastest_rate(plant, alone, start[0], state))
+    rate = float(np.max(np.nan_to_num(rates)))
+    if not rate * step > LONGEST:
+        return error
+    text = (
+        f"the fixed steps of {step:.3g} s are too long for the fastest rate of the loop, "
+        f"{rate:.3g} 1/s, such as that of elastic joints: take steps of at most "
+        f"{LONGEST / rate:.2g} s, or error control"
+    )
+    return error.retold(f"{text}. {error}", error.time, error.state)
 
 
 def fastest_rate(diagram: System, context: Context, time: float, state: FloatArray) -> float:

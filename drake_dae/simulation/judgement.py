@@ -159,18 +159,18 @@ def judge(
         found.append(RunFinding(FindingKind.ENDED, text, Outcome.BAD, time=end))
     # Of a compliant contact the whole force is recorded, which cannot pull.
     kinds = {*LimitKind} - ({LimitKind.FORCE} if "contact_force" in record else set())
-    for excess in (r.excess for r in ranges if r.kind in kinds):
-        if excess is not None:
-            numbers = excess.signal, excess.value, excess.limit, excess.time
-            found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *numbers))
+    beyond = [r.excess for r in ranges if r.kind in kinds and r.excess is not None]
+    for excess in sorted(beyond, key=lambda e: -abs(e.value / e.limit) if e.limit else -np.inf):
+        numbers = excess.signal, excess.value, excess.limit, excess.time
+        found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *numbers))
     found += more
     if changes:
         found += _of_task(changes)
-    else:
+    elif not ended:  # Else it has not had the time.
         pushing = {r.signal.name for r in ranges if r.kind is LimitKind.FORCE and r.low == 0.0}
         found += _of_contacts(record, pushing)
         found += _of_outputs(record, predicted, outputs, reasons)
-        if not ended and outputs:
+        if outputs:
             found += _of_prediction(record, predicted, accuracy, reasons)
     order = (Outcome.BAD, Outcome.UNDECIDED, None)
     first = (FindingKind.TASK, FindingKind.REFERENCE)  # Of the remarks.

@@ -26,6 +26,12 @@ from drake_dae.systems.control.contract import PhaseChange
 WIDTH = 100
 """The width of a paragraph, in characters."""
 
+MOST = 6
+"""The most findings that the text tells beside the first."""
+
+EXPECTED = (FindingKind.PREDICTION,)
+"""What the table of outputs tells, unless it decides."""
+
 UNEXCITED = 0.5
 """A parameter is not excited if its deviation stays above this share of that of its bounds."""
 
@@ -103,9 +109,10 @@ class RunSummary:
     def text(self) -> str:
         """The summary in lines of at most 100 characters; the first says good, bad, undecided."""
         head = [fill(str(self.judgement), WIDTH)]
-        for finding in self.judgement.findings[1:]:
-            if finding.kind is not FindingKind.PREDICTION or finding.decides:
-                head.append(fill(f"- {finding.text}", WIDTH, subsequent_indent="  "))
+        told = [f for f in self.judgement.findings[1:] if f.kind not in EXPECTED or f.decides]
+        for finding in told[:MOST]:
+            head.append(fill(f"- {finding.text}", WIDTH, subsequent_indent="  "))
+        head += [f"- {len(told) - MOST} more, which --json names"] * (len(told) > MOST)
         phases = [fill(str(change), WIDTH, subsequent_indent="  ") for change in self.changes]
         parts = [head, self._outputs(), self._forces(), phases, [*self._ending()]]
         return "\n\n".join("\n".join(part) for part in parts if part)

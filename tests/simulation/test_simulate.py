@@ -324,9 +324,8 @@ def test_a_projection_that_fails_gets_time_and_state():
     config = SimulatorConfig(
         integration_scheme="explicit_euler", max_step_size=1.0, use_error_control=False
     )
-    with pytest.raises(SimulationError, match=r"steps of 1 s .* 50 1/s") as caught:
+    with pytest.raises(SimulationError, match=r"steps of 1 s .* 50 1/s.*t = 1 s, .*y0") as caught:
         simulate(diagram, context, 3.0, config)
-    assert "y0" in str(caught.value.__cause__)
     assert caught.value.time == 1.0
     # Newton's law with v = 0: a straight line.
     np.testing.assert_allclose(caught.value.state[:2], [1.0, 50.0], rtol=1e-12)

@@ -101,7 +101,9 @@ def functions_of(name: str, compiled: str) -> dict[tuple, TracedFunction]:
 
 
 # The dynamics of walls are Drake's, or those of modes.
-SLOW = some(each_scenario(lambda name: name.startswith(IN_CONTACT)), of=4)
+SLOW = some(
+    each_scenario(lambda name: name.startswith(IN_CONTACT)), of=4, dear=["seven_joint_moving_plate"]
+)
 
 
 OPTIMIZED = ("two_link_wall", "two_link_motors", "seven_joint_wall", "cart_wall")

@@ -26,7 +26,7 @@ from drake_dae.running.rollout.program import MAKING, RolloutProgram, program_of
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
-from drake_dae.simulation.diagnosis import explained
+from drake_dae.simulation.diagnosis import explained, too_long
 from drake_dae.simulation.records.record import (
     Record,
     RecordAfter,
@@ -129,19 +129,24 @@ def rollout(
     found = run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
     if not isinstance(loop, ClosedLoop) or sum(r.failure is not None for r in found) > DIAGNOSED:
         return found
-    return [diagnosed(loop, one) for one in found]
+    return [diagnosed(loop, one, config) for one in found]
 
 
-def diagnosed(loop: ClosedLoop, rollout: Rollout) -> Rollout:
-    """A rollout whose failure says its cause, if that is a singular state or the reference."""
+def diagnosed(loop: ClosedLoop, rollout: Rollout, config: SimulatorConfig | None = None) -> Rollout:
+    """A rollout whose failure says its cause, as that of a simulation does."""
     if rollout.failure is None or not rollout.record.time.size:
         return rollout
     reference = None if loop.generator is None else loop.generator.reference
     start = float(rollout.record.time[0]), rollout.record["state"][0]
     structure = loop.controller.law.structure
-    return replace(
-        rollout, failure=explained(rollout.failure, loop.plant, structure, reference, start)
-    )
+    failure = explained(rollout.failure, loop.plant, structure, reference, start)
+    if failure is rollout.failure:
+        context = loop.diagram.CreateDefaultContext()
+        loop.plant.set_state(loop.plant.GetMyMutableContextFromRoot(context), start[1])
+        state = context.get_continuous_state_vector().CopyToVector()
+        config = config or SimulatorConfig()
+        failure = too_long(failure, loop.diagram, context, config, (start[0], state))
+    return replace(rollout, failure=failure)
 
 
 def run_loop(

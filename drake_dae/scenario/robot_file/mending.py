@@ -330,8 +330,8 @@ class Mender:
             owner[index : index + 1] = list(included)
 
     def _mend_mjcf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
-        if not self.has_geometry:
-            mjcf.remove_geometry(root)
+        if not (self.has_geometry and self.drawn):
+            mjcf.remove_geometry(root, collides=not self.has_geometry)
         refused: dict[str, str] = {}
         used = mjcf.colliding_meshes(root) if self.has_geometry else set[str]()
         for mesh, path in mjcf.mesh_files(root, file):

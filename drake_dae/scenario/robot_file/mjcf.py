@@ -39,7 +39,7 @@ def prepare(root: Element, file: Path) -> None:
             motor.tag = "motor"
             motor.attrib.pop("ctrlrange", None)
             motor.attrib.pop("ctrllimited", None)
-        gear = abs(number_in(motor.get("gear", "1").split()[0]) or 1.0)
+        gear = abs(number_in([*motor.get("gear", "").split(), "1"][0]) or 1.0)
         for key in ("ctrlrange", "forcerange"):
             bounds = [number_in(word) for word in motor.get(key, "").split()]
             if gear != 1.0 and bounds and None not in bounds:
@@ -94,14 +94,15 @@ def _apply_defaults(root: Element) -> None:
     apply(root, "main")
 
 
-def remove_geometry(root: Element) -> None:
-    """Removes the geometry from which no mass is computed, and meshes that nothing names."""
+def remove_geometry(root: Element, collides: bool) -> None:
+    """Removes geometry from which no mass is computed: what is only drawn, or also collisions."""
     always = _compiler(root).get("inertiafromgeom") == "true"
     for body in [*root.iter("body"), *root.iter("worldbody")]:
         if body.tag == "worldbody" or (body.find("inertial") is not None and not always):
             for geom in body.findall("geom"):
-                body.remove(geom)
-    for contact in root.findall("contact"):
+                if collides or not _collides(geom):
+                    body.remove(geom)
+    for contact in root.findall("contact") if collides else ():
         root.remove(contact)
     named = {geom.get("mesh", "") for geom in root.iter("geom")}
     for asset in root.iterfind("asset"):

@@ -84,7 +84,7 @@ class RobotFiles:
             return file.resolve().parent / name
         if scheme == "file":
             return Path(unquote(rest))
-        if scheme not in ("package", "model"):
+        if scheme not in ("package", "model") or package in self.missing:
             return None
         if not self.packages.Contains(package):
             folder = self._folder_of(package, file)
