@@ -12,14 +12,14 @@ from drake_dae.blocks.computations import (
     PARAMETERS,
     STATE,
     Computation,
+    Computations,
     Update,
 )
 from drake_dae.blocks.computations import TIME as TIME_SOURCE
-from drake_dae.blocks.computations import Block as Computed
 from drake_dae.blocks.computations import Projection as Projected
 
 
-def computations_of(system: System, block: Block) -> Computed:
+def computations_of(system: System, block: Block) -> Computations:
     """The computations of a block: one for all outputs of the same sources."""
     held = stacked([each.symbol for each in block.held.values()])
     columns = {
@@ -54,7 +54,7 @@ def computations_of(system: System, block: Block) -> Computed:
     if block.projection is not None:
         assert block.scale is not None
         projection = Projected(block.projection.newton, block.scale, block.projection.project)
-    return Computed(
+    return Computations(
         system,
         tuple(computed(" and ".join(values), values) for values in grouped.values()),
         tuple(updates),

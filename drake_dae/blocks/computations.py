@@ -124,7 +124,7 @@ class DrakeStepped:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class Computations:
     """The computations of one system of a diagram.
 
     Attributes:
@@ -140,7 +140,6 @@ class Block:
         unwired: Name of an input port -> its value if it has neither a wire nor a fixed value.
         moving: The indices of its parameters that come through an input port "exogenous".
         stepped: The part that Drake steps; None if all of it is traced.
-        draws: Whether its update uses new random numbers.
         model: The owner of its first parameters, such as a DaeSystem; None if no other block shares
             it.
         under: For a controller: a computation of this block's sources with the same values as the
@@ -160,7 +159,6 @@ class Block:
     unwired: Mapping[str, Computation] = field(default_factory=dict)
     moving: tuple[int, ...] = ()
     stepped: DrakeStepped | None = None
-    draws: bool = False
     model: object = None
     under: Callable[[], Computation | None] | None = None
     signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
@@ -184,8 +182,8 @@ class Traced(Protocol):
 
     Rules, which one test suite checks for each such block:
 
-    1. `traced()` returns the same `Block` at each call, without a context: only state, discrete
-       state, numeric parameters and inputs differ from run to run.
+    1. `traced()` returns the same `Computations` at each call, without a context: only state,
+       discrete state, numeric parameters and inputs differ from run to run.
     2. The output of a computation that is named like an output port has the value of that port in
        any context, at the time, states, parameters and inputs of that context.
     3. DERIVATIVE is the result of `CalcTimeDerivatives`; it is an output if there is a continuous
@@ -198,5 +196,5 @@ class Traced(Protocol):
        ModelError with the reason, in one sentence.
     """
 
-    def traced(self) -> Block:
+    def traced(self) -> Computations:
         """The computations of the block."""

@@ -178,7 +178,7 @@ class TracedSystem(LeafSystem):
         state.get_mutable_continuous_state().SetFromVector(projected)
         return _CHANGED
 
-    def traced(self) -> computations.Block:
+    def traced(self) -> computations.Computations:
         """The computations of the block."""
         return computations_of(self, self.block)
 

@@ -15,8 +15,8 @@ from drake_dae.blocks.computations import (
     NOISE,
     PARAMETERS,
     STATE,
-    Block,
     Computation,
+    Computations,
 )
 from drake_dae.compiler.compiled import ARGUMENTS, CompiledDiagram
 from drake_dae.compiler.rates import ColumnPlace, UpdateRate, appended, dense_function
@@ -87,7 +87,7 @@ def with_twins(compiled: CompiledDiagram) -> CompiledDiagram:
     The functions keep their arguments and ignore the parameters of the plants, see
     `CompiledDiagram.twins`. They need fewer operations: expressions that plant and law share are
     computed once, and the plant's derivative follows from the law's intermediate results where
-    `Block.under` gives it. Returns the diagram itself if it has no such plants.
+    `Computations.under` gives it. Returns the diagram itself if it has no such plants.
     """
     if not compiled.twins:
         return compiled
@@ -185,7 +185,7 @@ def _trace_dependencies(expressions: Expressions, outputs: Sequence[Port]) -> No
                 expressions.call(block, block.initial)
 
 
-def _check_stepped(blocks: Mapping[System, Block], states: Sequence[ColumnPlace]) -> None:
+def _check_stepped(blocks: Mapping[System, Computations], states: Sequence[ColumnPlace]) -> None:
     """Raises if a block that Drake steps is combined with a block that is not sampled."""
     stepped = [block.system.get_name() for block in blocks.values() if block.stepped is not None]
     if not stepped:
@@ -201,7 +201,7 @@ def _check_stepped(blocks: Mapping[System, Block], states: Sequence[ColumnPlace]
 
 
 def _stacked(
-    expressions: Expressions, blocks: Mapping[System, Block], name: str
+    expressions: Expressions, blocks: Mapping[System, Computations], name: str
 ) -> tuple[ca.SX, list[ColumnPlace]]:
     """The symbols of all blocks stacked in one column, and the slice of each block."""
     column, places = ca.SX(0, 1), []
@@ -215,7 +215,7 @@ def _stacked(
 
 def _rates(
     expressions: Expressions,
-    blocks: Mapping[System, Block],
+    blocks: Mapping[System, Computations],
     held: Sequence[ColumnPlace],
     arguments: Sequence[ca.SX],
 ) -> list[tuple[UpdateRate, tuple[ca.SX, ca.SX]]]:
@@ -224,17 +224,17 @@ def _rates(
     The update of a block that Drake steps is the last one.
     """
     parts = {system: range(part.start, part.stop) for system, part in held}
-    groups: dict[tuple[float, float, bool], list[tuple[Block, Computation]]] = {}
+    groups: dict[tuple[float, float, bool], list[tuple[Computations, Computation]]] = {}
     for block in blocks.values():
         for update in block.updates:
             key = update.period, update.offset, update.is_unrestricted
             groups.setdefault(key, []).append((block, update.computation))
 
-    def next_held(updates: Sequence[tuple[Block, Computation]]) -> list[ca.SX]:
+    def next_held(updates: Sequence[tuple[Computations, Computation]]) -> list[ca.SX]:
         calls = [expressions.call(*update) for update in updates]
         return [call.results[call.computation.outputs.index(HELD)] for call in calls]
 
-    def stepped_input(block: Block, port: str) -> list[ca.SX]:
+    def stepped_input(block: Computations, port: str) -> list[ca.SX]:
         return [expressions.source(block, port)]
 
     rates = []

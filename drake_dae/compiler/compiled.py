@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import HELD, Block, Update
+from drake_dae.blocks.computations import HELD, Computations, Update
 from drake_dae.blocks.traced_system import context_in
 from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
@@ -49,7 +49,7 @@ class CompiledDiagram:
     inputs: tuple[tuple[str, slice], ...]
     noise: tuple[ColumnPlace, ...]
     rates: tuple[UpdateRate, ...]
-    blocks: Mapping[System, Block]
+    blocks: Mapping[System, Computations]
     _expressions: Expressions = field(repr=False)
     _columns: Mapping[str, ca.SX] = field(repr=False)
     _values: Mapping[str, Sequence[ca.SX]] = field(repr=False)
@@ -147,7 +147,7 @@ class CompiledDiagram:
     def initialized(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """The discrete state at the start of a run: NaN entries are replaced by `Block.initial`."""
+        """The discrete state at the start of a run: NaN entries are those of `initial`."""
         start = held.copy()
         for part, initial in self._initial:
             if np.isnan(held[part]).any():
@@ -287,7 +287,7 @@ class CompiledDiagram:
         return bool(self.rates) and self.rates[-1].stepped is not None
 
     @property
-    def stepped(self) -> tuple[UpdateRate, Block]:
+    def stepped(self) -> tuple[UpdateRate, Computations]:
         """The update and the block that Drake steps; requires `has_stepped`."""
         rate = self.rates[-1]
         assert rate.stepped is not None

@@ -18,8 +18,8 @@ from drake_dae.blocks.computations import (
     PARAMETERS,
     STATE,
     TIME,
-    Block,
     Computation,
+    Computations,
     Update,
     not_traced,
 )
@@ -28,7 +28,7 @@ from drake_dae.errors import ModelError
 from drake_dae.symbolic import to_casadi
 
 
-def primitive(system: System) -> Block:
+def primitive(system: System) -> Computations:
     """Traces a system of Drake, or a user's LeafSystem, by converting it to symbolic expressions.
 
     Args:
@@ -59,7 +59,7 @@ def primitive(system: System) -> Block:
         ) from None
 
 
-def _random_source(source: RandomSource) -> Block:
+def _random_source(source: RandomSource) -> Computations:
     """A block that draws new random numbers at each multiple of its period and holds them."""
     size = source.get_output_port().size()
     held, noise = ca.SX.sym("held", size), ca.SX.sym("noise", size)
@@ -67,7 +67,7 @@ def _random_source(source: RandomSource) -> Block:
         ca.Function("output", [held], [held]), (HELD,), (source.get_output_port().get_name(),)
     )
     draw = Computation(ca.Function("draw", [noise], [noise]), (NOISE,), (HELD,))
-    return Block(source, (output,), (Update(draw, _period(source), 0.0, True),), draws=True)
+    return Computations(source, (output,), (Update(draw, _period(source), 0.0, True),))
 
 
 def _period(source: RandomSource) -> float:
@@ -129,7 +129,7 @@ class _Converted:
                 converted.get_input_port(index).FixValue(context, variables)
         self._has_state, self._has_held = bool(sizes[STATE][0]), bool(sum(sizes[HELD]))
 
-    def block(self) -> Block:
+    def block(self) -> Computations:
         """The system as a traced block."""
         system, converted, context = self._system, self._converted, self._context
         computations = []
@@ -155,7 +155,7 @@ class _Converted:
             )
             update = self._computation(HELD, next_held)
             updates.append(Update(update, event.period_sec(), event.offset_sec()))
-        return Block(system, tuple(computations), tuple(updates))
+        return Computations(system, tuple(computations), tuple(updates))
 
     def _variables(self, source: str, size: int) -> np.ndarray:
         """New Drake variables for a column, each with a CasADi symbol of its own."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import casadi as ca
 from pydrake.systems.framework import System
 
-from drake_dae.blocks.computations import Block
+from drake_dae.blocks.computations import Computations
 
 
 class ColumnPlace(NamedTuple):
@@ -37,7 +37,7 @@ class UpdateRate:
     is_unrestricted: bool
     function: ca.Function
     places: tuple[int, ...]
-    stepped: Block | None = None
+    stepped: Computations | None = None
 
 
 def appended(column: ca.SX, values: ca.SX) -> tuple[ca.SX, slice]:

@@ -12,8 +12,8 @@ from drake_dae.blocks.computations import (
     PARAMETERS,
     STATE,
     TIME,
-    Block,
     Computation,
+    Computations,
     Traced,
 )
 from drake_dae.compiler.groups import discrete_states, numeric_parameters
@@ -36,7 +36,7 @@ class TracedCall:
             symbols, so that they can be computed once for all evaluations at one time.
     """
 
-    block: Block
+    block: Computations
     computation: Computation
     arguments: tuple[ca.SX, ...]
     results: tuple[ca.SX, ...]
@@ -63,7 +63,7 @@ class Expressions:
             symbols.
         twins: Plant -> the controller whose law has the plant's system as its model, with equal
             parameters. Both then use the controller's symbols.
-        is_short: Whether the derivative of such a plant is computed by `Block.under` of its
+        is_short: Whether the derivative of such a plant is computed by `Computations.under` of its
             controller, where the controller is connected directly to the plant.
 
     Attributes:
@@ -88,7 +88,7 @@ class Expressions:
     ) -> None:
         self.time = ca.SX.sym("time")
         self.calls: list[TracedCall] = []
-        self.used: dict[System, Block] = {}
+        self.used: dict[System, Computations] = {}
         self.precomputed: list[tuple[ca.SX, ca.SX]] = []
         self.symbols: dict[tuple[System, str], ca.SX] = {}
         self._wires, self._context, self._twins = wires, context, dict(twins or {})
@@ -96,14 +96,14 @@ class Expressions:
         self._open: list[tuple[System, Computation]] = []
         # The calls on which each expression under construction depends; the innermost is last.
         self._dependencies: list[dict[int, TracedCall]] = []
-        self._under: dict[System, tuple[Block, Computation]] = {}
+        self._under: dict[System, tuple[Computations, Computation]] = {}
         cut = {name: system.get_output_port(i) for name, (system, i) in wires.inputs.items()}
         self.inputs = {name: ca.SX.sym(name, port.size()) for name, port in cut.items()}
         self._cut = {(p.get_system(), p.get_name()): self.inputs[n] for n, p in cut.items()}
         for plant, controller in self._twins.items() if is_short else ():
             self._shorten(plant, self.block(controller))
 
-    def block(self, system: System) -> Block:
+    def block(self, system: System) -> Computations:
         """The block of a system: its computations and updates."""
         if system not in self.used:
             self.used[system] = system.traced() if isinstance(system, Traced) else primitive(system)
@@ -133,7 +133,7 @@ class Expressions:
             block, computation = self._under[system]
         return self.call(block, computation).results[computation.outputs.index(name)]
 
-    def call(self, block: Block, computation: Computation) -> TracedCall:
+    def call(self, block: Computations, computation: Computation) -> TracedCall:
         """A computation evaluated at the expressions of its sources; raises as `port` does."""
         key = block.system, computation
         if key in self._calls:
@@ -224,7 +224,7 @@ class Expressions:
         calls = self._dependencies.pop().values()
         return value, sum((call.valid for call in calls), ca.SX(0))
 
-    def source(self, block: Block, name: str) -> ca.SX:
+    def source(self, block: Computations, name: str) -> ca.SX:
         """The expression of an argument of a block's computation."""
         system = block.system
         if name == TIME:
@@ -239,7 +239,7 @@ class Expressions:
             return self.input(block, name)
         return self.output(system, name)
 
-    def input(self, block: Block, name: str) -> ca.SX:
+    def input(self, block: Computations, name: str) -> ca.SX:
         """The expression of an input port.
 
         Raises:
@@ -263,7 +263,7 @@ class Expressions:
             "value. Connect it, or fix its value in the context"
         )
 
-    def parameters(self, block: Block) -> ca.SX:
+    def parameters(self, block: Computations) -> ca.SX:
         """The numeric parameters of a block; the time-varying ones are those of its input port."""
         system = block.system
         size = self._size(system, PARAMETERS)
@@ -277,8 +277,8 @@ class Expressions:
                 parameters[list(block.moving)] = self.input(block, "exogenous")
         return parameters
 
-    def _shorten(self, plant: System, controller: Block) -> None:
-        """Replaces a plant's derivative by `Block.under` of a directly connected controller."""
+    def _shorten(self, plant: System, controller: Computations) -> None:
+        """Replaces a plant's derivative by `under` of a directly connected controller."""
         if controller.under is None or not plant.HasInputPort("control"):
             return
         source = self._source(plant, "control")

@@ -344,7 +344,18 @@ def too_long(
     step, scheme = config.max_step_size, config.integration_scheme
     if config.use_error_control or scheme.startswith(IMPLICIT) or not start[1].size:
         return error
-    rate = fastest_rate(diagram, context, *start)
+    begun, rates = context.Clone(), [fastest_rate(diagram, context, *start)]
+    begun.SetTimeAndContinuousState(*start)
+    # A law that cancels springs takes their rates out of the loop, and not out of its steps.
+    for plant in (block for block in blocks_of(diagram) if isinstance(block, Plant)):
+        alone = plant.CreateDefaultContext()
+        for i in range(plant.num_input_ports()):
+            if size := plant.get_input_port(i).size():
+                plant.get_input_port(i).FixValue(alone, np.zeros(size))
+        state = plant.state(plant.GetMyContextFromRoot(begun))
+        if alone.num_continuous_states() == state.size:
+            rates.append(fastest_rate(plant, alone, start[0], state))
+    rate = float(np.max(np.nan_to_num(rates)))
     if not rate * step > LONGEST:
         return error
     text = (

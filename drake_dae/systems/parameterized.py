@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.blocks.block import Block, Requirement
-from drake_dae.blocks.computations import Block as Computed
+from drake_dae.blocks.computations import Computations
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.system.system import DaeSystem
@@ -109,7 +109,7 @@ class ParameterizedSystem(TracedSystem):
                 parameter.check(values[place])
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
-    def traced(self) -> Computed:
+    def traced(self) -> Computations:
         return replace(super().traced(), moving=tuple(self.exogenous_places), **self._shares())
 
     def _shares(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import casadi as ca
 from pydrake.systems.framework import BasicVector_, LeafSystem, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from drake_dae.blocks.computations import HELD, Block, Computation, Update
+from drake_dae.blocks.computations import HELD, Computation, Computations, Update
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -22,7 +22,7 @@ class Guarded(LeafSystem):
         output.SetFromVector(2.0 * self.GetInputPort("u").Eval(context))
 
     def traced(self):
-        return Block(self, (Computation.of(self._function, ("u",), ("y",)),))
+        return Computations(self, (Computation.of(self._function, ("u",), ("y",)),))
 
 
 class Latch(LeafSystem):
@@ -43,7 +43,7 @@ class Latch(LeafSystem):
     def traced(self):
         value = ca.SX.sym("value")
         same = ca.Function("same", [value], [value])
-        return Block(
+        return Computations(
             self,
             (Computation(same, (HELD,), ("y",)),),
             (Update(Computation(same, ("u",), (HELD,)), self.period),),

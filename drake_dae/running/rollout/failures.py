@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import HELD, PARAMETERS, STATE, TIME, Block
+from drake_dae.blocks.computations import HELD, PARAMETERS, STATE, TIME, Computations
 from drake_dae.blocks.failures import (
     cannot_go_on,
     endless_steps,
@@ -97,7 +97,7 @@ def _reason(
 
 
 def _where(
-    sources: Sequence[str], arguments: Sequence[FloatArray], block: Block, state: FloatArray
+    sources: Sequence[str], arguments: Sequence[FloatArray], block: Computations, state: FloatArray
 ) -> FloatArray:
     """Returns the state among the arguments of a computation; without one, all states."""
     for name, values in zip(sources, arguments, strict=True):

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers
-from drake_dae.blocks.computations import Block
+from drake_dae.blocks.computations import Computations
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
@@ -209,7 +209,7 @@ def _plants(
     state: FloatArray,
     held: FloatArray,
     parameters: FloatArray,
-) -> list[tuple[slice, FloatArray, Block]]:
+) -> list[tuple[slice, FloatArray, Computations]]:
     """Returns the blocks with a manifold: the place of their states, their present parameters."""
     states, places = dict(compiled.states), dict(compiled.parameters)
     plants = []

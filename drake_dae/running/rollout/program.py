@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydrake.systems.framework import Diagram
 
+from drake_dae.blocks.computations import NOISE
 from drake_dae.compiler.compile import compile_diagram, with_twins
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.dae.system.signals import Signal
@@ -90,7 +91,8 @@ class RolloutProgram:
         """The places of the held values that a start contains: all except random numbers."""
         drawn = np.zeros(self.compiled.sizes["held"], dtype=bool)
         for system, part in self.compiled.held:
-            drawn[part] = self.compiled.blocks[system].draws
+            updates = self.compiled.blocks[system].updates
+            drawn[part] = any(NOISE in update.computation.sources for update in updates)
         return np.flatnonzero(~drawn)
 
     @property

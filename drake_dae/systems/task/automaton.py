@@ -1,6 +1,7 @@
 """The automaton of a task with the laws that it switches, as one block."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from math import factorial, inf
 
@@ -136,56 +137,37 @@ class Automaton:
         self.force = ca.SX.sym("measured_force", closed.num_constraints)
         self.hold = ca.SX.sym("hold")
         self.signals = {name: ca.SX.sym(name) for name in task.watched("signal")}
+        # By the model: z, z', ... of both laws, the distance and its derivative, all outputs in m.
+        self.chains = []
+        for law in laws:
+            own = [law.system.state, law.system.parameter_symbol]
+            chain = ca.Function("chain", own, [law.structure.chain])
+            self.chains += chain.call([self.state, self.values])
+        starts, chain, places = laws[FREE].layout.starts, self.chains[FREE], list(contact.places)
+        self.distance, self.rate = (
+            ca.sum1(chain[(starts[places] + order).tolist()]) / contact.size for order in (0, 1)
+        )
+        in_metres = [i for i, each in enumerate(free.output_signals) if each.unit == "m"]
+        rest = starts[[i for i in in_metres if i not in places]].tolist()
+        self.moved = ca.vertcat(self.distance, chain[rest])
+        self.first_force = task.contact_force * task.contacts[0]
         self._declare(free.num_outputs)
         self._filter()
-        # By the model: z, z', ... of both laws, the distance and its derivative, all outputs in m.
-        chains = [
-            ca.Function(
-                "chains", [law.system.state, law.system.parameter_symbol], [law.structure.chain]
-            ).call([self.state, self.values])[0]
-            for law in laws
-        ]
-        self.chains, layout = chains, laws[FREE].layout
-        places, starts = list(contact.places), layout.starts
-        self.distance, self.rate = (
-            ca.sum1(chains[FREE][(starts[places] + order).tolist()]) / contact.size
-            for order in (0, 1)
-        )
-        in_metres = [
-            int(starts[i])
-            for i, signal in enumerate(free.output_signals)
-            if signal.unit == "m" and i not in places
-        ]
-        self.moved = ca.vertcat(self.distance, chains[FREE][in_metres])
         self.goals = [self._goals_of(place) for place in range(self.end)]
         self.references = [self._reference(which) for which in (FREE, CONTACT)]
 
     def _declare(self, count: int) -> None:
         """The held values, and their present ones: before the task begins those of its begin."""
         size = max(law.layout.reference_size for law in self.laws)
-        columns = {
-            "change": len(CHANGE),
-            "over": 1,
-            "touched": 1,
-            "base": count,
-            "rate": count,
-            "offset": size,
-            "moved": 0,
-            "felt": 2,
-            "filter": 2 * self.contact.size + 1,
-            "entered": self.end,
-        }
-        free = self.laws[FREE].system.output_signals
-        columns["moved"] = 1 + sum(
-            s.unit == "m" and i not in self.contact.places for i, s in enumerate(free)
-        )
+        columns = {"change": len(CHANGE), "entered": self.end, "filter": 2 * self.contact.size + 1}
+        columns |= {"over": 1, "touched": 1, "felt": 2, "moved": self.moved.numel()}
+        columns |= {"base": count, "rate": count, "offset": size}
         self.held = {name: ca.SX.sym(name, size) for name, size in columns.items()}
         number, place, law, start, _, _, distance, _, ending, _ = ca.vertsplit(self.held["change"])
         self.has_begun = number > 0.5
-        self.place, self.ending, self.distance_then = place, ending, distance
+        self.place, self.ending, self.away = place, ending, self.distance - distance
         self.passed = TIME - start
-        first = float(self.task.contacts[0])
-        self.is_closed = ca.if_else(self.has_begun, law, first) > 0.5
+        self.is_closed = ca.if_else(self.has_begun, law, float(self.task.contacts[0])) > 0.5
 
     def _filter(self) -> None:
         """The low-pass of the forces of the contact, after their bias.
@@ -272,11 +254,11 @@ class Automaton:
         reference = self._goals_at(which, self.place, is_start=False)
         reference += self._along(which, held["base"], held["rate"], self.passed)
         reference += faded(held["offset"][:size], law.degrees, self.passed, held["over"])
-        begins = ca.if_else(self.has_begun, reference, self._present(which, self._begin_force()))
+        if which == CONTACT:  # For an observer, whose estimates the present outputs may depend on.
+            acts = ca.logic_and(self.has_begun, self.is_closed)
+            self.contact_reference = ca.if_else(acts, reference, 0)
+        begins = ca.if_else(self.has_begun, reference, self._present(which, self.first_force))
         return ca.if_else(self.is_closed == (which == CONTACT), begins, 0)
-
-    def _begin_force(self) -> float:
-        return self.task.contact_force * self.task.contacts[0]
 
     def _present(self, which: int, force: ca.SX | float) -> ca.SX:
         """R of a law from the present outputs, z_i, z_i', ...; zero for the highest derivatives.
@@ -299,21 +281,16 @@ class Automaton:
         wanted = ca.SX(0)
         for which, law in enumerate(self.laws):
             places = [contact.main] if which == CONTACT else list(contact.places)
-            wanted += ca.sum1(self.references[which][law.layout.lowest[places].tolist()]) / len(
-                places
-            )
+            rows = law.layout.lowest[places].tolist()
+            wanted += ca.sum1(self.references[which][rows]) / len(places)
         names = [signal.name for signal in self.laws[FREE].system.control_signals]
         for name in self.task.watched("control"):
             if name and name not in names:
                 raise ModelError(f"condition of a control: {unknown_name('control', name, names)}")
-            controls[name] = (
-                ca.fabs(control[names.index(name)]) if name else ca.mmax(ca.fabs(control))
-            )
-        away, travel = (
-            self.distance - self.distance_then,
-            ca.norm_2(self.moved - self.held["moved"]),
-        )
-        motion = self.distance, self.rate, wanted, away, travel
+            own = control[names.index(name)] if name else control
+            controls[name] = ca.mmax(ca.fabs(own))
+        travel = ca.norm_2(self.moved - self.held["moved"])
+        motion = self.distance, self.rate, wanted, self.away, travel
         return Moment(self.passed, self.total, *motion, self.signals, controls)
 
     def _causes(self, now: Moment) -> ca.SX:
@@ -372,7 +349,7 @@ class Automaton:
         to, ending = ca.if_else(begins, 0, to), ca.if_else(begins, GOING, ending)
         closed = self._closed_after(cause, to)
         closed = ca.if_else(begins, float(self.task.contacts[0]), closed)
-        force = ca.if_else(begins, self._begin_force(), self.total)
+        force = ca.if_else(begins, self.first_force, self.total)
         motion = force, self.distance, self.rate
         after = {
             "change": ca.vertcat(
@@ -438,66 +415,58 @@ class Automaton:
 
     def block(self) -> Block:
         """The block; see `TaskController`."""
-        controls, requirements, parts = [], list[Requirement](), dict[str, Held]()
-        outputs = dict[str, ca.SX]()
-        desired = ca.SX.zeros(self.laws[CONTACT].system.num_outputs + self.contact.size)
+        closed, task = self.laws[CONTACT].system, self.task
+        controls, requirements, integrals = [], list[Requirement](), dict[str, Held]()
+        desired = ca.SX.zeros(closed.num_outputs + self.contact.size)
         rest = [i for i in range(self.force.numel()) if i not in self.contact.forces]
         for which, law in enumerate(self.laws):
+            sums = ca.SX.sym("integral", len(law.integral.outputs))
+            reference = self.references[which]
             given = {
                 "state": self.state,
-                "reference": self.references[which],
+                "reference": reference,
                 "measured_force": self.tared if which == CONTACT else self.tared[rest],
+                "integral": sums,
                 "parameters": ca.vertcat(self.values, self.gains[which]),
             }
-            name = "integral" if which == CONTACT else "free_integral"
-            sums = ca.SX.sym(name, len(law.integral.outputs))
-            given["integral"] = sums
             regular = Requirement.regular(law.pivot, law.regular)
             values = [*(regular.of(value) for value in law.outputs.values()), regular.margin]
             function = ca.Function("law", list(law.inputs.values()), values)
-            results = function.call([given[each] for each in law.inputs])
+            results = function.call([given[name] for name in law.inputs])
             named = dict(zip([*law.outputs, "margin"], results, strict=True))
             controls.append(named["control"])
             is_active = self.is_closed == (which == CONTACT)
             margin = ca.if_else(is_active, named["margin"], 1.0)
-            requirements.append(Requirement(margin, regular.reason, regular.fault))
-            desired[columns_of(self.contact, desired.numel(), which)] += self.references[which][
-                law.layout.lowest.tolist()
-            ]
+            requirements.append(replace(regular, margin=margin))
+            columns = columns_of(self.contact, desired.numel(), which)
+            desired[columns] += reference[law.layout.lowest.tolist()]
             if sums.numel():
                 moves = ca.if_else(self.holds(which), 0, named["integral_rate"])
-                after = sums + self.period * moves
-                parts[name] = Held(sums, after, np.zeros(sums.numel()), self.period)
-                outputs[name] = sums
+                name = "integral" if which == CONTACT else "free_integral"
+                integrals[name] = self._kept(sums, sums + self.period * moves)
         control = ca.if_else(self.is_closed, controls[CONTACT], controls[FREE])
-        for name, value in self.update(control).items():
-            start = np.zeros(value.numel())
-            parts[name] = Held(self.held[name], value, start, self.period)
-        outputs |= {
-            "control": control,
-            "phase": self.place,
-            "ending": self.ending,
-            "change": self.held["change"],
-            "desired_output": desired,
-            "contact_reference": self.references[CONTACT],
-        }
-        if self.task.tare_time:
-            outputs["tared_force"] = self.tared
+        after = self.update(control)
         inputs = {"estimated_state": self.state, "measured_force": self.force, "hold": self.hold}
         inputs |= {SIGNAL + name: symbol for name, symbol in self.signals.items()}
-        size = self.values.numel()
-        own = [law.all_parameters()[size:] for law in self.laws]
-        closed = self.laws[CONTACT].system
+        own = [law.all_parameters()[self.values.numel() :] for law in self.laws]
+        start = [closed.parameter_values, own[CONTACT], own[FREE]]
         return Block(
             "task_controller",
             inputs,
-            outputs,
-            held=parts,
-            parameters=stacked([self.values, self.gains[CONTACT], self.gains[FREE]]),
-            start={
-                "parameters": np.concatenate([closed.parameter_values, own[CONTACT], own[FREE]])
+            {
+                "control": control,
+                "phase": self.place,
+                "ending": self.ending,
+                "change": self.held["change"],
+                "desired_output": desired,
+                "contact_reference": self.contact_reference,
+                **({"tared_force": self.tared} if task.tare_time else {}),
+                **{name: each.symbol for name, each in integrals.items()},
             },
-            defaults={name: ca.SX.zeros(1) for name in inputs if name not in _NEEDED},
+            held=integrals | {name: self._kept(self.held[name], after[name]) for name in after},
+            parameters=stacked([self.values, self.gains[CONTACT], self.gains[FREE]]),
+            start={"parameters": np.concatenate(start)},
+            defaults={name: ca.SX.zeros(1) for name in list(inputs)[2:]},
             requirements=tuple(requirements),
             signals={
                 "estimated_state": closed.state_signals,
@@ -510,8 +479,8 @@ class Automaton:
             },
         )
 
-
-_NEEDED = "estimated_state", "measured_force"
+    def _kept(self, symbol: ca.SX, after: ca.SX) -> Held:
+        return Held(symbol, after, np.zeros(symbol.numel()), self.period)
 
 
 def columns_of(contact: OpeningContact, size: int, which: int) -> list[int]:

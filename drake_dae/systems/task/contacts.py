@@ -86,12 +86,7 @@ def open_contact(system: DaeSystem, force: str | Sequence[str]) -> DaeSystem:
 
 
 def _contact(system: DaeSystem, forces: Sequence[int]) -> OpeningContact:
-    """The contact with some constraint forces.
-
-    Raises:
-        ModelError: The outputs that depend on them are not as many, do not contain their sum, or
-            depend on other forces.
-    """
+    """The contact with some constraint forces; raises as `open_contact` does."""
     names = [signal.name for signal in system.constraint_input_signals]
     outputs = listed(signal.name for signal in system.output_signals)
     others = [i for i in range(len(names)) if i not in forces]
@@ -107,15 +102,12 @@ def _contact(system: DaeSystem, forces: Sequence[int]) -> OpeningContact:
         total = [j for j in fitting if all(system.m[j, i].is_one() for i in forces)]
         if len(total) == 1:
             return OpeningContact(tuple(fitting), tuple(forces), total[0])
-    if len(forces) == 1:
-        raise ModelError(
-            f"{system.name}: '{names[forces[0]]}' must be one of the outputs by itself, so that a "
-            f"distance can be in its place where the contact is open; the outputs are {outputs}"
-        )
+    own = ", ".join(f"'{names[i]}'" for i in forces)
     raise ModelError(
-        f"{system.name}: the contact of {', '.join(names[i] for i in forces)} needs {len(forces)} "
-        "outputs that depend on these forces alone, one of them their sum, so that distances can "
-        f"be in their places where it is open, such as ForceCombinations; the outputs are {outputs}"
+        f"{system.name}: {own} must be outputs, one by itself, or of "
+        "several points as many outputs of these alone, one of them their sum, such as "
+        "ForceCombinations, so that distances can be in their places where the contact is open; "
+        f"the outputs are {outputs}"
     )
 
 
@@ -130,10 +122,8 @@ def opening_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
         [signal.name for signal in system.constraint_input_signals] for system in (closed, free)
     )
     gone = [name for name in names if name not in others]
-    if not gone or (closed.num_states, closed.num_controls) != (
-        free.num_states,
-        free.num_controls,
-    ):
+    sizes = {(system.num_states, system.num_controls) for system in (closed, free)}
+    if not gone or len(sizes) > 1:
         raise ModelError(
             f"a task needs the laws of one robot with and without a contact, as of its system and "
             f"of open_contact(system, force); these hold {', '.join(names) or 'nothing'} and "
@@ -155,16 +145,13 @@ def opening_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
             f"exogenous signals, as of an observer's estimates, the free law "
             f"{free_law.exogenous_degrees}; leave them, or the observer, out"
         )
-    for i in range(closed.num_outputs):
-        if i not in contact.places and law.degrees[i] != free_law.degrees[i]:
+    for i, (degree, freed) in enumerate(zip(law.degrees, free_law.degrees, strict=True)):
+        name = free.output_signals[i].name
+        if i in contact.places and freed < 2:
+            raise ModelError(f"'{name}' must have degree 2 or more, as where forces move it")
+        if i not in contact.places and degree != freed:
             raise ModelError(
-                f"'{closed.output_signals[i].name}' has degree {law.degrees[i]} in contact and "
-                f"{free_law.degrees[i]} without, so that no reference leads from one to the other"
-            )
-    for place in contact.places:
-        if free_law.degrees[place] < 2:
-            raise ModelError(
-                f"'{free.output_signals[place].name}' must have degree 2 or more, as where forces "
-                "move it"
+                f"'{name}' has degree {degree} in contact and {freed} without, so that no "
+                "reference leads from one to the other"
             )
     return contact

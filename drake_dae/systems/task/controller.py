@@ -35,25 +35,15 @@ class TaskController(ParameterizedSystem, Controller):
     """A task in phases: approach, touch, press, move, release, retreat.
 
     In contact, the law (28) of the robot with the contact is active and tracks the contact force;
-    otherwise the law of the robot without it, which tracks the distance in place of the force. Each
-    phase has goals, and ends by the measured force, the distance by the model or the time, at a
-    sample. The references of a phase start with the values and all derivatives of those before, and
-    go to its goals by a polynomial; a reference that did not exist before, such as the force after
-    a touch, starts at the measured value.
-
-    The control may jump when the law changes, since both laws explain the same motion by different
-    forces. When a robot touches a frictionless surface and the free law presses with lambda, that
-    is, it commands phi'' = w = -A lambda there, the jump is
+    otherwise the law of the robot without it, which tracks the distance in place of the force. A
+    phase ends at a sample; see `Phase`. The control may jump when the law changes, since both laws
+    explain the same motion by different forces. When a robot touches a frictionless surface and the
+    free law presses with lambda, that is, it commands phi'' = -A lambda there, the jump is
 
         B (u_c - u_f) = lambda (A M [P; J]^-1 (0, 1) - J^T),
 
     where P is the Jacobian of the other outputs. It is zero if pressing moves none of them, P M^-1
-    J^T = 0. At a release lambda is at most the task's `contact_force`, and the jump is J^T lambda.
-    A slow touch, and small gains of the free law for the distance, keep the first jump small.
-
-    Of a plant it needs only the state x and the measured constraint forces. If the laws are for a
-    system with a disturbance, one observer serves both, since its equation contains the measured
-    force and so holds for closed and open contacts.
+    J^T = 0. A slow touch, and small gains of the free law for the distance, keep it small.
 
     Input ports:
         estimated_state: x, shape (n,).
@@ -71,7 +61,8 @@ class TaskController(ParameterizedSystem, Controller):
             "leave" after a success, 3 when the task is given up, shape (1,).
         desired_output: The desired positions, forces and distances, shape (p + k,) for a contact
             of k points. In contact the distances are zero, otherwise the forces.
-        contact_reference: R of the law in contact while it is active, otherwise 0; for an observer.
+        contact_reference: R of the law in contact while it is active, otherwise 0, as before the
+            first sample; for an observer.
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
         change: The last change of phase, shape (10,); `changes` reads it from a record.
         integral, free_integral: The integrals of each law, if it has any. They are not updated

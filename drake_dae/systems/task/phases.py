@@ -88,17 +88,10 @@ class Condition:
 class Moment:
     """The measurements that decide when a phase ends, as expressions of CasADi.
 
-    Attributes:
-        time: The time since the phase began, in s.
-        force: The measured force of the contact, in N; of several points their sum.
-        distance: The distance from the surface by the law's model, in m; of several points their
-            mean.
-        rate: Its derivative, in m/s.
-        wanted: The reference of the force (in contact), in N, or of the distance, in m.
-        away: The increase of the distance since the phase began, in m.
-        travel: See `Condition`.
-        signals: Name -> value of each signal.
-        controls: Name -> |u| of each control, and "" -> the largest; empty if no phase watches one.
+    Those of `Condition`, of several points the sum of forces and the mean of distances; `rate` of
+    the distance in m/s, `wanted`, the reference of the force (in contact) or of the distance, and
+    `away`, the increase of the distance since the phase began, in m. `controls` and `signals` have
+    those that phases watch, "" the largest |u|.
     """
 
     time: Any
@@ -139,8 +132,7 @@ class Phase:
        is done, and the robot rests; "approach", back to the last phase that leads into contact;
        "hold", the robot rests in its present state with contact and force, and the task is given
        up if the phase failed; "leave", the force goes to zero first.
-    7. `margin` and `remaining` are expressions of a `Moment`: ca.fmin, ca.fmax and ca.if_else take
-       the place of min, max and if.
+    7. `margin` and `remaining` are expressions of a `Moment`: with ca.fmin, ca.fmax, ca.if_else.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -198,10 +190,9 @@ class Phase:
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         """Output name -> its reference, whose time starts with the phase.
 
-        Args:
-            contact_output: The name of the force, or of the distance if the robot is free. With a
-                goal for the force of several points, their other force outputs without goals go to
-                zero; with a goal for this one of their distances, the others go to the same.
+        `contact_output` is the name of the force, or of the distance if the robot is free. With a
+        goal for the force of several points, their other force outputs without goals go to zero;
+        with a goal for this one of their distances, the others go to the same.
         """
         return {}
 
@@ -230,11 +221,6 @@ class Phase:
     def awaits(self, contact_force: float) -> str:
         """The condition that ends it, for messages: that of `until`, or its own."""
         return " or ".join(map(str, self.until)) or self.awaited(contact_force)
-
-    @property
-    def successors(self) -> tuple[str | None, ...]:
-        """All words that say what follows."""
-        return self.on_success, self.on_failure, self.if_late, self.if_lost, self.if_spent
 
     def successor(self, outcome: Outcome) -> tuple[str, str]:
         """What follows after an outcome, and the attribute that says so."""

@@ -99,7 +99,8 @@ class Task:
     @cached_property
     def all_phases(self) -> tuple[Phase, ...]:
         """The phases, then the Release of "leave" if one of them chooses it."""
-        words = {word for phase in self.phases for word in phase.successors}
+        keys = "on_success", "on_failure", "if_late", "if_lost", "if_spent"
+        words = {getattr(phase, key) for phase in self.phases for key in keys}
         # A model error may be larger than contact_force, and holds the tool.
         leave = Release(name=LEAVE, within=5.0, on_success=HOLD)
         return (*self.phases, *([leave] if LEAVE in words else []))
@@ -130,15 +131,9 @@ class Task:
         return self.all_phases[place].in_contact_after(before) if outcome == "success" else before
 
     def successors(self, place: int, outcome: Outcome) -> tuple[list[int], bool]:
-        """What follows a phase.
+        """The indices of phases, of which the first follows whose retries are not used up.
 
-        Args:
-            place: Its index.
-            outcome: How it has ended.
-
-        Returns:
-            The indices of phases, of which the first follows whose retries are not used up; and
-            whether the task is done if there is none, or given up.
+        Also whether the task is done if there is none, or the robot rests for another reason.
         """
         chain, at, word = list[int](), place, self.all_phases[place].successor(outcome)[0]
         while True:
@@ -188,16 +183,10 @@ class Task:
         return 2.0 * kept / (1.0 + kept)
 
     def tare_samples(self, sample_period: float) -> int:
-        """The number of samples in the mean for the bias of the force; 0 without a tare_time.
-
-        Raises:
-            ModelError: There are so few samples that the noise of their mean may count as a touch.
-        """
-        if not self.tare_time:
-            return 0
+        """The number of samples in the mean for the bias of the force; 0 without a tare_time."""
         count = ceil(self.tare_time / sample_period - 1e-9)
         needed = ceil((_STEADY * self.force_noise / self.contact_force) ** 2)
-        if count < needed:
+        if 0 < count < needed:
             raise ModelError(
                 f"tare_time: a mean over {self.tare_time:g} s keeps too much of the force sensor's "
                 f"noise of {self.force_noise:g} N; it must be {needed * sample_period:g} s or more"
@@ -238,13 +227,6 @@ class Task:
 
     def __repr__(self) -> str:
         return f"Task({', '.join(phase.name for phase in self.phases)})"
-
-    def __str__(self) -> str:
-        """One line for each phase, with the condition that ends it."""
-        return "\n".join(
-            f"{index + 1}. {phase.name}, until {phase.awaits(self.contact_force)}"
-            for index, phase in enumerate(self.phases)
-        )
 
 
 def _named(phases: Sequence[Phase]) -> tuple[Phase, ...]:

@@ -26,7 +26,6 @@ def test_phases_have_the_names_of_their_classes_with_numbers():
     names = [phase.name for phase in task.phases]
     assert names == ["Approach", "Move", "Move 2", "Dwell", "Move 3"]
     assert [phase.name for phase in Task(task.phases).phases] == names
-    assert "3. Move 2, until the end of 1 s" in str(task)
     chosen = Task([Approach(name="Press"), PRESS])
     assert [phase.name for phase in chosen.phases] == ["Press", "Press 2"]
 

@@ -24,7 +24,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import Block
+from drake_dae.blocks.computations import Computations
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae.structure.constrained import ConstraintStructure
 from drake_dae.dae.system.signals import Signal
@@ -261,7 +261,7 @@ class ContactPlant(Diagram, Plant):
         self.multibody.SetPositionsAndVelocities(multibody_context, values[: self.dae.num_states])
         set_masses(multibody_context, self._masses)
 
-    def traced(self) -> Block:
+    def traced(self) -> Computations:
         return traced_contact(self, self._forces, self._held, self._put, self._values)
 
     def _held(self, context: Context) -> FloatArray:

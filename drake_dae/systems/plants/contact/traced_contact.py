@@ -6,7 +6,7 @@ import casadi as ca
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import HELD, Block, Computation, DrakeStepped
+from drake_dae.blocks.computations import HELD, Computation, Computations, DrakeStepped
 from drake_dae.robots.constraint_wrenches import contact_normals
 from drake_dae.systems.plants.contact.contact_forces import ContactForces
 from drake_dae.systems.plants.contract import Plant
@@ -18,7 +18,7 @@ def traced_contact(
     held_in: Callable[[Context], FloatArray],
     put: Callable[[Context, FloatArray], None],
     values: FloatArray,
-) -> Block:
+) -> Computations:
     """The computations of a `ContactPlant`, whose HELD is (q, v) and the contact forces.
 
     Args:
@@ -68,4 +68,4 @@ def traced_contact(
         for name, value in shown.items()
     )
     ports = {**plant.port_signals, "contact_force": forces}
-    return Block(plant, computations, stepped=stepped, ports=ports)
+    return Computations(plant, computations, stepped=stepped, ports=ports)
