@@ -135,14 +135,22 @@ def compose(
     *,
     context: Context | None = None,
     merge: bool = False,
+    is_whole: bool = False,
 ) -> Composed:
-    """As `compile_diagram`, with the places of the systems in the block."""
+    """As `compile_diagram`, with the places of the systems in the block.
+
+    With `is_whole` it has all blocks with states, also those on which no output depends.
+    """
     if outputs is None:
         every = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]
         vectors = [p for p in every if p.get_data_type() == PortDataType.kVectorValued]
         outputs = {port.get_name(): port for port in vectors}
     walk = _Walk(diagram, context or diagram.CreateDefaultContext())
     values = {name: walk.port(leaf_port(port)) for name, port in outputs.items()}
+    for system in walk.leaves.systems if is_whole else ():
+        block = walk.block(system)
+        if block is not None and (block.state.numel() or block.held):
+            walk.used.add(system)
     dynamics: dict[System, _Dynamics] = {}
     while new := [s for s in walk.leaves.systems if s in walk.used and s not in dynamics]:
         dynamics |= {system: walk.dynamics(system) for system in new}  # May use more.

@@ -77,7 +77,9 @@ class CompiledRun:
             if (system, i) in leaves.sources and _is_traced(leaves.sources[system, i][0])
         }
         ports = {name: system.get_output_port(i) for name, (system, i) in outputs.items()}
-        self.composed = composed = compose(diagram, ports, context=context, merge=True)
+        self.composed = composed = compose(
+            diagram, ports, context=context, merge=True, is_whole=True
+        )
         (choice, *_) = [p.dae.compiled for p in _plants(diagram)]
         builder = DiagramBuilder()
         self._block = builder.AddSystem(TracedSystem(composed.block, compiled=choice))

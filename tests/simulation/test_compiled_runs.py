@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import DiagramBuilder
 from runs import first_quick, scenario, some
 
-from drake_dae import build_scenario, simulate
+from drake_dae import RobotPlant, build_scenario, simulate
 from drake_dae.errors import SimulationError
 from drake_dae.simulation import compiled_run
 from drake_dae.simulation import simulate as simulation
@@ -144,6 +145,24 @@ def test_a_fixed_value_at_a_connected_port_counts(short_runs):
     port.FixValue(loop.plant.GetMyMutableContextFromRoot(context), np.zeros(7))
     simulate(loop.diagram, context, 0.01, chosen.integrator)
     assert CompiledRun.of(loop.diagram, context, *given) is None
+
+
+def test_a_plant_without_a_log_moves_as_well(short_runs):
+    """Nothing reads its state; 0.1 s of a fall, as wired."""
+    chosen, loop, _ = loop_of("ideal contact")
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(RobotPlant(loop.plant.model, structure=loop.plant.structure))
+    diagram = builder.Build()
+    ends = []
+    for see in (None, lambda now: None):
+        context = diagram.CreateDefaultContext()
+        own = plant.GetMyMutableContextFromRoot(context)
+        plant.GetInputPort("control").FixValue(own, np.zeros(7))
+        start = plant.state(own)
+        simulate(diagram, context, 0.1, chosen.integrator, after_step=see)
+        ends.append(plant.state(own))
+        assert np.abs(ends[-1] - start).max() > 1e-2
+    assert_allclose(*ends, rtol=0, atol=1e-9)
 
 
 def test_each_step_is_seen_where_that_is_asked_for(short_runs):
