@@ -91,8 +91,8 @@ class TracedSystem(LeafSystem):
             converter._AddConstructor[scalar, float](partial(_convert, kind))
         super().__init__(converter)
         self.block, self.compiled = block, compiled
-        watches = bool(block.state.numel()) if sees_steps is None else sees_steps
-        self._steps = StepWatch(self, watches)
+        self._watches = bool(block.state.numel()) if sees_steps is None else sees_steps
+        self._steps = StepWatch(self, self._watches)
         _declare(self, float, partial(_by_numbers, proxy(self)))
         if block.projection is not None:
             values = {"parameters": block.projection.parameters}
@@ -135,7 +135,8 @@ class TracedSystem(LeafSystem):
 
     def begin_run(self, context: Context) -> None:
         """Begins a run from a context without initialization events, which would do this."""
-        self._steps.begin(context)
+        if self._watches:
+            self._steps.begin(context)
 
     def motion(self) -> ca.SX | None:
         """x' of a plant that is the law's own `equations`, in fewer operations; None without it.

@@ -54,7 +54,7 @@ from drake_dae import (
     simulate,
     start_values,
 )
-from drake_dae.errors import ModelError, ScenarioError, SimulationError, WiringError
+from drake_dae.errors import ModelError, ScenarioError, SimulationError
 from drake_dae.scenario.shipped import FOLDER
 
 MATERIAL = {"stiffness": 1e5, "dissipation": 2.0, "friction": 0.3, "radius": 0.01}
@@ -427,14 +427,6 @@ def test_gains_of_a_continuous_contact_need_a_period():
     )
     with pytest.raises(ScenarioError, match="sampling"):
         run_scenario(found)
-
-
-@pytest.mark.slow
-def test_a_task_on_a_continuous_contact_is_sampled():
-    settings = ("plant=!CompliantContact {time_step: 0}", "law.gains={all: [-25]}")
-    found = scenario("wall_polish", *settings)
-    with pytest.raises((ScenarioError, WiringError), match="sampling"):
-        build_scenario(found)
 
 
 @pytest.mark.slow
