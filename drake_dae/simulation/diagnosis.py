@@ -242,6 +242,8 @@ class RunDiagnosis:
         """
         if not isinstance(error, DrakeDaeError) and (ports := self._without_wires(context, error)):
             return WiringError(f"no wire to {', '.join(ports)}: connect or fix each input port")
+        if isinstance(error, WiringError):
+            return error  # It names its cause.
         state = context.get_continuous_state_vector().CopyToVector()
         if self._plant is not None:
             state = self._plant.state(self._plant.GetMyContextFromRoot(context))

@@ -27,8 +27,8 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
         raise ModelError("Drake's contact needs a robot that a MultibodyPlant has read")
     if model.dae.exogenous or model.known_forces:
         raise ModelError(
-            "Drake's contact as the plant takes no exogenous signals and no known_forces; forces "
-            "that the law does not know are disturbance forces (plant.disturbances). Use "
+            "Drake's contact as the plant takes no exogenous signals and no robot.known_forces; "
+            "forces that the law does not know are disturbance forces (plant.disturbances). Use "
             "`plant: !CompliantContact`, which has the same equations of contact, or a rollout"
         )
     if model.stages:
