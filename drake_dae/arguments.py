@@ -111,11 +111,14 @@ def _rule(hint: Any) -> tuple[str, Callable[[Any], object]]:
         return " or ".join(map(repr, words)), lambda v: isinstance(v, str) and v in words
     if getattr(hint, "_is_protocol", False):
         names = [name for kind in hint.__mro__ for name in vars(kind) if name[0] != "_"]
-        has = inspect.getattr_static  # It evaluates no property.
-        return f"a {hint.__name__}", lambda v: all(has(v, n, None) is not None for n in names)
+        has = inspect.getattr_static  # It evaluates no property, and an attribute may be None.
+        return f"a {hint.__name__}", lambda v: all(has(v, n, _NOT) is not _NOT for n in names)
     if hint is Any or not inspect.isclass(hint):  # Any is a class, too.
         return "anything", lambda v: True
     return f"a {hint.__name__}", lambda v: isinstance(v, hint)
+
+
+_NOT = object()
 
 
 def _is_whole(value: Any) -> bool:

@@ -100,8 +100,11 @@ def _limits(record: Record, limits: SignalLimits) -> Iterator[RunEvent]:
         if kind in (LimitKind.FORCE, LimitKind.CONE):
             continue
         # A control that is cut off keeps its limit by round-off.
-        is_low = np.isfinite(low) & (values <= low + 1e-9 * abs(low))
-        reached = is_low | (np.isfinite(high) & (values >= high - 1e-9 * abs(high)))
+        reached = np.zeros(values.size, dtype=bool)
+        if np.isfinite(low):
+            reached |= values <= low + 1e-9 * abs(low)
+        if np.isfinite(high):
+            reached |= values >= high - 1e-9 * abs(high)
         if kind is LimitKind.CONTROL and "excess" in record:
             reached |= record["excess"][:, controls.index(signal.name)] != 0.0
         begins = reached & ~np.concatenate([[False], reached[:-1]])

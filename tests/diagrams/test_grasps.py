@@ -328,8 +328,8 @@ def test_what_is_free_moves_in_the_animation(name, body):
         ),
         (
             "three_fingers",  # What moves the puck, too.
-            "forces.2=!ForceCombination {name: a, weights: {grip1.fx: 1, grip2.fx: 1, "
-            "grip3.fx: 1}}",
+            "forces.2=!ForceCombination {name: grip3.grip1.squeeze, "
+            "weights: {grip1.fx: 1, grip2.fx: 1, grip3.fx: 1}}",
             ["outputs: ", "(5)", "object_x"],
         ),
         ("biped", "forces.0=!ForceCombination {weights: {}, name: a}", ["forces.0: ", "'a'"]),

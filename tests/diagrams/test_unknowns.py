@@ -61,7 +61,7 @@ def test_a_disturbance_leaves_the_error_of_statics(plant):
     It is smooth over 10 ms, and 0.5 s later the poles at -25 1/s have left 5e-5 of it.
     """
     push = "plant.disturbances=[{frame: tool, force: [0, 0, 5], start_time: 0.1}]"
-    _, _, record = run_scenario(two_link(push, *plant))
+    _, _, record = run_scenario(two_link(*plant, push))
     expected = left_behind([0.0, 5.0])
     assert 1e-3 < expected < 2e-2
     assert_allclose(record["tracking_error"][-1, 0], expected, rtol=2e-2)
@@ -71,7 +71,7 @@ def test_a_disturbance_leaves_the_error_of_statics(plant):
 @PLANTS
 def test_payload_that_nobody_knows_pulls_with_its_weight(plant):
     payload = "plant.payloads=[{frame: tool, mass: 0.5}]"
-    _, _, record = run_scenario(two_link(payload, *plant))
+    _, _, record = run_scenario(two_link(*plant, payload))
     # Its inertia adds 0.5 J^T J to M, which changes A_h in the plant; at rest the law's counts.
     assert_allclose(record["tracking_error"][-1, 0], left_behind([0.0, -0.5 * 9.81]), rtol=2e-2)
 
@@ -157,7 +157,7 @@ def test_a_disturbance_grows_and_fades_smoothly():
 )
 def test_what_is_not_there_is_refused(settings, message):
     with pytest.raises(ScenarioError, match=message):
-        build_scenario(two_link(settings, *CONTACT))
+        build_scenario(two_link(*CONTACT, settings))
 
 
 @pytest.mark.slow

@@ -31,8 +31,7 @@ def long_function(name, looks_up=False):
 
 
 def library(source, folder):
-    (folder / "code.c").write_text(source)
-    find_compiler().link([folder / "code.c"], folder / "code.so", "-O1", 60.0)
+    find_compiler().compile(source, folder / "code", "-O1", 60.0)
     return ca.external("long_one", str(folder / "code.so"))
 
 
