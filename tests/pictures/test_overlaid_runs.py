@@ -130,7 +130,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     for arguments, said in (
         ([folders[0], "--out=a.txt"], "'a.txt'"),
         ([folders[0], folders[0]], "a run is named twice"),
-        ([*folders, "--all", "--errors"], "--signals, --errors"),
+        ([*folders, "--all", "--errors"], "--all"),
         ([record, "--all"], "scenario.yaml"),
         ([str(tmp_path)], "record.npz"),
         (["nothing"], "nothing"),

@@ -34,7 +34,6 @@ def test_a_robot_with_a_mesh(tmp_path):
     ("change", "words"),
     [
         ({"drive": ""}, ["robot.actuators: ", "'lever.urdf'", "all"]),
-        ({"shape": '<mesh filename="shape.obj"/>'}, ["robot.file: ", "shape.obj"]),
         ({"drive": "<transmission>"}, ["robot.file: ", "lever.urdf", "XML"]),
         ({"world": "base"}, ["robot.file: ", "'base'", "quaternion", "{weld: "]),
         ({"scenario": LEVER.replace("0.8", "1.8")}, ["start.positions: ", "wall.distance"]),

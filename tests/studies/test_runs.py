@@ -121,7 +121,7 @@ def test_each_value_of_a_context_is_that_of_its_run(key, value, is_rollout):
         ((), {"plant": {"_tag": "!CompliantContact"}, "plant.parameters.link1.mass": 11.0}),
         ((), {"references.tool.z.offset": 0.2}),
         ((), {"constraints.0.surface.point": [1.25, 0.0, 0.0]}),
-        ((), {"gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}}),
+        ((), {"law.gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}}),
         # Gains are computed for the stiffness.
         (
             (
@@ -151,7 +151,7 @@ def test_another_structure_is_built():
     variations = [
         {"constraints.0.surface.point": [1.25, 0.0, 0.0]},
         {"references.tool.z.offset": 0.2},
-        {"gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}},
+        {"law.gains": {"_tag": "!Coefficients", "all": [16.0, 8.0]}},
         {"actuation": [{"_tag": "!DcMotors", "torque_constant": 0.5, "inductance": 1e-2,
                         "resistance": 1.0, "gear_ratio": 100.0}],
          "integrator.max_step_size": 1e-3},
@@ -172,7 +172,7 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
         ({"start.errors.tool.z": 3.0}, Outcome.NO_START, "tool.z"),
         ({"start.positions.joint1": 9.0}, Outcome.REFUSED, "joint1"),
         ({"plant.parameters.link7.mass": 1.0}, Outcome.REFUSED, "link7.mass"),
-        ({"gains": {"_tag": "!Coefficients", "all": [1.0]}}, Outcome.REFUSED, "gains: "),
+        ({"law.gains": {"_tag": "!Coefficients", "all": [1.0]}}, Outcome.REFUSED, "gains: "),
         ({"constraints": []}, Outcome.REFUSED, ": "),
         ({"constraints": []}, Outcome.REFUSED, ": "),
         ({"law.gains.all": [4.0]}, Outcome.REFUSED, "gains: "),

@@ -205,9 +205,12 @@ def test_ctrl_c_keeps_what_has_ended(tmp_path):
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert said == (
-        f"runs that have ended are in {folder}/runs.db; the same command continues\ninterrupted\n"
-    )
+    # The interpreter may tell of what its killed workers have left.
+    own = [
+        line for line in said.splitlines() if "resource_tracker" not in line and "warn" not in line
+    ]
+    kept = f"runs that have ended are in {folder}/runs.db; the same command continues"
+    assert own == [kept, "interrupted"]
     assert lines(folder / "runs.db") == 3
 
 
@@ -279,7 +282,7 @@ def test_a_run_without_end_is_ended_at_the_limit(stopped, tmp_path):
         ),
         (
             [{"sensors.force.seed": 0.0}, {"sensors.force.seed": 1}],
-            r"force_feedback: .*'seed'",
+            r"sensors\.force\.seed",
         ),
         ([{"duration": -1.0}], r"duration: .*-1.0"),
         ([{"outputs.3.axes": "z"}], r"outputs: .*'3'"),

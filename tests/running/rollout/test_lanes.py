@@ -85,7 +85,7 @@ def assert_same(ours, theirs, tolerance, slack=0):
         ),
         pytest.param(
             "two_link_measured_force",
-            ["sensors.force={sample_period: 0.003, noise_deviation: 0.1}"],
+            ["sensors.force={sample_period: 0.003, noise_deviation: 0.1}", "law.force_gain=0.5"],
             ("force_noise",),
             marks=pytest.mark.slow,
         ),

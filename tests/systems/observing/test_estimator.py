@@ -259,7 +259,7 @@ def test_the_first_break_away_of_encoders_alone_does_not_swing():
 
 
 def test_what_cannot_be_estimated_is_refused():
-    with pytest.raises(ScenarioError, match="observer"):
+    with pytest.raises(ScenarioError, match="estimator"):
         build_scenario(scenario(*NOISY, "estimator={rate: 20, state_rate: 100}"))
     with pytest.raises(ScenarioError, match="velocity_bandwidth"):
         build_scenario(
@@ -273,7 +273,7 @@ def test_what_cannot_be_estimated_is_refused():
         build_scenario(
             scenario(*NOISY, "estimator={rate: 20, state_rate: 2000}", "sensors.encoders={}")
         )
-    with pytest.raises(ScenarioError, match="observer"):
+    with pytest.raises(ScenarioError, match="estimator"):
         build_scenario(
             scenario(
                 "wall_flexible_contact",
