@@ -262,7 +262,7 @@ def sensed_contact(
         inertia=float(np.linalg.norm(inertia)),
         noise=SensorNoise(
             position=float(np.max(encoders.position_deviation)),
-            velocity=float(np.max(encoders.velocity_noise)),
+            velocity=float(np.max(np.asarray(encoders.velocity_noise, dtype=float))),
             force=float(np.max(scenario.sensors.force_noise)),
             velocity_bandwidth=encoders.velocity_bandwidth or 0.0,
         ),
