@@ -9,6 +9,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.system.signals import Signal
+from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, FailureKind, TracedFunction
 
@@ -133,6 +134,33 @@ class Block:
     scale: FloatArray | None = None
     requirements: tuple[Requirement, ...] = ()
     signals: Mapping[str, Sequence[Signal]] = field(default_factory=dict)
+
+    def check(self) -> None:
+        """Refuses sizes that do not fit, and expressions of other symbols.
+
+        Raises:
+            ModelError: With the value and what would be right.
+        """
+        sizes = {"derivative": (self.derivative.numel(), self.state.numel())}
+        for name, each in self.held.items():
+            size = each.symbol.numel()
+            sizes[f"next of '{name}'"] = each.next.numel(), size
+            sizes[f"start of '{name}'"] = np.size(each.start), size
+        for name, (found, wanted) in sizes.items():
+            if found != wanted:
+                raise ModelError(
+                    f"block '{self.name}': {name} must have {wanted} entries, got {found}"
+                )
+        known = {symbol.element_hash() for symbol in ca.symvar(stacked([*self.columns().values()]))}
+        values = {"derivative": self.derivative, **self.outputs}
+        values |= {f"next of '{name}'": each.next for name, each in self.held.items()}
+        for name, value in values.items():
+            free = [s.name() for s in ca.symvar(value) if s.element_hash() not in known]
+            if free:
+                raise ModelError(
+                    f"block '{self.name}': {name} depends on {', '.join(free)}, which is none of "
+                    "its inputs, states, held values or parameters"
+                )
 
     def columns(self) -> dict[str, ca.SX]:
         """Source -> its symbols: "time", "state", "parameters", "held <name>", "input <name>"."""

@@ -105,7 +105,6 @@ def compile_diagram(
     outputs: Mapping[str, OutputPort] | None = None,
     *,
     context: Context | None = None,
-    merge: bool = False,
 ) -> Block:
     """A diagram as one block: the expressions of its blocks, with wires in place of inputs.
 
@@ -121,12 +120,11 @@ def compile_diagram(
         diagram: The diagram.
         outputs: Name -> an output port of a system in it; its own vector-valued ports if None.
         context: A context of the diagram, with the start; the default one if None.
-        merge: Whether held values of one rate become one group, which takes Drake less time.
 
     Raises:
         ModelError: An input port has neither a wire nor a value, or an output port has no vector.
     """
-    return compose(diagram, outputs, context=context, merge=merge).block
+    return compose(diagram, outputs, context=context).block
 
 
 def compose(
@@ -139,7 +137,8 @@ def compose(
 ) -> Composed:
     """As `compile_diagram`, with the places of the systems in the block.
 
-    With `is_whole` it has all blocks with states, also those on which no output depends.
+    With `merge` held values of one rate become one group, which takes Drake less time. With
+    `is_whole` it has all blocks with states, also those on which no output depends.
     """
     if outputs is None:
         every = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]

@@ -49,16 +49,6 @@ class Computation:
         return cls(traced.function, sources, outputs, traced)
 
 
-def zero(name: str, size: int = 1) -> Computation:
-    """Zeros for an input port without a wire, shape (size,)."""
-    return Computation(ca.Function("zero", [], [ca.SX.zeros(size)]), (), (name,))
-
-
-def ones(name: str, size: int) -> Computation:
-    """Ones for an input port without a wire, shape (size,)."""
-    return Computation(ca.Function("ones", [], [ca.SX.ones(size)]), (), (name,))
-
-
 @dataclass(frozen=True, eq=False)
 class Update:
     """The update of a block's discrete state at t_k = offset + k period.

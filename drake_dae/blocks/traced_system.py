@@ -74,6 +74,7 @@ class TracedSystem(LeafSystem):
         is_law: Whether it is a law for `equations`, and not a plant with these equations.
 
     Raises:
+        ModelError: Sizes of the block do not fit, or an expression depends on another symbol.
         SingularityError: A matrix that must be regular is singular during a run.
         NonFiniteError: A value is not finite during a run.
         SimulationError: A value does not exist, or the state cannot be projected, during a run.
@@ -86,6 +87,7 @@ class TracedSystem(LeafSystem):
     def __init__(
         self, block: Block, *, compiled: Compiled = False, sees_steps: bool | None = None
     ) -> None:
+        block.check()
         converter = SystemScalarConverter()
         for scalar, kind in _CONVERTED.items():
             converter._AddConstructor[scalar, float](partial(_convert, kind))

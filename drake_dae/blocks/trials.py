@@ -20,7 +20,6 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import (
     CacheEntry,
     Context,
-    DependencyTicket,
     EventStatus,
     LeafSystem,
     ValueProducer,
@@ -42,15 +41,6 @@ SHORTEST = 1e-12
 PACE_STEPS, LEAST_PROGRESS = 1000, 1e-8
 """The least increase of the time by so many steps, relative to the simulated time. A kink in a
 reference needs a few shorter steps, a state that grows without bound any number of them."""
-
-
-def state_tickets(system: LeafSystem) -> set[DependencyTicket]:
-    """The dependencies of a function of the continuous state, which include the time.
-
-    After a rejected step, Drake's runge_kutta5 and bogacki_shampine3 restore the state without
-    invalidating its cache entries (Drake 1.51). They restore the time as well, which does.
-    """
-    return {system.xc_ticket(), system.time_ticket()}
 
 
 _DONE = EventStatus.DidNothing()

@@ -123,7 +123,8 @@ def _analyze(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     path = find_scenario(options.scenario)
     with waiting(f"analyzing {path.stem}"):
         report = find_feasibility(load_scenario(path, options.settings))
-    print(f"{path.stem}\n\n{report}")
+    if not options.json:
+        print(f"{path.stem}\n\n{report}")
     return 2 if report.problems else 0, {"scenario": path.stem, **report.to_dict()}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import HELD, Computations, Update
+from drake_dae.blocks.computations import HELD, Computations
 from drake_dae.blocks.traced_system import context_in
 from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
@@ -74,11 +74,6 @@ class CompiledDiagram:
         """(time, state, held, parameters) -> all outputs stacked, validity."""
         return self._function("row", self._values["row"])
 
-    def rate_index(self, update: Update) -> int:
-        """The index in `rates` of the function that computes an update."""
-        keys = [(rate.period, rate.offset, rate.is_unrestricted) for rate in self.rates]
-        return keys.index((update.period, update.offset, update.is_unrestricted))
-
     @cached_property
     def staged(self) -> Mapping[str, ca.Function]:
         """Name -> function, with all that depends only on time and parameters precomputed.
@@ -117,32 +112,6 @@ class CompiledDiagram:
             groups = [block.stepped.held(local)] if block.stepped else discrete_states(local)
             held[part] = np.concatenate(groups)
         return state, held
-
-    def set_context(
-        self,
-        context: Context,
-        time: float,
-        state: FloatArray,
-        held: FloatArray,
-        parameters: FloatArray,
-    ) -> None:
-        """Sets time, state, discrete state and parameters in a context of the diagram."""
-        context.SetTime(time)
-        for system, part in self.states:
-            system.GetMyMutableContextFromRoot(context).SetContinuousState(state[part])
-        for system, part in self.held:
-            local = system.GetMyMutableContextFromRoot(context)
-            stops = np.cumsum([group.size for group in discrete_states(local)])
-            for i, values in enumerate(np.split(held[part], stops[:-1])):
-                local.SetDiscreteState(i, values)
-        for system, part in self.parameters:
-            local = system.GetMyMutableContextFromRoot(context)
-            stops = np.cumsum([group.size for group in numeric_parameters(local)])
-            for i, values in enumerate(np.split(parameters[part], stops[:-1])):
-                local.get_mutable_numeric_parameter(i).SetFromVector(values)
-        for system, name, part in self.fixed:
-            local = system.GetMyMutableContextFromRoot(context)
-            system.GetInputPort(name).FixValue(local, parameters[part])
 
     def initialized(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
-from pydrake.systems.framework import Context, Diagram, OutputPort
+from pydrake.systems.framework import Context, Diagram
 from pydrake.systems.primitives import RandomSource, VectorLogSink
 
 from drake_dae.arguments import checked
@@ -80,13 +80,6 @@ class ClosedLoop:
                 "which rollouts and exports need; run the loop by simulate"
             )
         return self.generator
-
-    @property
-    def state_source(self) -> OutputPort:
-        """The port of the state that the controller gets: estimated, measured, or the plant's."""
-        if self.observer is not None and self.observer.HasOutputPort("estimated_state"):
-            return self.observer.GetOutputPort("estimated_state")
-        return self.plant.GetOutputPort("state") if self.encoders is None else self.encoders.output
 
     def set_seed(self, context: Context, seed: int) -> None:
         """Sets the seed of the noise of the force sensor.

@@ -48,6 +48,19 @@ def pendulum() -> Block:
     )
 
 
+def test_what_is_no_block_is_refused():
+    x, y = ca.SX.sym("x", 2), ca.SX.sym("stray", 1)
+    one = ca.SX.sym("one", 1)
+    for arguments, told in (
+        ({"state": x, "derivative": x[0]}, "derivative must have 2 entries, got 1"),
+        ({"outputs": {"angle": y}}, "angle depends on stray"),
+        ({"held": {"one": Held(one, x, np.zeros(1), 0.1)}}, "next of 'one'"),
+        ({"held": {"one": Held(one, one, np.zeros(2), 0.1)}}, "start of 'one'"),
+    ):
+        with pytest.raises(ModelError, match=told):
+            TracedSystem(Block("bad", **arguments))
+
+
 def test_ports_depend_on_what_their_expressions_read():
     system = TracedSystem(pendulum())
     reads = {
@@ -150,7 +163,7 @@ def test_a_diagram_of_all_kinds_is_one_block():
     values = [diagram.GetOutputPort(n).Eval(simulator.get_context())[0] for n in ("sum", "last")]
 
     start = diagram.CreateDefaultContext()
-    block = compile_diagram(diagram, context=start, merge=True)
+    block = compile_diagram(diagram, context=start)
     assert list(block.inputs) == ["noise.output"]
     builder = DiagramBuilder()
     one = builder.AddSystem(TracedSystem(block))
