@@ -5,14 +5,15 @@ import signal
 from copy import deepcopy
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from runs import first_quick, scenario, some
 
-from drake_dae import RobotPlant, build_scenario, simulate
+from drake_dae import DaePlant, DaeSystem, RobotPlant, build_scenario, simulate
 from drake_dae.errors import SimulationError
 from drake_dae.simulation import compiled_run
 from drake_dae.simulation import simulate as simulation
@@ -163,6 +164,23 @@ def test_a_plant_without_a_log_moves_as_well(short_runs):
         ends.append(plant.state(own))
         assert np.abs(ends[-1] - start).max() > 1e-2
     assert_allclose(*ends, rtol=0, atol=1e-9)
+
+
+def test_a_trial_out_of_the_domain_does_not_end_it(short_runs):
+    """x' = 1000 (1 - x^2 sqrt(x)): long steps try an x without a root, and are made shorter."""
+    functions = {"f": lambda x: 1000.0 - 1000.0 * x**2 * ca.sqrt(x), "h": lambda x: 1}
+    root = DaeSystem.from_functions(1, l=lambda x: x, nominal_state=[0.5], name="root", **functions)
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(root))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.GetInputPort("control").FixValue(own, [0.0])
+    looks = []
+    config = SimulatorConfig(max_step_size=0.1, accuracy=1e-9)
+    run = simulate(diagram, context, 0.3, config, look=lambda now: looks.append(now.get_time()))
+    assert_allclose(plant.state(own), [1.0], rtol=1e-6)
+    assert len(looks) < run.steps / 16
 
 
 def test_each_step_is_seen_where_that_is_asked_for(short_runs):
