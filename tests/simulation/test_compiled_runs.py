@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from runs import first_quick, scenario, some
 
 from drake_dae import DaePlant, DaeSystem, RobotPlant, build_scenario, simulate
-from drake_dae.errors import SimulationError
+from drake_dae.errors import NonFiniteError, SimulationError
 from drake_dae.simulation import compiled_run
 from drake_dae.simulation import simulate as simulation
 from drake_dae.simulation.compiled_run import CompiledRun
@@ -169,7 +169,7 @@ def test_a_plant_without_a_log_moves_as_well(short_runs):
 def test_a_trial_out_of_the_domain_does_not_end_it(short_runs):
     """x' = 1000 (1 - x^2 sqrt(x)): long steps try an x without a root, and are made shorter."""
     functions = {"f": lambda x: 1000.0 - 1000.0 * x**2 * ca.sqrt(x), "h": lambda x: 1}
-    root = DaeSystem.from_functions(1, l=lambda x: x, nominal_state=[0.5], name="root", **functions)
+    root = DaeSystem.from_functions(1, l=lambda x: x, nominal_state=[2.0], name="root", **functions)
     builder = DiagramBuilder()
     plant = builder.AddSystem(DaePlant(root))
     diagram = builder.Build()
@@ -181,6 +181,14 @@ def test_a_trial_out_of_the_domain_does_not_end_it(short_runs):
     run = simulate(diagram, context, 0.3, config, look=lambda now: looks.append(now.get_time()))
     assert_allclose(plant.state(own), [1.0], rtol=1e-6)
     assert len(looks) < run.steps / 16
+    fixed = SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=0.01, use_error_control=False
+    )
+    context = diagram.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(plant.GetMyMutableContextFromRoot(context), [0.0])
+    with pytest.raises(NonFiniteError) as caught:
+        simulate(diagram, context, 0.3, fixed)
+    assert (caught.value.time, *caught.value.state) == (0.0, 2.0)
 
 
 def test_each_step_is_seen_where_that_is_asked_for(short_runs):
