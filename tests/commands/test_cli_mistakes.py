@@ -107,7 +107,7 @@ def test_a_reference_out_of_reach_ends_the_run_and_keeps_the_record(tmp_path, ca
     move = "references.tool.z=!PointToPoint {start: [0.3], end: [3], end_time: 0.3}"
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=0.5"]
     assert main([*arguments, "--set", move, "--set", "write.plots=false"]) == 1
-    assert re.match(r"error: .* at t = 0\.1\d+ s", error_line(capsys))
+    assert re.match(r"error: .* at t = 0\.1\d+ s.*, state \[", error_line(capsys))
     record = Record.load(tmp_path / "record.npz")
     assert 0.1 < record.time[-1] < 0.2
     assert 1.0 < record["controlled_output"][-1, 0] < 1.6
