@@ -130,8 +130,7 @@ from .systems.control.references import ReferenceGenerator as ReferenceGenerator
 from .systems.control.sampling import ControlHold as ControlHold
 from .systems.control.sampling import Sampling as Sampling
 from .systems.observing.estimator import StateEstimator as StateEstimator
-from .systems.observing.observer import DisturbanceObserver as DisturbanceObserver
-from .systems.observing.observer_rates import Observing as Observing
+from .systems.observing.observing import Observing as Observing
 from .systems.plants.contact.compliant_plant import CompliantPlant as CompliantPlant
 from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
 from .systems.plants.contact.contact_material import PointMaterial as PointMaterial

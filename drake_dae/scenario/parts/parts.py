@@ -10,7 +10,7 @@ from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots.constraints.friction import FrictionCone
-from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
@@ -86,7 +86,7 @@ class LargestErrors:
 
 @dataclass(frozen=True)
 class Estimator(Observing):
-    """The settings of a `DisturbanceObserver` or `StateEstimator` of model errors.
+    """The settings of a `StateEstimator` of model errors.
 
     Attributes:
         rate: k_o in 1/s, the rate of disturbances along the free directions; it is computed with
