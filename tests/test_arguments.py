@@ -34,6 +34,7 @@ from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError
 from drake_dae.pictures.scene.run_motion import ShownLoop
 from drake_dae.robots.constraints.constraint import Constraint
@@ -42,7 +43,6 @@ from drake_dae.robots.surfaces.surface import Surface
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation.records.record import Recorded
 from drake_dae.studies.runs import Outcome, RunResult
 
 

@@ -21,9 +21,9 @@ from drake_dae import (
 )
 from drake_dae.arrays import listed
 from drake_dae.dae.system.signals import Signal
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation.records.record import Recorded
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from test_record import same
 
 from drake_dae import Record, RecordWriter, build_scenario, simulate
 from drake_dae.errors import ModelError
-from drake_dae.simulation.records import record_writer
+from drake_dae.running.records import record_writer
 
 
 @pytest.fixture
