@@ -36,9 +36,7 @@ from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError
 from drake_dae.pictures.scene.run_motion import ShownLoop
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.surfaces.surface import Surface
+from drake_dae.robots import Constraint, Links, Surface
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario

@@ -48,9 +48,7 @@ from drake_dae.pictures.scene.view import (
     start_unwatched_meshcat,
     view_of_links,
 )
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.surfaces.surface import axes_along
+from drake_dae.robots import Constraint, ConstraintWrenches, axes_along
 from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.records.phases import PhaseSpan, phase_spans
 from drake_dae.simulation.records.record import Record

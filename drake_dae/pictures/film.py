@@ -51,7 +51,7 @@ from drake_dae.pictures.scene.run_motion import (
 )
 from drake_dae.pictures.scene.surroundings import surroundings
 from drake_dae.pictures.scene.view import ARROW, PIECE
-from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.robots import own_values
 from drake_dae.simulation.limits import robot_limits
 from drake_dae.simulation.records.phases import phase_spans, phases_at
 from drake_dae.simulation.records.record import Record

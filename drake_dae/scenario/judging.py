@@ -30,9 +30,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.links_behind import LinkBehind, links_behind
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind
 from drake_dae.scenario.build import tracking_law
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.gains import advised

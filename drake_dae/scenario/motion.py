@@ -13,8 +13,7 @@ from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.references.by_name import assign, in_order
 from drake_dae.references.reference import stack_references
-from drake_dae.robots.links_behind import links_behind
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel, links_behind
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_state

@@ -26,7 +26,7 @@ from drake_dae import (
 )
 from drake_dae.dae.structure.structure import Structure, find_structure
 from drake_dae.dae.tracking.gains import GainDesign
-from drake_dae.robots.actuation.stage import Stage
+from drake_dae.robots import Stage
 from drake_dae.scenario.shipped import FOLDER, find_scenario
 
 

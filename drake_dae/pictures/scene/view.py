@@ -29,7 +29,7 @@ from drake_dae.pictures.scene.surroundings import (
     scene_points,
     surroundings,
 )
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.robots import ConstraintWrenches
 from drake_dae.systems.plants.contract import Plant
 
 FRAME_RATE = 32.0
