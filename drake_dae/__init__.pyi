@@ -48,7 +48,6 @@ from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
 from .pictures.film import save_film as save_film
 from .pictures.runs import plot_runs as plot_runs
-from .pictures.scene.view import start_meshcat as start_meshcat
 from .references import CircleReference as CircleReference
 from .references import ConstantReference as ConstantReference
 from .references import CsvReference as CsvReference
@@ -113,6 +112,7 @@ from .scenario.model import complete_scenario as complete_scenario
 from .scenario.new import new_scenario as new_scenario
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
+from .scene.view import start_meshcat as start_meshcat
 from .simulation.records.record import Record as Record
 from .simulation.records.record_writer import RecordWriter as RecordWriter
 from .simulation.simulate import simulate as simulate

@@ -35,7 +35,7 @@ from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
 from drake_dae.errors import DrakeDaeError
-from drake_dae.pictures.scene.run_motion import ShownLoop
+from drake_dae.pictures.run_motion import ShownLoop
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.surfaces.surface import Surface

@@ -28,7 +28,7 @@ from drake_dae.simulation.records.record import Record
 if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.figure import Figure
 
-    from drake_dae.pictures.scene.run_motion import ContactPath
+    from drake_dae.pictures.run_motion import ContactPath
 
 PATHS = "path.png"
 """The plot of contact points that move on surfaces; omitted if there are none."""

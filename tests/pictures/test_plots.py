@@ -15,7 +15,7 @@ from drake_dae.pictures.plots import (
     plot_residual,
     save_plots,
 )
-from drake_dae.pictures.scene.run_motion import ContactPath
+from drake_dae.pictures.run_motion import ContactPath
 from drake_dae.simulation.records.phases import phase_spans, phases_at
 from drake_dae.simulation.records.record import Recorded
 
