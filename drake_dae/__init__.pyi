@@ -7,6 +7,7 @@ from .blocks.block import Block as Block
 from .blocks.block import Held as Held
 from .blocks.block import Requirement as Requirement
 from .blocks.compose import compile_diagram as compile_diagram
+from .blocks.symbolic import from_symbolic as from_symbolic
 from .blocks.traced_system import TracedSystem as TracedSystem
 from .dae import AdvisedGains as AdvisedGains
 from .dae import ConstraintStructure as ConstraintStructure
@@ -120,7 +121,6 @@ from .studies.sweep import sweep as sweep
 from .studies.variations import grid_variations as grid_variations
 from .studies.variations import listed_variations as listed_variations
 from .studies.variations import random_variations as random_variations
-from .symbolic import from_symbolic as from_symbolic
 from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController

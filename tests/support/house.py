@@ -26,7 +26,7 @@ FLOORS = (
     ("trace",),
     ("dae",),
     ("references",),
-    ("analysis", "symbolic", "robots"),
+    ("analysis", "robots"),
     ("blocks",),
     ("systems",),
     ("compiler",),

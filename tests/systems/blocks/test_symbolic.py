@@ -34,8 +34,8 @@ from pydrake.symbolic import min as smaller
 from pydrake.systems.primitives import SymbolicVectorSystem
 
 from drake_dae import find_structure
+from drake_dae.blocks.symbolic import from_symbolic, to_casadi
 from drake_dae.errors import ModelError
-from drake_dae.symbolic import from_symbolic, to_casadi
 
 # With arguments kept inside their domains: |sin e| <= 1.
 ONE = [
