@@ -29,11 +29,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 import drake_dae as dd
 from drake_dae.analysis.report import Assumption
 from drake_dae.blocks.block import Block
-from drake_dae.dae.derivatives import Derivatives
-from drake_dae.dae.elimination import Elimination
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.margins import RankMargin
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae import Derivatives, Elimination, Manifold, PinnedMotion, RankMargin
 from drake_dae.errors import DrakeDaeError
 from drake_dae.pictures.run_motion import ShownLoop
 from drake_dae.robots.constraints.constraint import Constraint

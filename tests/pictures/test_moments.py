@@ -7,7 +7,7 @@ import pytest
 from arms import arm
 from runs import scenario
 
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.pictures.event_marks import mark_phases
 from drake_dae.pictures.friction import friction_cones, slips
 from drake_dae.pictures.moments import RunEvent, RunEventKind, events_of, sorted_events

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from drake_dae import Record
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.pictures.plots import (
     PLOTS,
     plot_controls,

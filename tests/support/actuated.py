@@ -11,7 +11,7 @@ from arms import arm, consistent_states, numbers, touching
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_dae import RobotModel, find_structure
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae import Structure
 from drake_dae.robots.actuation.dc_motors import DcMotors
 from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
 from drake_dae.robots.actuation.hydraulics import ElectrohydraulicServos
