@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arguments import checked
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.links.kinematics import Kinematics

@@ -12,8 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, vector
-from drake_dae.dae.structure.redundancy import share_forces
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.actuation.stage import Stage

@@ -11,10 +11,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive, unknown_name
-from drake_dae.dae.beyond.disturbance import with_disturbance
-from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.dae.system.signals import outputs_named
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Structure, TrackingLaw, find_structure, outputs_named, with_disturbance
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import hold_before
 from drake_dae.diagrams.settings import LoopSettings

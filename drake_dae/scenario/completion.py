@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.by_name import denoted

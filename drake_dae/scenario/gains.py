@@ -9,16 +9,16 @@ import numpy as np
 from scipy.linalg import expm
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.beyond.advised_gains import (
-    EVERY,
-    MODEL_ERROR,
+from drake_dae.dae import (
     AdvisedGains,
+    ContactGains,
     SensedContact,
+    SensorNoise,
+    Structure,
     advised_gains,
+    contact_gains,
 )
-from drake_dae.dae.beyond.contact_gains import ContactGains, contact_gains
-from drake_dae.dae.beyond.one_direction import SensorNoise
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR
 from drake_dae.dae.tracking.model_of_law import damping_gains
 from drake_dae.errors import ScenarioError
 from drake_dae.references import Reference

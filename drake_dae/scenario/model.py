@@ -13,7 +13,7 @@ from drake_dae.analysis.analyze import examine
 from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.dae import Structure, find_structure
 from drake_dae.errors import (
     AssumptionError,
     GeometryWarning,

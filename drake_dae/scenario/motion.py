@@ -5,10 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, PinnedMotion, Structure, ZeroDynamics
 from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.references.by_name import assign, in_order

@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import Signal, ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots import Links, RobotModel

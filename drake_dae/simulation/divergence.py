@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import SimulationError
 from drake_dae.simulation.diagnosis import blocks_of
 from drake_dae.simulation.judgement import unit_sizes

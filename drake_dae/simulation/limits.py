@@ -7,7 +7,7 @@ import numpy as np
 
 from drake_dae.analysis.limits import LimitKind, SignalLimits, SignalRange
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots import FrictionCone, RobotModel
 from drake_dae.simulation.records.record import Record

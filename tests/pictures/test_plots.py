@@ -5,7 +5,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from drake_dae import Record
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.pictures.plots import (
     PLOTS,
     plot_controls,
@@ -15,7 +15,7 @@ from drake_dae.pictures.plots import (
     plot_residual,
     save_plots,
 )
-from drake_dae.pictures.scene.run_motion import ContactPath
+from drake_dae.pictures.run_motion import ContactPath
 from drake_dae.simulation.records.phases import phase_spans, phases_at
 from drake_dae.simulation.records.record import Recorded
 

@@ -9,7 +9,7 @@ from runs import some
 
 from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
 from drake_dae.arrays import show_state
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario

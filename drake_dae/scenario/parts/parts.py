@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, positive
-from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
+from drake_dae.dae import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots import FrictionCone
 from drake_dae.systems.observing.observer_rates import Observing

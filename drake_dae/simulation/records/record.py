@@ -14,7 +14,7 @@ from pydrake.systems.primitives import VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, numbers
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.files import MOST_RECORDED, check_file, open_file
 from drake_dae.simulation.records.columns import Recorded as Recorded

@@ -11,8 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import Block, Held, Requirement
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import ConstraintStructure, Signal, constraint_structure_of
 from drake_dae.errors import ModelError
 from drake_dae.robots import RobotModel
 from drake_dae.systems.parameterized import ParameterizedSystem
