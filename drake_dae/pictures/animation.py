@@ -24,9 +24,7 @@ from drake_dae.pictures.run_motion import (
     run_points,
     run_view,
 )
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.surfaces.surface import axes_along
+from drake_dae.robots import Constraint, ConstraintWrenches, axes_along
 from drake_dae.scene.arrows import (
     FORCE_COLOR,
     LEAST_SCALE,

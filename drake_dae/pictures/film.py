@@ -47,7 +47,7 @@ from drake_dae.pictures.run_motion import (
     run_points,
     run_view,
 )
-from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.robots import own_values
 from drake_dae.scene.floor import floor_below
 from drake_dae.scene.framing import ViewAngles
 from drake_dae.scene.surroundings import surroundings
