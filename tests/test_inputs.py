@@ -41,7 +41,7 @@ from drake_dae import (
 )
 from drake_dae.arrays import brief, numbers
 from drake_dae.cli import main
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
 from drake_dae.pictures.axes import labelled

@@ -8,9 +8,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.analysis.tables import count_of
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.region import Region
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Manifold, Region
 from drake_dae.errors import InconsistentStateError, ModelError
 
 Bounds = Mapping[str, tuple[float, float]]

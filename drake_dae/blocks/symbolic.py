@@ -12,8 +12,7 @@ from pydrake.symbolic import Expression, ExpressionKind, Formula, FormulaKind, V
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import numbers
-from drake_dae.dae.system.signals import Parameter, Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Parameter, Signal
 from drake_dae.errors import ModelError
 
 _FUNCTIONS: dict[ExpressionKind, Callable[..., ca.SX]] = {

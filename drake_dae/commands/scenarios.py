@@ -16,7 +16,7 @@ from drake_dae.arrays import number_in
 from drake_dae.commands.parser import Parser, program, waiting
 from drake_dae.errors import DrakeDaeError, GeometryWarning, ScenarioError, SimulationError
 from drake_dae.files import check_unwritten
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots import Vector
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import load_scenario

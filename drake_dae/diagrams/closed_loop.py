@@ -13,7 +13,7 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.record import Record, computed_record, recorded_values
 from drake_dae.diagrams.sources import seed_noise

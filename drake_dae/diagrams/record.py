@@ -14,7 +14,7 @@ from pydrake.systems.primitives import VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, numbers
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record_columns import Recorded as Recorded
 from drake_dae.diagrams.record_columns import label, read_csv, write_csv
 from drake_dae.diagrams.versions import versions

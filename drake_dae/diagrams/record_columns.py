@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from drake_dae.arrays import FloatArray, brief, listed, number_in, numbers
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 
 TIME = "time"

@@ -6,7 +6,7 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from drake_dae.arguments import checked
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import add_drives, hold_before
 from drake_dae.diagrams.force_feedback import add_force_feedback

@@ -16,18 +16,16 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
+from drake_dae.pictures.friction import DrawnFrictionCone, friction_cones, slips
 from drake_dae.pictures.moments import RunEvent, event_kinds, events_of, sorted_events
-from drake_dae.pictures.scene.friction import DrawnFrictionCone, friction_cones, slips
-from drake_dae.pictures.scene.run_motion import (
+from drake_dae.pictures.run_motion import (
     RunMotion,
     ShownLoop,
     follow,
     run_points,
     run_view,
 )
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.surfaces.surface import axes_along
+from drake_dae.robots import Constraint, ConstraintWrenches, axes_along
 from drake_dae.running.limits import robot_limits
 from drake_dae.running.phases import PhaseSpan, phase_spans
 from drake_dae.scene.arrows import (

@@ -36,19 +36,19 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
+from drake_dae.pictures.film_marks import FilmMarks
+from drake_dae.pictures.friction import slips
+from drake_dae.pictures.labels import label_box, reserved_pixels
 from drake_dae.pictures.moments import RunEvent, events_of, sorted_events
-from drake_dae.pictures.scene.film_marks import FilmMarks
-from drake_dae.pictures.scene.friction import slips
-from drake_dae.pictures.scene.labels import label_box, reserved_pixels
-from drake_dae.pictures.scene.rendered import rendered
-from drake_dae.pictures.scene.run_motion import (
+from drake_dae.pictures.rendered import rendered
+from drake_dae.pictures.run_motion import (
     RunMotion,
     ShownLoop,
     follow,
     run_points,
     run_view,
 )
-from drake_dae.robots.constraint_wrenches import own_values
+from drake_dae.robots import own_values
 from drake_dae.running.limits import robot_limits
 from drake_dae.running.phases import phase_spans, phases_at
 from drake_dae.scene.floor import floor_below

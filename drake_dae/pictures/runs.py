@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.pictures.axes import decades, grid, labelled, legend, round_off

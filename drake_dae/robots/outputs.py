@@ -8,8 +8,7 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
-from drake_dae.dae.system.fields import as_expression
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal, as_expression
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import position_index

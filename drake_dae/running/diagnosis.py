@@ -10,11 +10,7 @@ from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray, show_state
 from drake_dae.blocks.failures import cannot_go_on, singular_configuration
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.zero_dynamics.pinned_motion import EndCause, MotionEnd
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import ConstraintStructure, EndCause, MotionEnd, Signal, Structure, ZeroDynamics
 from drake_dae.errors import (
     DrakeDaeError,
     PainleveError,

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record, computed_record, recorded_values
 from drake_dae.errors import SimulationError
 from drake_dae.running.diagnosis import blocks_of

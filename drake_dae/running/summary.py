@@ -10,7 +10,7 @@ import numpy as np
 
 from drake_dae.analysis.limits import LimitKind, SignalRange
 from drake_dae.analysis.tables import Table
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record
 from drake_dae.running.judgement import (
     ROUND_OFF,

@@ -15,8 +15,7 @@ from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
 from drake_dae.references import Reference
-from drake_dae.robots.actuation.stage import Stage
-from drake_dae.robots.force_outputs import ForceOutput
+from drake_dae.robots import ForceOutput, Stage
 from drake_dae.running.simulate import check_config, check_duration
 from drake_dae.scenario.forms import values
 from drake_dae.scenario.forms.forms import Reader

@@ -28,6 +28,7 @@ TOPICS = {
     "compiler": "Diagrams as functions",
     "scenario": "Scenarios",
     "studies": "Studies",
+    "scene": "The view in Meshcat",
     "pictures": "Pictures",
     "errors": "Errors",
 }

@@ -9,8 +9,7 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from drake_dae import ConstantReference, DaeSystem, SinusoidReference, ZeroDynamics, load_scenario
 from drake_dae.analysis.limits import LimitKind, SignalLimits, limits_along
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal, find_structure
 from drake_dae.errors import ScenarioError
 from drake_dae.running.judgement import FindingKind
 from drake_dae.running.limits import robot_limits

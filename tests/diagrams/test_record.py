@@ -20,7 +20,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.arrays import listed
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.scenario.shipped import find_scenario

@@ -9,7 +9,7 @@ from runs import scenario
 
 from drake_dae import Record, build_scenario, simulate
 from drake_dae.cli import main
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.pictures.runs import plot_runs

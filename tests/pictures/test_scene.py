@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from runs import scenario, some
 
 from drake_dae.pictures.film import _HEIGHT, _TOP, _WIDTH, _Scene
-from drake_dae.pictures.scene.labels import label_box, overlap, reserved_pixels
-from drake_dae.pictures.scene.run_motion import follow, run_points
+from drake_dae.pictures.labels import label_box, overlap, reserved_pixels
+from drake_dae.pictures.run_motion import follow, run_points
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scene.floor import floor_below

@@ -9,7 +9,7 @@ from runs import some
 
 from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
 from drake_dae.arrays import show_state
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record, Recorded
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
 from drake_dae.running.divergence import DivergenceWatch

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.robots.surfaces.surface import (

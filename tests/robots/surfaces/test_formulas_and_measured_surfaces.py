@@ -18,7 +18,7 @@ from drake_dae import (
     Sphere,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.robots import tangents
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.given import numpy_explained
 from drake_dae.trace.smoothness import find_flaw
