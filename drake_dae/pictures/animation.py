@@ -12,6 +12,7 @@ from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatCone, Rgba, Scene
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
+from drake_dae.analysis.limits import robot_limits
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.record import Record
@@ -26,7 +27,6 @@ from drake_dae.pictures.run_motion import (
     run_view,
 )
 from drake_dae.robots import Constraint, ConstraintWrenches, axes_along
-from drake_dae.running.limits import robot_limits
 from drake_dae.running.phases import PhaseSpan, phase_spans
 from drake_dae.scene.arrows import (
     FORCE_COLOR,

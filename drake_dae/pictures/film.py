@@ -32,6 +32,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from pydrake.systems.sensors import CameraInfo
 
+from drake_dae.analysis.limits import robot_limits
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.record import Record
@@ -49,7 +50,6 @@ from drake_dae.pictures.run_motion import (
     run_view,
 )
 from drake_dae.robots import own_values
-from drake_dae.running.limits import robot_limits
 from drake_dae.running.phases import phase_spans, phases_at
 from drake_dae.scene.floor import floor_below
 from drake_dae.scene.framing import ViewAngles

@@ -8,7 +8,6 @@ import numpy as np
 
 from drake_dae.analysis.limits import LimitKind, SignalLimits
 from drake_dae.diagrams.record import Record
-from drake_dae.running.limits import limited_values
 
 APART = 0.01
 """Events with the same text that follow each other within this fraction of the run are shown as
@@ -94,7 +93,7 @@ def _limits(record: Record, limits: SignalLimits) -> Iterator[RunEvent]:
     """Yields when a control or a joint reaches its limit."""
     controls = [signal.name for signal in record.signals["control"].signals]
     columns = zip(
-        limits.kinds, limits.signals, limited_values(limits, record).T, limits.bounds.T, strict=True
+        limits.kinds, limits.signals, limits.of_record(record).T, limits.bounds.T, strict=True
     )
     for kind, signal, values, (low, high) in columns:
         if kind in (LimitKind.FORCE, LimitKind.CONE):

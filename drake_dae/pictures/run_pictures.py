@@ -4,6 +4,7 @@ from pathlib import Path
 
 from pydrake.systems.framework import Context
 
+from drake_dae.analysis.limits import robot_limits
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.record import Record
 from drake_dae.files import complete
@@ -12,7 +13,6 @@ from drake_dae.pictures.friction import slips
 from drake_dae.pictures.moments import RunEvent, events_of, sorted_events
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
 from drake_dae.pictures.run_motion import RunMotion, ShownLoop, contact_paths, follow
-from drake_dae.running.limits import robot_limits
 from drake_dae.running.phases import phase_spans
 
 ANIMATION = "animation.html"
