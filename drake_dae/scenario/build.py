@@ -26,7 +26,7 @@ from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, references_of
 from drake_dae.scenario.parts.parts import Poles
-from drake_dae.scenario.robot_file.links import add_robot
+from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, task_controller

@@ -51,10 +51,8 @@ from drake_dae.scenario.forms.typed_yaml import dump_yaml
 from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
-from drake_dae.scenario.robot_file.changes import finalize
-from drake_dae.scenario.robot_file.links import robot_links
-from drake_dae.scenario.robot_file.loops import actuators_of, closing_joints, joints_of
-from drake_dae.scenario.robot_file.reading import needs_of, read_robot
+from drake_dae.scenario.robot_file.changes import actuators_of, closing_joints, joints_of
+from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 
