@@ -33,7 +33,7 @@ from drake_dae.running.limits import limited_values, robot_limits
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import tracking_law
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of

@@ -36,7 +36,7 @@ from drake_dae.robots import (
     triple,
     unique_names,
 )
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.mending import Mender
 from drake_dae.scenario.robot_file.mjcf import ARMATURE
 from drake_dae.scenario.robot_file.robot import Payload, Robot, RobotPlacement

@@ -29,7 +29,7 @@ from pydrake.multibody.parsing import PackageMap
 from drake_dae.arrays import brief, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.files import check_file, read_mesh
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.robot_file.xml_tree import read_xml
 from drake_dae.scenario.shipped import FOLDER

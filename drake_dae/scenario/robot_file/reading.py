@@ -27,7 +27,7 @@ from pydrake.multibody.tree import (
 
 from drake_dae.errors import DrakeDaeError, GeometryWarning, ModelError, RobotFileWarning
 from drake_dae.robots import Constraint, MultibodyExpressions, joint_names, plant_constraints
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.changes import (
     add_payloads,
     change_robot,

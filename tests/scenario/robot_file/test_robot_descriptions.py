@@ -9,9 +9,9 @@ from vendors import write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.files import described_robot
+from drake_dae.scenario.scenario import save_scenario
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
 
