@@ -137,7 +137,7 @@ class Squeeze(ForceOutput):
         return (Signal(self.name or f"{self.first}.{self.second}.squeeze", "N"),)
 
 
-def force_outputs(
+def as_force_outputs(
     forces: Sequence[str | ForceOutput] | None, constraints: ConstraintSet
 ) -> tuple[ForceOutput, ...]:
     """The force outputs of a list: a name is that force, None are all forces.

@@ -17,7 +17,7 @@ from drake_dae import (
     Sphere,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.robots import tangents
 from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.functions import TracedFunction
 

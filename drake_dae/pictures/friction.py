@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.pictures.moments import RunEvent, RunEventKind
-from drake_dae.pictures.scene.run_motion import RunMotion
+from drake_dae.pictures.run_motion import RunMotion
 from drake_dae.trace.functions import TracedFunction
 
 

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from drake_dae.arrays import FloatArray
+from drake_dae.pictures.friction import friction_cones
 from drake_dae.pictures.moments import RunEvent
-from drake_dae.pictures.scene.friction import friction_cones
-from drake_dae.pictures.scene.run_motion import RunMotion
-from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.pictures.run_motion import RunMotion
+from drake_dae.robots import tangents
 
 if TYPE_CHECKING:  # Loaded with the first film.
     from matplotlib.axes import Axes

@@ -19,17 +19,17 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.pictures.scene.arrows import ConstraintForceVisualizer, ForceArrows, path_of
-from drake_dae.pictures.scene.floor import Floor, floor_below
-from drake_dae.pictures.scene.framing import ViewAngles, direction_of, framed
-from drake_dae.pictures.scene.small_meshes import shrink_meshes
-from drake_dae.pictures.scene.surroundings import (
+from drake_dae.robots import ConstraintWrenches
+from drake_dae.scene.arrows import ConstraintForceVisualizer, ForceArrows, path_of
+from drake_dae.scene.floor import Floor, floor_below
+from drake_dae.scene.framing import ViewAngles, direction_of, framed
+from drake_dae.scene.small_meshes import shrink_meshes
+from drake_dae.scene.surroundings import (
     DrawnSurface,
     scene_extent,
     scene_points,
     surroundings,
 )
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.systems.plants.contract import Plant
 
 FRAME_RATE = 32.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.pictures.scene.surroundings import DrawnSurface
+from drake_dae.scene.surroundings import DrawnSurface
 
 _CELLS = 8.0
 """The approximate number of cells in the width of a scene."""
