@@ -31,7 +31,6 @@ from drake_dae.analysis.report import Assumption
 from drake_dae.blocks.block import Block
 from drake_dae.dae import Derivatives, Elimination, Manifold, PinnedMotion, RankMargin
 from drake_dae.errors import DrakeDaeError
-from drake_dae.pictures.run_motion import ShownLoop
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.surfaces.surface import Surface
@@ -157,7 +156,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
-    ShownLoop: loop,
 }
 
 # What fits an argument with a name, of all names or of one.
