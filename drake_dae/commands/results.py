@@ -8,12 +8,12 @@ from pydrake.systems.framework import Context
 from drake_dae.commands.folder import SCENARIO, load_run, runs_by_name, show
 from drake_dae.commands.parser import Parser, waiting
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.files import check_unwritten, complete
 from drake_dae.pictures import PLOTS
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
-from drake_dae.simulation.records.record import Record
 
 
 def _plot_options(parser: Parser) -> None:

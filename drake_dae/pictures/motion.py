@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import InconsistentStateError
 from drake_dae.robots import RobotModel
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
@@ -17,7 +18,6 @@ from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.scene.camera import direction_of, framed
 from drake_dae.scene.surroundings import scene_points
 from drake_dae.scene.view import FRAME_RATE
-from drake_dae.simulation.records.record import Record
 
 _STILL = 1e-4
 """A path on a surface is omitted if its extent is below this fraction of the largest coordinate of

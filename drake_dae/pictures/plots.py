@@ -16,13 +16,13 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record, Recorded
 from drake_dae.errors import ModelError
 from drake_dae.files import complete
 from drake_dae.pictures.events import RunEvent, events_of, kinds_of
 from drake_dae.pictures.motion import ContactPath, contact_paths, follow
-from drake_dae.simulation.judgement import output_sizes
-from drake_dae.simulation.records.phases import phase_spans
-from drake_dae.simulation.records.record import Record, Recorded
+from drake_dae.running.judgement import output_sizes
+from drake_dae.running.phases import phase_spans
 
 _FIRST = ("controlled_output", "constraint_force", "control", "state")
 """The signals in which an entry's name is looked up first; of these the first has the outputs."""
@@ -377,7 +377,7 @@ def _set_decades(axis: Axes, floor: float) -> None:
 
 
 def _flatten(axis: Axes, values: FloatArray) -> None:
-    """Sets the range of an axis so that a signal that does not vary is a flat line, and no noise."""
+    """Sets the range of an axis so that what does not vary is a flat line, and no noise."""
     low, high = float(np.min(values)), float(np.max(values))
     scale = max(abs(low), abs(high), 1e-3)
     if high - low < 1e-4 * scale:

@@ -25,7 +25,7 @@ from drake_dae.robots.equations import (
     check_mass_matrix,
     robot_equations,
 )
-from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
+from drake_dae.robots.force_outputs import ForceOutput, as_force_outputs, force_rows
 from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
@@ -122,7 +122,7 @@ class RobotModel:
         bound = ConstraintSet(self.constraints)
         if forces is None and (outputs is None or not (links.actuator_signals or bound.motors)):
             forces = ()  # The robot is only simulated.
-        self.forces = force_outputs(forces, bound)
+        self.forces = as_force_outputs(forces, bound)
         S = force_rows(self.forces, bound, links)  # (40)
         self._num_forces = S.shape[0]
         h_1 = ca.vertcat(

@@ -19,9 +19,7 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.references import Reference
-from drake_dae.robots.known_forces import ScaledForce
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import Links, RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.forms.keys import at, each, violated
 from drake_dae.scenario.gains import advised

@@ -10,10 +10,14 @@ from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.model import RobotModel
-from drake_dae.robots.surfaces.surface import axes_along
+from drake_dae.robots import (
+    Constraint,
+    ConstraintWrenches,
+    RobotModel,
+    Wrenches,
+    axes_along,
+    own_values,
+)
 
 FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
 MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)

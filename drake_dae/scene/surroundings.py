@@ -9,10 +9,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
 
 from drake_dae.arrays import FloatArray
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.model import RobotModel
-from drake_dae.robots.surfaces.picture import PosedShape
+from drake_dae.robots import Constraint, ConstraintWrenches, PosedShape, RobotModel, own_values
 from drake_dae.trace.functions import TracedFunction
 
 _CELLS = 8.0

@@ -19,7 +19,7 @@ from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.robots import ConstraintWrenches
 from drake_dae.scene.arrows import ConstraintForceVisualizer, ForceArrows, path_of
 from drake_dae.scene.camera import direction_of, framed, view_angles
 from drake_dae.scene.meshes import shrink_meshes

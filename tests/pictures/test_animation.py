@@ -29,13 +29,13 @@ from drake_dae import (
     simulate,
     start_meshcat,
 )
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.pictures.motion import contact_paths, follow, frame_times
 from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.robots.surfaces import surfaces
 from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.scene.surroundings import diagonal, scene_points
-from drake_dae.simulation.records.record import Recorded
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 

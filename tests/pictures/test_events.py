@@ -8,8 +8,8 @@ from arms import arm
 
 from drake_dae import plot_runs
 from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record, Recorded
 from drake_dae.pictures.events import RunEventKind, events_of
-from drake_dae.simulation.records.record import Record, Recorded
 
 TIMES = np.linspace(0.0, 10.0, 101)
 

@@ -12,10 +12,8 @@ from pydrake.systems.framework import BasicVector, LeafSystem
 
 from drake_dae import Controller, ForceOutput, Plant, PointOnSurface
 from drake_dae.dae import Signal
+from drake_dae.robots import Application, AttachedStage, Constraint, Stage, Surface
 from drake_dae.robots.actuation.numbers import diagonal_parameter
-from drake_dae.robots.actuation.stage import AttachedStage, Stage
-from drake_dae.robots.constraints.constraint import Application, Constraint
-from drake_dae.robots.surfaces.surface import Surface
 from drake_dae.systems.task.phases import Phase
 
 

@@ -8,10 +8,9 @@ import numpy as np
 from drake_dae.analysis.limits import LimitKind, SignalLimits, SignalRange
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.friction import FrictionCone
-from drake_dae.robots.model import RobotModel
-from drake_dae.simulation.records.record import Record
+from drake_dae.robots import FrictionCone, RobotModel
 
 
 def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> SignalLimits:
