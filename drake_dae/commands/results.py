@@ -13,7 +13,7 @@ from drake_dae.errors import ModelError
 from drake_dae.files import check_unwritten, complete
 from drake_dae.pictures import PLOTS
 from drake_dae.scenario.build import build_scenario
-from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.scenario import load_scenario
 
 
 def _plot_options(parser: Parser) -> None:
