@@ -48,7 +48,7 @@ from .diagrams.wiring import wire_loop as wire_loop
 from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
 from .pictures.film import save_film as save_film
-from .pictures.runs import plot_runs as plot_runs
+from .pictures.plots import plot_runs as plot_runs
 from .references import CircleReference as CircleReference
 from .references import ConstantReference as ConstantReference
 from .references import CsvReference as CsvReference

@@ -32,7 +32,6 @@ from drake_dae.blocks.block import Block
 from drake_dae.dae import Derivatives, Elimination, Manifold, PinnedMotion, RankMargin
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError
-from drake_dae.pictures.run_motion import ShownLoop
 from drake_dae.robots import Constraint, Links, Surface
 from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
@@ -155,7 +154,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
-    ShownLoop: loop,
 }
 
 # What fits an argument with a name, of all names or of one.
