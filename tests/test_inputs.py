@@ -41,13 +41,12 @@ from drake_dae import (
 )
 from drake_dae.arrays import brief, numbers
 from drake_dae.cli import main
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
-from drake_dae.pictures.axes import labelled
-from drake_dae.scenario.forms.typed_yaml import load_yaml
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.simulation.records.record import Recorded
+from drake_dae.scenario.typed_yaml import load_yaml
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
@@ -327,10 +326,6 @@ def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
         Record.load(tmp_path / "record.npz")
     with pytest.raises(ModelError, match="nowhere"):
         Record.load("nowhere")
-
-
-def test_dollars_in_names_are_no_mathematics():
-    assert labelled(Signal("$x^$", "m")) == r"\$x^\$ [m]"
 
 
 def test_a_folder_that_is_none(tmp_path, capsys):

@@ -11,10 +11,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive, unknown_name
-from drake_dae.dae.beyond.disturbance import with_disturbance
-from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.dae.system.signals import outputs_named
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Structure, TrackingLaw, find_structure, outputs_named, with_disturbance
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import hold_before
 from drake_dae.diagrams.settings import LoopSettings
@@ -22,16 +19,14 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.references import Reference
-from drake_dae.robots.known_forces import ScaledForce
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import Links, RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.forms.keys import at, each, violated
+from drake_dae.scenario.form import at, each
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, references_of
-from drake_dae.scenario.parts.parts import Poles
-from drake_dae.scenario.robot_file.links import add_robot
+from drake_dae.scenario.parts import Poles
+from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, task_controller
@@ -78,7 +73,9 @@ def build_completed(
         try:
             structure = scenario_structure(model)
         except AssumptionError as error:
-            raise violated(error) from error
+            key = "constraints" if error.assumption <= 3 else "outputs"
+            hint = "" if error.state is None else "; start.positions choose another start"
+            raise ScenarioError((key, f"{error}{hint}")) from error
 
     # The gains, with what belongs to them.
     chosen = advised(completed.scenario, model, structure)

@@ -26,14 +26,15 @@ FLOORS = (
     ("trace",),
     ("dae",),
     ("references",),
-    ("analysis", "symbolic", "robots"),
+    ("robots",),
     ("blocks",),
     ("systems",),
+    ("scene",),
     ("compiler",),
-    ("simulation",),
-    ("pictures",),
     ("diagrams",),
+    ("analysis",),
     ("running",),
+    ("pictures",),
     ("scenario",),
     ("studies",),
     ("drake_dae",),
@@ -44,10 +45,13 @@ FLOORS = (
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 # The mathematics can be read, tested and used without Drake.
-WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references", "analysis")
+WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references")
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
+    "signals",
+    "contacts",
+    "fields",
     "system",
     "manifold",
     "derivatives",

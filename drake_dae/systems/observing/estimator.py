@@ -11,8 +11,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive
 from drake_dae.blocks.block import Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.observing.sample import EstimatorSample

@@ -10,11 +10,10 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, where_finite
+from drake_dae.dae import Lags, Observation, TrackingLaw
 from drake_dae.dae.beyond.chain_filter import ChainFilter
-from drake_dae.dae.beyond.disturbance import DISTURBANCE, Observation
+from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.beyond.friction_share import Metric, beside, shares
-from drake_dae.dae.beyond.lags import Lags
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.observing.parameter_filter import ParameterFilter, Sampled
@@ -624,8 +623,7 @@ class EstimatorSample:
         is_moved, sticks = wanted > self._least_speed, memory.slid == 0
         ahead = -ca.mtimes(towards.T, error) > CLEAR * ca.sqrt(ca.sum1(towards**2 * squares).T)
         aside = [
-            ca.sumsqr(ca.mtimes(plane.T, error))
-            > CLEAR**2 * ca.dot(ca.sum2(plane**2), squares)
+            ca.sumsqr(ca.mtimes(plane.T, error)) > CLEAR**2 * ca.dot(ca.sum2(plane**2), squares)
             for plane in contact.planes
         ]
         leaves = ca.logic_or(ca.logic_and(is_moved, ahead), ca.vertcat(*aside))

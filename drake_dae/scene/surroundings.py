@@ -1,0 +1,175 @@
+"""What surrounds a robot in a picture: the surfaces that it touches, and a grid below it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import Box, SceneGraph, Shape
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import BodyIndex
+
+from drake_dae.arrays import FloatArray
+from drake_dae.robots import Constraint, ConstraintWrenches, PosedShape, RobotModel, own_values
+from drake_dae.trace.functions import TracedFunction
+
+_CELLS = 8.0
+"""The approximate number of grid cells along the diagonal of a scene."""
+
+_NEAR = 0.1
+"""The grid is on a horizontal surface that is nearer to the lowest point than this fraction of the
+scene's diagonal."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnSurface:
+    """A surface that one or several constraints touch.
+
+    Attributes:
+        constraint: The first of these constraints.
+        pose: The pose of the surface's frame in the world.
+        picture: The shape, and its pose in the surface's frame.
+    """
+
+    constraint: Constraint
+    pose: RigidTransform
+    picture: PosedShape
+
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """A horizontal grid: the side of a cell, and the ends of its lines, m, shape (k, 3) each."""
+
+    cell: float
+    begins: FloatArray
+    ends: FloatArray
+
+
+def surroundings(
+    model: RobotModel,
+    acting: ConstraintWrenches,
+    points: FloatArray,
+    parameters: FloatArray,
+    size: float,
+) -> list[DrawnSurface]:
+    """The surfaces that a robot touches, each only once: two at one pose would flicker.
+
+    An unbounded surface is drawn as a piece of at least this size around its contact points, which
+    are (times, constraints, 3).
+    """
+    constraints = acting.constraints
+
+    def piece(row: int, contacts: FloatArray) -> DrawnSurface | None:
+        values = own_values(constraints[row], model.dae, parameters)
+        low, high = contacts.min(axis=0), contacts.max(axis=0)
+        nearest = np.argmin(np.linalg.norm(contacts - (low + high) / 2, axis=1))
+        extent = max(size, 1.4 * float(np.linalg.norm(high - low)))
+        picture = constraints[row].picture(values, contacts[nearest], extent)
+        if picture is None:
+            return None
+        pose = constraints[row].placement(values)
+        return DrawnSurface(constraints[row], pose, picture.moved(pose.inverse()))
+
+    groups = list[list[int]]()
+    for row in range(len(constraints)):
+        if piece(row, points[:, row]) is None:
+            continue
+        for group in groups:
+            if any(p.exogenous for k in (row, group[0]) for p in constraints[k].parameters):
+                continue
+            contacts = points[:, [*group, row]].reshape(-1, 3)
+            if _coincide(piece(group[0], contacts), piece(row, contacts)):
+                group.append(row)
+                break
+        else:
+            groups.append([row])
+    pieces = [piece(group[0], points[:, group].reshape(-1, 3)) for group in groups]
+    return [surface for surface in pieces if surface is not None]
+
+
+def _coincide(first: DrawnSurface | None, second: DrawnSurface | None) -> bool:
+    if first is None or second is None:
+        return False
+    poses = [surface.pose @ surface.picture.pose for surface in (first, second)]
+    form, other = first.picture.form, second.picture.form
+    if not poses[0].IsNearlyEqualTo(poses[1], 1e-9):
+        return False
+    if isinstance(form, Shape) or isinstance(other, Shape):
+        return repr(form) == repr(other)
+    return np.array_equal(form.vertices(), other.vertices())
+
+
+def floor_below(points: FloatArray, surfaces: Sequence[DrawnSurface] = ()) -> Floor:
+    """A grid slightly below points, m, shape (k, 3), or on a horizontal plane near the lowest.
+
+    The side of a cell is 1, 2 or 5 times a power of ten.
+    """
+    size, low, high = diagonal(points), points.min(axis=0), points.max(axis=0)
+    power = 10.0 ** np.floor(np.log10(size / _CELLS) + 1e-9)
+    cell = power * max(step for step in (1, 2, 5) if step * power <= size / _CELLS * (1 + 1e-9))
+    height = low[2] - 0.003 * size
+    for surface in surfaces:
+        pose, form = surface.pose @ surface.picture.pose, surface.picture.form
+        if isinstance(form, Box) and pose.rotation().matrix()[2, 2] > 1.0 - 1e-6:
+            level = pose.translation()[2] + form.height() / 2.0
+            if abs(level - low[2]) < _NEAR * size:
+                height = level + 0.003 * size
+    first, last = np.floor(low[:2] / cell) - 1, np.ceil(high[:2] / cell) + 1
+    xs, ys = (cell * np.arange(a, b + 0.5) for a, b in zip(first, last, strict=True))
+    begins = [*((x, ys[0], height) for x in xs), *((xs[0], y, height) for y in ys)]
+    ends = [*((x, ys[-1], height) for x in xs), *((xs[-1], y, height) for y in ys)]
+    return Floor(float(cell), np.array(begins), np.array(ends))
+
+
+def diagonal(points: FloatArray) -> float:
+    """The diagonal of the bounding box of points, shape (k, 3), at least 1 mm."""
+    return max(float(np.linalg.norm(np.ptp(points, axis=0))), 1e-3)
+
+
+def scene_points(
+    model: RobotModel,
+    wrenches: ConstraintWrenches,
+    states: FloatArray,
+    scene_graph: SceneGraph | None = None,
+) -> FloatArray:
+    """Points that enclose a robot and its contact points, m, shape (k, 3).
+
+    Args:
+        model: The robot.
+        wrenches: Its constraint wrenches.
+        states: x, or only its first part, the link state (q, v), one row for each time.
+        scene_graph: The geometry of its links; None if only the links' origins count.
+    """
+    links, dae = model.links, model.dae
+    # The world's origin is not a part of the robot.
+    own = [k for k, name in enumerate(links.landmark_names) if name != "world"]
+    origins = links.landmarks()[:, own] if own else links.landmarks()
+    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
+    landmarks = TracedFunction("landmarks", inputs, {"points": origins})
+    no_force, points = np.zeros(len(dae.force_signals)), []
+    for state in states:
+        values = landmarks(state[: links.q.numel()], dae.parameter_values)[0]
+        points += [values.reshape(3, -1, order="F").T, wrenches(state, no_force).points]
+    return np.vstack([*points, _corners(model, states, scene_graph)])
+
+
+def _corners(model: RobotModel, states: FloatArray, scene_graph: SceneGraph | None) -> FloatArray:
+    """Corners and middles of the bounding boxes of the links' geometry, m, (k, 3)."""
+    plant, corners = model.links.plant, [np.zeros((0, 3))]
+    if scene_graph is None or plant is None or plant.get_source_id() is None:
+        return corners[0]
+    inspector, context = scene_graph.model_inspector(), plant.CreateDefaultContext()
+    signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1)
+    boxes = []
+    for body in map(plant.get_body, map(BodyIndex, range(1, plant.num_bodies()))):
+        for geometry in plant.GetVisualGeometriesForBody(body):
+            try:
+                box = inspector.GetObbInGeometryFrame(geometry)
+            except RuntimeError:  # A mesh that Drake does not read, or without extent.
+                continue
+            if box is not None:
+                pose = inspector.GetPoseInFrame(geometry) @ box.pose()
+                boxes.append((body, pose.multiply(signs * box.half_width()[:, None])))
+    for state in states:
+        plant.SetPositions(context, state[: plant.num_positions()])
+        corners += [plant.EvalBodyPoseInWorld(context, body).multiply(box).T for body, box in boxes]
+    return np.vstack(corners)
