@@ -70,7 +70,7 @@ def add_observer(
         )
     late = 0.0 if sampling is None else sampling.delay + step
     lag, delay = control_lag(plant, sampling), late + period / 2.0
-    noise = (0.0, 0.0)
+    noise = np.zeros(()), np.zeros(())
     if estimates:
         noise = _check_encoders(encoders)
     try:
