@@ -116,11 +116,7 @@ from .scenario.scenario import load_scenario as load_scenario
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .scene.view import start_meshcat as start_meshcat
-from .studies.study import Study as Study
 from .studies.sweep import sweep as sweep
-from .studies.variations import grid_variations as grid_variations
-from .studies.variations import listed_variations as listed_variations
-from .studies.variations import random_variations as random_variations
 from .systems.control.commanded import CommandedReferences as CommandedReferences
 from .systems.control.contract import Controller as Controller
 from .systems.control.controller import TrackingController as TrackingController
