@@ -1,5 +1,6 @@
-"""Many runs of one scenario: what varies, processes, tables."""
+"""Many runs of one scenario."""
 
-from drake_dae.studies.study import Study as Study
-from drake_dae.studies.sweep import sweep as sweep
-from drake_dae.studies.variations import make_variations as make_variations
+import lazy_loader
+
+# The names stand in __init__.pyi, and are loaded when they are asked for.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
