@@ -24,13 +24,7 @@ def log_signals(
     controller: Controller,
     named: Named,
 ) -> VectorLogSink:
-    """Exports all signals, and logs them as one vector.
-
-    Args:
-        builder: The builder of the diagram.
-        plant, controller: The blocks.
-        named: The signals.
-    """
+    """Exports all signals, and logs them as one vector."""
     for name, (port, _) in named.items():
         builder.ExportOutput(port, name)
     for name in controller.shown:
@@ -96,11 +90,6 @@ def log_steps(builder: DiagramBuilder, ports: Sequence[OutputPort], plant: Plant
 
     For a discrete plant the log is periodic, since after the last step of a run the state of the
     plant belongs to a time that the run has not reached.
-
-    Args:
-        builder: The builder of the diagram.
-        ports: The ports.
-        plant: The plant.
     """
     stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
     stacked.set_name("logged_signals")

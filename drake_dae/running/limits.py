@@ -14,15 +14,7 @@ from drake_dae.robots import FrictionCone, RobotModel
 
 
 def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> SignalLimits:
-    """The limits of a robot: efforts of drives and joints, positions, speeds, pushing, cones.
-
-    Args:
-        model: The robot.
-        cones: Friction cones of contacts that must not slide.
-
-    Raises:
-        ModelError: A cone names a force that the robot does not have.
-    """
+    """The limits of a robot: efforts of drives and joints, positions, speeds, pushing, cones."""
     dae, links, loops = model.dae, model.links, model.loop_joints
     control = ca.SX.sym("u", dae.num_controls)
     force = ca.SX.sym("force", len(dae.force_signals))

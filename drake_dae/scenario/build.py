@@ -54,16 +54,7 @@ def build_scenario(
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:
-    """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly.
-
-    Args:
-        scenario, meshcat: As for `build_scenario`.
-        commanded: Whether a person changes references during the run; signals for which a task
-            waits are then inputs of the diagram.
-
-    Returns:
-        The scenario with outputs, start and gains, the choices in words, and the loop.
-    """
+    """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly."""
     # The robot, with the outputs and the start that the scenario leaves out.
     if scenario.task is not None:
         check_task(scenario)
@@ -140,16 +131,7 @@ def build_completed(
 
 
 def make_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> Plant:
-    """Makes the plant of a scenario.
-
-    Args:
-        scenario: The scenario.
-        model: The robot, with payloads if the plant does not add them itself.
-        structure: The structure of the model's system.
-
-    Raises:
-        ScenarioError: The robot cannot be simulated so; the message names the key.
-    """
+    """Makes the plant of a scenario."""
     check_disturbances(scenario.plant.disturbances, model.links)
     add = partial(add_robot, scenario.robot, payloads=scenario.plant.payloads)
     try:

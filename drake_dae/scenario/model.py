@@ -51,15 +51,7 @@ _LARGE = 30.0
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
-    """The robot model of a scenario: constraints, outputs and actuation.
-
-    Args:
-        scenario: What `load_scenario` returns.
-        scene_graph: The scene graph of the robot's geometry; needed to draw it.
-
-    Raises:
-        ScenarioError: Something does not fit; the message names its key.
-    """
+    """The robot model of a scenario: constraints, outputs and actuation."""
     return completed_model(scenario, scene_graph)[1]
 
 
@@ -105,18 +97,7 @@ def completed_model(
     drawn: bool = True,
     robot: RobotLinks | None = None,
 ) -> tuple[Completed, RobotModel, Structure | None]:
-    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads.
-
-    Args:
-        scenario: What `load_scenario` returns.
-        scene_graph: The scene graph of the robot's geometry, or None.
-        payloads: The payloads.
-        drawn: Whether the scene graph, if there is one, will be drawn.
-        robot: What `robot_links` made of the other arguments; None to read the robot.
-
-    Returns:
-        The completed scenario, its robot, and the structure if it was examined already.
-    """
+    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads."""
     if robot is None:
         drawn = drawn and scene_graph is not None
         robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)
@@ -231,23 +212,14 @@ def _model(
 
 
 def scenario_structure(model: RobotModel) -> Structure:
-    """The structure of a scenario's robot.
-
-    Raises:
-        AssumptionError: The robot violates an assumption of the theory.
-        ScenarioError: The robot's start is not near its constraints.
-    """
+    """The structure of a scenario's robot."""
     _check_outputs(model)
     with _near_constraints():
         return find_structure(model.dae)
 
 
 def examine_scenario(model: RobotModel) -> Analysis:
-    """What `analyze` finds of a scenario's robot, without its motion.
-
-    Raises:
-        ScenarioError: The robot's start is not near its constraints.
-    """
+    """What `analyze` finds of a scenario's robot, without its motion."""
     _check_outputs(model)
     with _near_constraints():
         return examine(model.dae)

@@ -29,11 +29,7 @@ _SLACK = 1e-6
 def references_of(
     scenario: Scenario, outputs: Sequence[str], degrees: Sequence[int]
 ) -> list[Reference]:
-    """The references in the order of the outputs, each smooth enough for its degree.
-
-    Raises:
-        ScenarioError: One does not fit; the message names its key.
-    """
+    """The references in the order of the outputs, each smooth enough for its degree."""
     smooth = []
     for name, reference in scenario.references.items():
         with at(f"references.{name}"):
@@ -45,16 +41,7 @@ def references_of(
 def exogenous_references(
     scenario: Scenario, system: DaeSystem, needed: Sequence[int] | None = None
 ) -> list[Reference]:
-    """The references of the exogenous parameters, in the order of the system.
-
-    Args:
-        scenario: The scenario.
-        system: The system of its plant or of its law.
-        needed: The number of derivatives of each entry that are needed; None to check none.
-
-    Raises:
-        ScenarioError: There are too few or too many, or one is not smooth enough.
-    """
+    """The references of the exogenous parameters, in the order of the system."""
     moving: list[Reference] = []
     degrees = list(needed or ())
     for parameter in system.exogenous.moving:

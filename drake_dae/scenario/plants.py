@@ -66,19 +66,11 @@ class ScenarioPlant(ABC):
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
-        """Sets the numbers of `in_context` in a context of the plant.
-
-        Raises:
-            ModelError: They do not fit the plant.
-        """
+        """Sets the numbers of `in_context` in a context of the plant."""
 
     @abstractmethod
     def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
-        """Makes the plant of a robot, with the structure of its system.
-
-        Raises:
-            ScenarioError: The robot cannot be simulated so; the message names the key.
-        """
+        """Makes the plant of a robot, with the structure of its system."""
 
 
 @dataclass(frozen=True)
@@ -160,10 +152,6 @@ class OwnPlant(ScenarioPlant):
 
     Attributes:
         maker: The module and the class in it, as "my_plants:SpringyPlant".
-
-    Raises:
-        ModelError: The text is not a module and class; or, when the plant is made, there is no such
-            class.
     """
 
     maker: str

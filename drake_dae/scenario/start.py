@@ -28,14 +28,6 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     references plus the errors, with outputs as in its model, where `plant.parameters` may differ,
     and on the plant's constraints; a task at start.positions, in contact if its first phase needs
     it.
-
-    Args:
-        scenario: The scenario of the loop; start, plant.parameters, integrator, the numbers of
-            uncoupled gains, and the seed of the sensor may be others than those it was built with.
-        loop: What `build_completed` made.
-
-    Raises:
-        ScenarioError: There is no such start, or something does not fit; the message names the key.
     """
     context, plant = loop.diagram.CreateDefaultContext(), loop.plant
     _set_numbers(scenario, loop, context)
@@ -213,18 +205,7 @@ def start_state(
     parameters: FloatArray,
     of_law: FloatArray,
 ) -> FloatArray:
-    """The state at rest near start.positions, within limits, with given outputs.
-
-    Args:
-        scenario: The scenario.
-        model: Its robot.
-        outputs: z, shape (p,), as the law sees them.
-        parameters: Values of all parameters of the plant, for its constraints.
-        of_law: The same as the law assumes them, for the outputs.
-
-    Raises:
-        ModelError: There is none.
-    """
+    """The state at rest near start.positions, within limits, with given outputs."""
     count = len(model.position_signals)
     # By default near the start of the completion.
     guess = start_guess(scenario, model.links, model.nominal_positions)

@@ -13,11 +13,7 @@ from drake_dae.systems.task.controller import TaskController
 
 
 def check_task(scenario: Scenario) -> None:
-    """Checks that the keys of a scenario fit its task.
-
-    Raises:
-        ScenarioError: A key does not fit a task, or start.positions are missing.
-    """
+    """Checks that the keys of a scenario fit its task."""
     refused = {"references": "a task has the references of its phases; leave them out"}
     problems = [(key, text) for key, text in refused.items() if getattr(scenario, key)]
     if (task := scenario.task) is not None:
@@ -38,17 +34,7 @@ def check_task(scenario: Scenario) -> None:
 def task_controller(
     scenario: Scenario, model: RobotModel, law: TrackingLaw, period: float
 ) -> TaskController:
-    """The controller of a scenario with a task.
-
-    Args:
-        scenario: The scenario.
-        model: Its robot.
-        law: The law in contact.
-        period: The time between its samples in s; 0 for 1 ms.
-
-    Raises:
-        ScenarioError: Something does not fit; the message names its key.
-    """
+    """The controller of a scenario with a task."""
     task = scenario.task
     assert task is not None
     assert scenario.law.gains is not None  # advised.
