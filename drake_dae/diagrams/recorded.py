@@ -38,7 +38,7 @@ def signals_of_plant(
     plant: Plant,
     moving: ReferenceGenerator | None,
     reference: ReferenceGenerator | None,
-    law: TrackingLaw,
+    law: TrackingLaw | None,
     control: OutputPort,
 ) -> Named:
     """The signals of every plant and its inputs that a record contains."""
@@ -48,7 +48,7 @@ def signals_of_plant(
         named["exogenous"] = (moving.get_output_port(), signals)
     for name, signals in plant.port_signals.items():
         named[name] = (plant.GetOutputPort(name), signals)
-    if reference is not None:
+    if reference is not None and law is not None:
         named["reference"] = (reference.GetOutputPort("reference"), law.reference_signals)
     return {**named, "control": (control, dae.control_signals)}
 
