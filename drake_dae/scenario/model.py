@@ -10,6 +10,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.tree import BodyIndex
 
 from drake_dae.analysis.analyze import examine
+from drake_dae.analysis.limits import robot_limits
 from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
@@ -39,7 +40,6 @@ from drake_dae.robots import (
     links_behind,
     plant_constraints,
 )
-from drake_dae.running.limits import robot_limits
 from drake_dae.scenario.completion import Completed, completions
 from drake_dae.scenario.form import at, each
 from drake_dae.scenario.parts import make
@@ -352,11 +352,7 @@ def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> s
     if motion.ending is not None:
         return str(motion.ending)
     limits = robot_limits(model, scenario.judgement.friction_cones)
-    rows = zip(
-        motion.states, motion.controls, motion.constraint_inputs, motion.parameters, strict=True
-    )
-    values = np.array([limits.pinned_values(*row)[0].copy() for row in rows])
-    for one in limits.ranges(motion.times, values):
+    for one in limits.ranges(motion.times, limits.of_motion(motion)):
         # A start may be on the limit of a joint.
         if one.excess and abs(one.excess.value - one.excess.limit) > _SLACK:
             return f"{one.excess}{_singularity(model, motion)}"
