@@ -26,7 +26,7 @@ from .linearization import Linearization as Linearization
 from .linearization import LinearModel as LinearModel
 from .linearization import linearize as linearize
 from .linearization import linearize_loop as linearize_loop
-from .manifold.manifold import Manifold as Manifold
+from .manifold import Manifold as Manifold
 from .normal_form import NormalForm as NormalForm
 from .signals import DerivativeLayout as DerivativeLayout
 from .signals import Indices as Indices

@@ -52,6 +52,7 @@ PAPER = (
     "contacts",
     "fields",
     "system",
+    "settling",
     "manifold",
     "derivatives",
     "elimination",

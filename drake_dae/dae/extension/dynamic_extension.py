@@ -22,7 +22,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import lie_derivative
 from drake_dae.dae.extension.extension import Extension, by_control, integrated, refuse_metric
-from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import InputActions

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.samples import fields_at
 from drake_dae.errors import InconsistentStateError
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.manifold import Manifold
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import NewtonModel, newton
 

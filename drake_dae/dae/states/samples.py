@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, brief, numbers, show
-from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError

@@ -13,7 +13,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
-from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.family import Family
 from drake_dae.dae.states.margins import RankMargin, find_margin
 from drake_dae.dae.states.region import Region

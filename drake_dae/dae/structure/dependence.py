@@ -9,7 +9,7 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.elimination import Elimination
-from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.samples import Samples
 from drake_dae.trace.round_off import (
     SINGULAR,

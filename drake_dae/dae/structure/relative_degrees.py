@@ -16,7 +16,7 @@ import numpy as np
 from drake_dae.arrays import Booleans, FloatArray, show
 from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
-from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.states.family import VISIBLE, Deciding, Family
 from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, as_matrix, fields_at

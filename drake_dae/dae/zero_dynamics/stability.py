@@ -7,7 +7,7 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold.manifold import coordinates
+from drake_dae.dae.manifold import coordinates
 from drake_dae.dae.structure.structure import Structure
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedSet
 
