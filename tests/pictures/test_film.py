@@ -6,9 +6,9 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 from runs import run_scenario, scenario, some
 
-from drake_dae import save_film
 from drake_dae.cli import main
 from drake_dae.errors import ModelError
+from drake_dae.pictures import save_film
 from drake_dae.pictures.film import FilmScene
 from drake_dae.pictures.motion import follow, run_points
 from drake_dae.scene.surroundings import scene_points

@@ -9,8 +9,10 @@ import pytest
 from arms import arm, numbers
 from numpy.testing import assert_allclose
 
-from drake_dae import Observing, RobotModel, StateEstimator, TrackingLaw, poles, with_disturbance
+from drake_dae import RobotModel, StateEstimator, TrackingLaw, poles
+from drake_dae.dae import with_disturbance
 from drake_dae.dae.beyond.chain_filter import ChainFilter
+from drake_dae.systems import Observing
 
 T = 1e-3
 RATES = Observing(20.0, force_rate=5.0, state_rate=100.0)

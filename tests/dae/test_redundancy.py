@@ -10,8 +10,8 @@ from problems import redundant, system_of
 from problems.tables import TABLE, plate
 
 from drake_dae import DaePlant, drop_constraints, find_structure, share_forces
-from drake_dae.dae.states.samples import draw
-from drake_dae.dae.structure.constrained import examine_constraints
+from drake_dae.dae.samples import draw
+from drake_dae.dae.structure import examine_constraints
 from drake_dae.errors import AssumptionError, ModelError
 
 

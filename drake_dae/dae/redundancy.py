@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, unknown_name
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.samples import Samples, draw
-from drake_dae.dae.structure.dependence import redundant_constraints
+from drake_dae.dae.assumptions import redundant_constraints
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.samples import Samples, draw
 from drake_dae.dae.system import DaeSystem, ForceSharing
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization

@@ -1,6 +1,6 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from math import isfinite
 
@@ -10,14 +10,33 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.manifold.newton_steps import FOUND, STAYS, shortest_step, trace_first_steps
-from drake_dae.dae.manifold.settling import CONSISTENT, Settling
+from drake_dae.dae.settling import CONSISTENT, Settling
 from drake_dae.dae.signals import DerivativeLayout, Indices
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction, count_operations
-from drake_dae.trace.newton import NewtonModel, newton, norm, shortest_steps
+from drake_dae.trace.newton import (
+    PRECISION,
+    ROUNDING,
+    NewtonModel,
+    newton,
+    norm,
+    shortest_steps,
+)
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
+
+NEWTON_STEPS = 6
+"""The number of Newton steps in one function. One or two lead from the end of a simulation step to
+N*, the others reduce the error to round-off. One projection in a thousand takes more."""
+
+STAYS, FOUND, NOT_FOUND = 0.0, 1.0, 2.0
+"""The outcome of these steps: the state is already consistent, they converged to a consistent
+state, or they did not converge."""
+
+DOUBT = 0.03
+"""Gradients are checked for near dependence if the part of one that is orthogonal to those before
+it is shorter than usual by this factor."""
 
 PROBE = 1e-4
 """The distance at which poles show, in states over their scale."""
@@ -46,12 +65,8 @@ class Manifold:
         self.residual_function = system.trace("manifold", {"residual": self.residual_expression})
         outputs = {"gradient": self.gradient}
         self._gradient = system.trace("manifold gradient", outputs, often=False)
-        usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
-        usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
-        self._first_steps = trace_first_steps(
-            system, self.layout, self.residual_expression, self.short_gradient, usual
-        )
-        self._settling = Settling(self)
+        self._first_steps = self._trace_first_steps()
+        self._settling = Settling(system, self.layout, self.gradient, self.gradients, self.residual)
 
     @property
     def dimension(self) -> int:
@@ -99,14 +114,42 @@ class Manifold:
         """
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(self.short_gradient, state, other)
-        scale = ca.SX(self.scale)
-        step = shortest_step(gradient, scale)[0](self.residual_expression)
+        step = _shortest_step(gradient, ca.SX(self.scale))[0](self.residual_expression)
         inputs = {"other": other}
         return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
 
+    def _trace_first_steps(self) -> TracedFunction:
+        """Traces the first Newton steps from a state, all with the gradients at that state.
+
+        The outputs are the outcome of `_followed` and the lengths of the steps (in states over
+        their scale), the state that they reach, and the first step. The result is not valid where
+        gradients are nearly dependent, by their usual lengths.
+        """
+        system = self.system
+        usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
+        usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
+        start, p, scale = system.state, system.parameter_symbol, ca.SX(self.scale)
+        # The steps hold them often: common subexpressions are removed once here, not from the
+        # whole.
+        expression, gradient = ca.cse([self.residual_expression, self.short_gradient])
+        function = ca.Function("residual", [start, p], [expression], {"cse": False})
+        (step_for, pivots), steps, state = _shortest_step(gradient, scale), list[ca.SX](), start
+        for _ in range(NEWTON_STEPS):
+            steps.append(scale * step_for(function(state, p)))
+            state = state + steps[-1]
+        unit = ca.fmax(scale, ca.fabs(start))
+        lengths = [ca.norm_2(step / scale) for step in steps]
+        sizes = [ca.norm_2(step / unit) for step in steps[:2]]
+        moved, outcome = _followed(start, steps, lengths, *sizes)
+        outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": moved, "step": steps[0]}
+        # A cheap test in place of the sines, which are computed only where this one fails.
+        heads = [ca.fabs(pivots[i]) / usual[i] for i in self.layout.heads.tolist()]
+        doubt = ca.mmin(ca.vertcat(1, *heads)) - DOUBT
+        return system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
+
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
-    def relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
-        """Returns the norm of the residual, each entry divided by its scaled gradient."""
+    def _relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
+        """The norm of the residual, each entry divided by its scaled gradient."""
         residual = self.residual_function.evaluate(state, parameters)[0]
         if not residual.any():
             return 0.0
@@ -114,24 +157,21 @@ class Manifold:
         return norm(residual / positive(length))
 
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
-        """Returns whether a state is on N* up to round-off: whether Newton's step is short.
-
-        The arguments are those of `residual`.
-        """
+        """Returns whether a state is on N* up to round-off: whether Newton's step is short."""
         x, p = self._state(state), self.system.parameter_vector(parameters)
         reach = float(self._first_steps.evaluate(x, p)[0][1])
         if isfinite(reach) and reach > 0.0:
             is_near = reach <= CONSISTENT * norm(x / self.scale) + FLOOR
             return is_near and not self._is_at_pole(x, p)
         # Dependent gradients, a residual of zero, or one that no state changes.
-        return self.relative_size(x, p) <= CONSISTENT
+        return self._relative_size(x, p) <= CONSISTENT
 
-    def project(
-        self,
-        state: ArrayLike,
-        parameters: ArrayLike | None = None,
-    ) -> FloatArray:
-        """Returns the consistent state next to a state, to round-off, by Newton's method."""
+    def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """Returns the consistent state next to a state, to round-off, by Newton's method.
+
+        Raises:
+            InconsistentStateError: Newton's method does not reach N*.
+        """
         start, p = self._state(state), self.system.parameter_vector(parameters)
         found = self.projected(start, p)
         if self._is_at_pole(found, p):
@@ -164,35 +204,22 @@ class Manifold:
 
     def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
-        moved = self.first_steps(start, p)
-        if moved is None:
-            return self.searched(start, p)
-        return moved if moved is start else moved.copy()
-
-    def first_steps(self, start: FloatArray, p: FloatArray) -> FloatArray | None:
-        """Takes the first few Newton steps of `project`, without checks of arguments."""
-        function = self._first_steps
+        function, scale = self._first_steps, self.scale
         sizes, moved, _ = function.evaluate(start, p)
-        outcome = sizes.item(0)
-        if function.is_valid and outcome == FOUND:
-            return moved
-        return start if outcome == STAYS and function.is_finite else None
-
-    def searched(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """Acts as `project` from a state from which `first_steps` did not converge."""
-        function = self._first_steps
-        sizes, moved, _ = function.evaluate(start, p)
-        is_finite = function.is_finite
-        if (
-            is_finite
-            and sizes.item(1) == 0.0
-            and not self.residual_function.evaluate(start, p)[0].any()
-        ):
+        outcome, first = sizes.item(0), sizes.item(1)
+        if outcome == STAYS and function.is_finite:
             return start
-        if is_finite and sizes.item(0) == FOUND:
+        if outcome == FOUND and function.is_finite:
             return moved.copy()
-        scale = self.scale
-        z, converged = newton(start / scale, lambda z: self._linearize(scale * z, p))
+        if function.is_finite and first == 0.0 and not self.residual(start, p).any():
+            return start
+
+        def linearize(z: FloatArray) -> NewtonModel:
+            x = scale * z
+            step = self.newton_step
+            return NewtonModel(lambda z: step.evaluate(scale * z, x, p)[0].copy(), True)
+
+        z, converged = newton(start / scale, linearize)
         if not converged:
             # Gradients are dependent or steps diverge: least squares with decreasing residual.
             z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
@@ -200,20 +227,12 @@ class Manifold:
         if converged and not np.array_equal(state, start):
             return state
         # Otherwise the residual is round-off in coarse units, or no state changes it.
-        if self.relative_size(state, p) <= CONSISTENT:
+        if self._relative_size(state, p) <= CONSISTENT:
             return state
-        residual = self.residual_function.evaluate(state, p)[0].copy()
-        if converged and self._first_steps.evaluate(state, p)[1].any():
+        residual = self.residual(state, p)
+        if converged and function.evaluate(state, p)[1].any():
             return state
         raise InconsistentStateError(self._why(state, p, residual), residual)
-
-    def _linearize(self, state: FloatArray, parameters: FloatArray) -> NewtonModel:
-        """Newton steps of least norm by the gradients at a state, in states over their scale."""
-        scale = self.scale
-        return NewtonModel(
-            lambda z: self.newton_step.evaluate(scale * z, state, parameters)[0].copy(),
-            is_regular=True,
-        )
 
     def _downhill(self, state: FloatArray, parameters: FloatArray) -> NewtonModel | None:
         """Least-squares steps that decrease the residual; its rows are scaled to length one."""
@@ -224,11 +243,10 @@ class Manifold:
         def residual(z: FloatArray) -> FloatArray:
             return self.residual_function(scale * z, parameters)[0]
 
-        def measure(z: FloatArray) -> float:
-            return float(np.linalg.norm(residual(z) / length))
-
         steps = shortest_steps(gradients, residual)
-        return None if steps is None else steps._replace(measure=measure)
+        if steps is None:
+            return None
+        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
         """Returns in words why a Newton iteration that ended at a state failed."""
@@ -281,16 +299,17 @@ class Manifold:
         for name in fixed:
             if name not in names:
                 raise ModelError(unknown_name("state", name, names))
-        if not self.residual_function.evaluate(start, p)[0].any():
+        residual = self.residual(start, p)
+        if not residual.any():
             return start
-        near = self.first_steps(start, p)
-        if near is not None and 0.0 < self._first_steps.outputs[0][1] <= FLOOR:
+        outcome, first = self._first_steps.evaluate(start, p)[0][:2]
+        if self._first_steps.is_finite and outcome != NOT_FOUND and 0.0 < first <= FLOOR:
             return self.project(start, p)  # It was there up to round-off, which no level moves.
         chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
         error = InconsistentStateError(
             f"{self.system.name}: no consistent state is found near the given one in which "
             f"{', '.join(fixed)} keep their values; fix fewer states, or give others",
-            self.residual_function.evaluate(start, p)[0].copy(),
+            residual,
         )
         random = np.random.default_rng(0)
         for spread in (0.0, *np.geomspace(0.1, 3.0, RESTARTS)):
@@ -298,15 +317,15 @@ class Manifold:
             free = np.setdiff1d(self._settling.places, chosen)
             moved[free] += spread * self.scale[free] * random.normal(size=free.size)
             try:
-                return self._settled(moved, p, chosen, is_last=not fixed)
+                found = self._settled(moved, p, chosen)
+                if found is not None or not fixed:
+                    return self.project(moved if found is None else found, p)
             except InconsistentStateError as failure:
                 error = error if fixed or spread else failure
         raise error
 
-    def _settled(
-        self, start: FloatArray, p: FloatArray, chosen: Indices, is_last: bool
-    ) -> FloatArray:
-        """The consistent state next to a start; chosen states, and if possible velocities, stay."""
+    def _settled(self, start: FloatArray, p: FloatArray, chosen: Indices) -> FloatArray | None:
+        """The state next to a start where chosen states, and if possible velocities, stay."""
         given = np.union1d(chosen, self._settling.given_rates(start))
         for kept in (given, chosen) if given.size > chosen.size else (chosen,):
             found = self._settling.settled(start, p, kept)
@@ -314,10 +333,8 @@ class Manifold:
                 continue
             far = norm((found - start) / self.scale)
             if kept is chosen or far <= FAR * norm(start / self.scale):
-                return self.project(found, p)
-        if not is_last:
-            raise InconsistentStateError("", np.zeros(0))
-        return self.project(start, p)
+                return found
+        return None
 
     def _state(self, state: ArrayLike) -> FloatArray:
         """A state as a new array; its numbers need not be finite."""
@@ -329,6 +346,51 @@ class Manifold:
         return x
 
 
+def _followed(
+    start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """The state that `newton` reaches by these first steps, and the outcome."""
+    # Newton's method ends at the start, or after its first step; then it is polished.
+    at_start = size <= ROUNDING
+    after_one = ca.logic_and(ca.logic_not(at_start), left * left <= PRECISION * size)
+    goes_on = ca.logic_and(at_start, lengths[0] > 0)
+    moved = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
+    for number in range(1, len(steps)):
+        shorter = ca.logic_and(goes_on, lengths[number] < 0.5 * lengths[number - 1])
+        goes_on = shorter if number > 1 else ca.logic_or(after_one, shorter)
+        goes_on = ca.logic_and(goes_on, lengths[number] > 0)
+        moved += ca.if_else(goes_on, steps[number], 0)
+    ends = ca.logic_and(ca.logic_or(at_start, after_one), ca.logic_not(goes_on))
+    # A first step of length zero does not tell whether the start is consistent.
+    moves = ca.logic_or(after_one, lengths[0] > 0)
+    outcome = ca.if_else(ca.logic_and(ends, moves), FOUND, NOT_FOUND)
+    stays = ca.logic_and(lengths[0] > 0, lengths[0] <= ROUNDING)
+    return moved, ca.if_else(stays, STAYS, outcome)
+
+
+def _shortest_step(
+    gradient: ca.SX, scale: ca.SX
+) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
+    """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
+
+    It is -(C S)' N^-1 residual with N = C S (C S)', each row by its largest entry. An error of N^-1
+    grows with the square of the condition of C, and only makes Newton's method slower. The lengths
+    of the parts of the gradients that are orthogonal to those before are returned as well.
+    """
+    if not gradient.shape[0]:
+        return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
+    scaled = ca.mtimes(gradient, ca.diag(scale))
+    # By their largest entries: the squares of entries may be too large for a number.
+    largest = [ca.norm_inf(row) for row in ca.vertsplit(scaled)]
+    sizes = ca.vertcat(*[ca.if_else(size > 0, size, 1) for size in largest])
+    scaled = ca.sparsify(scaled / ca.repmat(sizes, 1, scaled.shape[1]))
+    normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
+    lengths = [size * length for size, length in zip(largest, normal.lengths, strict=True)]
+    # CasADi lets the infinities of constant gradients cancel each other.
+    regular = ca.if_else(normal.pivot > 0, 0, ca.SX.nan())
+    return lambda residual: regular - ca.mtimes(scaled.T, normal.solve(residual / sizes)), lengths
+
+
 def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
     """Returns a basis T of the tangent space, orthonormal in scaled states, shape (n, n - k)."""
     rows = unit_rows(gradients * scale)
@@ -338,8 +400,7 @@ def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
 def coordinates(gradients: FloatArray, scale: FloatArray) -> tuple[Indices, FloatArray]:
     """Returns n - k states that are coordinates, and the derivatives of all states by them.
 
-    Unlike an orthonormal basis this one leaves a triangular system triangular. The arguments are
-    those of `tangent`.
+    Unlike an orthonormal basis this one leaves a triangular system triangular.
     """
     basis = tangent(gradients, scale) / scale[:, None]
     count = basis.shape[1]

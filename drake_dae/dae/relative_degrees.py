@@ -14,14 +14,17 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray, show
+from drake_dae.dae.assumptions import (
+    Violation,
+    ViolationKind,
+    following_outputs,
+    redundant_constraints,
+)
 from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.family import VISIBLE, Deciding, Family
-from drake_dae.dae.states.region import Region
-from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
-from drake_dae.dae.structure.assumptions import Violation, ViolationKind
-from drake_dae.dae.structure.dependence import following_outputs, redundant_constraints
+from drake_dae.dae.family import VISIBLE, Deciding, Family
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.samples import Region, Samples, as_matrix, fields_at
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError, NegligibleWarning
 from drake_dae.trace.factorization import nonzeros
@@ -99,11 +102,11 @@ def constraint_chains(
 class OutputChains(NamedTuple):
     """The result of Assumption (4) for the outputs; see `Structure` for the fields."""
 
-    chains: tuple[tuple[ca.SX, ...], ...]
+    output_chains: tuple[tuple[ca.SX, ...], ...]
     drift: ca.SX
     control_matrix: ca.SX
     highest_derivatives: ca.SX
-    need_force: bool
+    chains_need_force: bool
     round_off: Booleans
 
 

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.samples import fields_at
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.samples import fields_at
 from drake_dae.errors import InconsistentStateError
 
 MEMBERS = 4
@@ -18,18 +18,18 @@ random members is zero at all."""
 VISIBLE = 1e-6
 """An action above this, relative to the sizes of its terms, is not round-off."""
 
-_NEARER = 0.25
+NEARER, TRIES = 0.25, 6
 """If there is no consistent state for drawn numbers, they are moved towards the defaults by this
-factor, repeatedly."""
+factor, so often."""
 
-_TRIES = 6
-
-CORNERS, STARTS, DESCENTS, STEP = 16, 3, 25, 1e-4
-"""How the box of bounds is searched: the number of random corners and of random places, of the
-places from which a margin is minimized, of steps, and the difference for its gradient."""
+CORNERS, PLACES = 16, 64
+"""The number of random corners and of random places at which a box of bounds is searched."""
 
 SAME = 1e-3
 """Parameters that differ less from their defaults, relative to the others, do not decide."""
+
+OfMember = Callable[[FloatArray, FloatArray], float]
+"""A function of a consistent state and the values of all parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Family:
         self._manifold, self._states = manifold, states
         self._system = manifold.system
 
-    def deciding(self, acts: Callable[[FloatArray, FloatArray], bool]) -> Deciding | None:
+    def deciding(self, acts: OfMember) -> Deciding | None:
         """Returns the parameters for which an input acts that does not act at the defaults."""
         hits = [member for member in self._members if acts(*member)]
         # One of many may be round-off of a nearly singular matrix.
@@ -72,7 +72,7 @@ class Family:
             mixed = others.copy()
             mixed[places] = those[places]
             member = self._consistent(state, mixed)
-            return member is not None and acts(*member)
+            return member is not None and bool(acts(*member))
 
         every = self._places
         chosen = [n for n in every if acts_with(every[n], others=defaults, those=values)]
@@ -86,83 +86,49 @@ class Family:
             pairs.append((name, float(values[i]), float(defaults[i])))
         return Deciding(tuple(pairs))
 
-    def lost(
-        self, margin: Callable[[FloatArray, FloatArray], float], least: float
-    ) -> Deciding | None:
+    def lost(self, margin: OfMember, least: float) -> Deciding | None:
         """Returns parameters within their bounds where a margin is not above the least, or None.
 
-        The margin is tried at corners and random places of the box of bounds, and then minimized
-        from the lowest, as far as its gradient leads.
+        It is evaluated at the ends of each range, and at corners and random places of the box.
         """
         system, defaults = self._system, self._system.parameter_values
-        names, places = [], list[int]()
+        names, places = list[str](), list[int]()
         for p in system.parameters:
             if p.bounds is not None:
                 first = system.parameter_slice(p.name).start
                 names += [signal.name for signal in p.signals]
                 places += range(first, first + p.value.size)
         low, high = (bound[places] for bound in system.parameter_box)
-        width = high - low
+        count, random = len(places), np.random.default_rng(0)
+        default = (defaults[places] - low) / np.where(high > low, high - low, 1.0)
+        alone = [np.where(row > 0, end, default) for row in np.eye(count) for end in (0, 1)]
+        corners = random.integers(0, 2, (CORNERS, count))
+        boxes = [*alone, *np.unique(corners, axis=0), *random.uniform(size=(PLACES, count))]
 
         def at(box: FloatArray) -> float:
             values = defaults.copy()
-            values[places] = low + width * box
+            values[places] = low + (high - low) * box
             member = self._consistent(self._states[0], values)
             return np.inf if member is None else margin(*member)
 
-        count, random = len(places), np.random.default_rng(0)
-        default = (defaults[places] - low) / np.where(width > 0.0, width, 1.0)
-        alone = [
-            np.where(np.eye(count)[i] > 0, end, default) for i in range(count) for end in (0, 1)
-        ]
-        corners = random.integers(0, 2, (CORNERS, count))
-        tried = [*alone, *np.unique(corners, axis=0), *random.uniform(size=(CORNERS, count))]
-        lowest = sorted(((at(box), k) for k, box in enumerate(tried)))
-        for value, k in lowest[:STARTS]:
-            box = np.array(tried[k], dtype=float)
-            for _ in range(DESCENTS):
-                if not value > least:
-                    there = low + width * box
-                    moved = np.abs(box - default) > SAME * np.max(np.abs(box - default))
-                    rows = zip(names, there, defaults[places], moved, strict=True)
-                    return Deciding(tuple((n, float(v), float(d)) for n, v, d, m in rows if m))
-                slope = self._slope(at, box, value) * (width > 0.0)
-                square = float(slope @ slope)
-                if not 0.0 < square < np.inf:
-                    break
-                # To the zero of the linearized margin, or as far as the margin falls.
-                for part in (1.0, 0.25, 0.06):
-                    trial = np.clip(box - part * value / square * slope, 0.0, 1.0)
-                    if (following := at(trial)) < value:
-                        break
-                else:
-                    break
-                box, value = trial, following
-        return None
-
-    @staticmethod
-    def _slope(at: Callable[[FloatArray], float], box: FloatArray, value: float) -> FloatArray:
-        """The derivatives of a margin by differences that stay in the box."""
-        slope = np.zeros(box.size)
-        for i in range(box.size):
-            other = box.copy()
-            other[i] += STEP if box[i] < 0.5 else -STEP
-            slope[i] = (at(other) - value) / (other[i] - box[i])
-        return slope
+        lowest = min(boxes, key=at)
+        if at(lowest) > least:
+            return None
+        moved = np.abs(lowest - default)
+        rows = zip(names, low + (high - low) * lowest, defaults[places], moved, strict=True)
+        far = SAME * np.max(moved)
+        return Deciding(tuple((n, float(v), float(d)) for n, v, d, off in rows if off > far))
 
     @cached_property
     def _places(self) -> dict[str, list[int]]:
         """The parameters and derivatives of signals to draw, with their indices."""
-        parameters, first = self._system.parameters, 0
-        following = sum(p.value.size for p in parameters)
-        places, rates = dict[str, list[int]](), dict[str, list[int]]()
-        for p in parameters:
+        system, places, rates = self._system, dict[str, list[int]](), dict[str, list[int]]()
+        for p in system.parameters:
             free = np.flatnonzero(p.low < p.high)
-            places[p.name] = (first + free).tolist()
-            for order in range(1, len(p.derivatives) + 1):
-                rates[p.name + "'" * order] = (following + free).tolist()
-                following += p.value.size
-            first += p.value.size
+            places[p.name] = (system.parameter_slice(p.name).start + free).tolist()
+            for order in range(len(p.derivatives)):
+                first = system.exogenous.rates()[p.name].start + order * p.value.size
+                rates[p.name + "'" * (order + 1)] = (first + free).tolist()
         return {name: drawn for name, drawn in (places | rates).items() if drawn}
 
     @cached_property
@@ -175,18 +141,18 @@ class Family:
         for number in range(MEMBERS):
             away = random.uniform(low, high) - defaults
             state = self._states[number % len(self._states)]
-            for _ in range(_TRIES):
+            for _ in range(TRIES):
                 member = self._consistent(state, defaults + away)
                 if member is not None:
                     members.append(member)
                     break
-                away *= _NEARER
+                away *= NEARER
         return members
 
     def _consistent(
         self, state: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Returns a consistent state near a state for other parameters; None if there is none."""
+        """A consistent state near a state for other parameters; None if there is none."""
         try:
             consistent = self._manifold.project(state, parameters)
         except InconsistentStateError:
