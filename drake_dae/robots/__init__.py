@@ -57,9 +57,16 @@ from drake_dae.robots.outputs import (
     SurfaceCoordinates,
     TiltFromNormal,
 )
-from drake_dae.robots.surfaces.implicit import ImplicitSurface
 from drake_dae.robots.surfaces.measured import MeasuredSurface
-from drake_dae.robots.surfaces.picture import PosedShape
+from drake_dae.robots.surfaces.meshes import PosedShape
+from drake_dae.robots.surfaces.shapes import (
+    Cylinder,
+    Ellipsoid,
+    ImplicitSurface,
+    Plane,
+    Sphere,
+    Torus,
+)
 from drake_dae.robots.surfaces.surface import (
     Pair,
     Surface,
@@ -69,7 +76,6 @@ from drake_dae.robots.surfaces.surface import (
     tangents,
     triple,
 )
-from drake_dae.robots.surfaces.surfaces import Cylinder, Ellipsoid, Plane, Sphere, Torus
 
 __all__ = [
     "Application",

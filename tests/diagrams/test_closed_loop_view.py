@@ -37,7 +37,7 @@ from drake_dae import (
 from drake_dae.errors import ModelError
 from drake_dae.pictures.run_motion import contact_paths, follow, frame_times
 from drake_dae.robots import ConstraintWrenches, Wrenches, tangents
-from drake_dae.robots.surfaces import surfaces
+from drake_dae.robots.surfaces import shapes as surfaces
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scene.arrows import ForceArrows, GrowingPaths
 from drake_dae.scene.surroundings import scene_extent

@@ -17,7 +17,7 @@ from drake_dae.dae import Parameter, Signal
 from drake_dae.dae.system.signals import moving
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.picture import PosedShape
+from drake_dae.robots.surfaces.meshes import PosedShape
 from drake_dae.robots.surfaces.surface import Vector
 
 

@@ -354,12 +354,12 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
     """A shelf over the half x > 0.5 of a table, and a rectangle that is wider than the table."""
     low, high = box([0, 0, 0], [1, 1, 0.1]), box([0.5, 0, 0.4], [0.5, 1, 0.1])
     both = np.vstack([low[0], high[0]]), np.vstack([low[1], high[1] + 8])
-    with pytest.raises(ModelError, match=r"at \[0\.[5-9]\d* *, +0\.\d+ *\] m"):
+    with pytest.raises(ModelError, match=r"at \[0\.5\d* *, +0\.\d* *\] m"):
         MeasuredSurface(file=stl_of(tmp_path / "shelf.stl", *both))
     file = stl_of(tmp_path / "table.stl", *low)
     part = MeasuredSurface((0.4, 0.8), file=file)
     assert part.fit.heights(np.array([0.5]), np.array([0.5]))[0, 0] == pytest.approx(0.1)
-    with pytest.raises(ModelError, match=r"at \[[-1]\.*\d* *, +0\.\d+ *\] m"):
+    with pytest.raises(ModelError, match=r"at \[-1\.\d* *, +0\.\d* *\] m"):
         MeasuredSurface((3.0, 0.8), file=file)
 
 

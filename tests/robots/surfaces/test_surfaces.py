@@ -161,7 +161,7 @@ def test_coordinates_that_there_are_not_are_refused(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some(SURFACES))
+@pytest.mark.parametrize("name", some(n for n in SURFACES if SURFACES[n].extent is None))
 def test_any_surface_is_drawn_from_its_distance_alone(name):
     """As `Surface` does where a class has no shape of its own: around a point, on the surface."""
     surface, size = SURFACES[name], 0.4
