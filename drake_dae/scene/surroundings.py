@@ -61,11 +61,11 @@ def surroundings(
         low, high = contacts.min(axis=0), contacts.max(axis=0)
         nearest = np.argmin(np.linalg.norm(contacts - (low + high) / 2, axis=1))
         extent = max(size, 1.4 * float(np.linalg.norm(high - low)))
-        picture = constraint.picture(values, contacts[nearest], extent)
-        if picture is None:
+        surface, pose = constraint.surface_at(values), constraint.placement(values)
+        if surface is None:
             return None
-        pose = constraint.placement(values)
-        return DrawnSurface(constraint, pose, picture.moved(pose.inverse()))
+        picture = surface.picture(pose.inverse() @ contacts[nearest], extent)
+        return None if picture is None else DrawnSurface(constraint, pose, picture)
 
     def moves(constraint: Constraint) -> bool:
         return any(parameter.exogenous for parameter in constraint.parameters)

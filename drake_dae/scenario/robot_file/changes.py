@@ -21,7 +21,7 @@ from pydrake.multibody.tree import (
 
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.robots import Coupling, frame_named, joint_names, unique_names
+from drake_dae.robots import JointCoupler, frame_named, joint_names, unique_names
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.loops import actuators_of, joints_of
 from drake_dae.scenario.robot_file.mending import Mender
@@ -118,7 +118,7 @@ def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
 
 @at("robot.locked")
 def _lock_joints(
-    locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[Coupling]
+    locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[JointCoupler]
 ) -> None:
     """Replaces joints, and those that are coupled to them, by welds at given positions.
 
@@ -169,7 +169,9 @@ def _lock_joints(
             plant.AddCouplerConstraint(*pair, coupling.ratio, coupling.offset)
 
 
-def _with_coupled(locked: Mapping[str, float], couplings: Sequence[Coupling]) -> dict[str, float]:
+def _with_coupled(
+    locked: Mapping[str, float], couplings: Sequence[JointCoupler]
+) -> dict[str, float]:
     """The positions of locked joints, and of those that are coupled to them."""
     positions = dict(locked)
     for _ in couplings:  # As often as the longest chain needs.
@@ -192,7 +194,7 @@ def _with_coupled(locked: Mapping[str, float], couplings: Sequence[Coupling]) ->
 def _drive_joints(
     driven: str | Sequence[str] | Mapping[str, float | None],
     plant: MultibodyPlant,
-    couplings: Sequence[Coupling],
+    couplings: Sequence[JointCoupler],
     mender: Mender,
 ) -> None:
     """Adds actuators to the joints that a scenario names, and removes those of all other joints.
@@ -245,7 +247,7 @@ def _of_joints(plant: MultibodyPlant, values: Mapping[tuple[str, str], T]) -> di
     return found
 
 
-def _couplings(plant: MultibodyPlant, mender: Mender) -> list[Coupling]:
+def _couplings(plant: MultibodyPlant, mender: Mender) -> list[JointCoupler]:
     """The couplings of joints of a plant, by names."""
     if plant.num_constraints() == 0:
         return []
@@ -254,7 +256,7 @@ def _couplings(plant: MultibodyPlant, mender: Mender) -> list[Coupling]:
     couplings = []
     for name, (leader, ratio, offset) in _of_joints(plant, mender.followers).items():
         leading = names.get((int(joints[name].model_instance()), leader))
-        couplings += [Coupling(name, leading, ratio, offset)] if leading else []
+        couplings += [JointCoupler(name, leading, ratio, offset)] if leading else []
     return couplings
 
 

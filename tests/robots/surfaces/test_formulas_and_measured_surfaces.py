@@ -18,7 +18,7 @@ from drake_dae import (
     Sphere,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots import tangents
+from drake_dae.robots import LinkExpressions, tangents
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.given import numpy_explained
 from drake_dae.trace.smoothness import find_flaw
@@ -122,13 +122,14 @@ def test_numbers_of_a_formula_are_parameters_of_the_constraint():
     assert [p.name for p in first.parameters] == ["a.position", "a.r"]
     assert first.parameters[1].value == 0.5
     # One surface of two constraints has a number for each.
-    p = ca.SX.sym("p", 3)
+    links = LinkExpressions(
+        ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.eye(3), ca.SX(3, 1), {"tool": ca.SX.sym("p", 3)}
+    )
     radius = first.parameters[1].symbol
-    assert ca.depends_on(first.surface.distance(p), radius)
-    assert not ca.depends_on(second.surface.distance(p), radius)
-    assert surface == first.surface
+    assert ca.depends_on(first.residual(links), radius)
+    assert not ca.depends_on(second.residual(links), radius)
     # Drawn with the number that it has now.
-    mesh = first.picture(np.array([0, 0, 0, 0.9]), np.array([0.0, 0.0, 0.9]), 0.4).form
+    mesh = first.surface_at(np.array([0, 0, 0, 0.9])).picture([0.0, 0.0, 0.9], 0.4).form
     vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.9, atol=1e-12)
 
@@ -210,8 +211,6 @@ def test_the_error_of_smoothing_is_reported():
     assert 0.5e-4 < np.sqrt(np.mean(off**2)) < 1.2e-4
     # It is nearer to the wave than the noise is.
     assert np.sqrt(np.mean((surface.fit.heights(X, Y) - WAVES) ** 2)) < 0.7e-4
-    assert PointOnSurface("tool", surface, name="bench").remark == f"bench: {surface.remark}"
-    assert PointOnSurface("tool", Sphere((0, 0, 0), 1.0)).remark == ""
 
 
 @pytest.mark.parametrize("rough", [np.abs(X - 0.13), 1.0 * (X > 0.17), np.sin(300 * X)])
