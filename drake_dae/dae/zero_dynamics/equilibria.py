@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold.manifold import coordinates
+from drake_dae.dae.manifold import coordinates
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.dae.zero_dynamics.stability import ROUNDED, balanced_matrix
 from drake_dae.errors import InconsistentStateError
@@ -50,7 +50,7 @@ class Equilibria:
     def __init__(self, pinned: PinnedOutputs) -> None:
         self.pinned, system = pinned, pinned.system
         examined = np.abs(pinned.structure.states).max(axis=0)
-        self.sizes = np.maximum(examined, system.nominal_spread)
+        self.sizes = np.maximum(examined, system.spread_around(system.nominal_state))
         # The rates of states with a constant rate, such as clocks.
         explicit, self._clocks = system.explicit, np.zeros(system.num_states)
         for i in range(system.num_states):

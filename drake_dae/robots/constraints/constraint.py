@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -15,7 +15,6 @@ from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Parameter, Signal
-from drake_dae.dae.system.signals import moving
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.links import Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.surface import Surface, Vector
@@ -137,7 +136,9 @@ class Constraint(ABC):
         if not any(parameter.name in names for parameter in self.parameters):
             return self
         changed = copy(self)
-        changed.__dict__["parameters"] = moving(self.parameters, names)
+        changed.__dict__["parameters"] = tuple(
+            replace(p, exogenous=p.exogenous or p.name in names) for p in self.parameters
+        )
         return changed
 
     @property

@@ -18,7 +18,7 @@ from drake_dae.robots.links.joints import constant_pose
 from drake_dae.robots.links.links import Frames, Kinematics
 from drake_dae.robots.links.plant_frames import body_with_frame
 from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 @checked(ModelError)

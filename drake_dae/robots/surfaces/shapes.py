@@ -26,9 +26,8 @@ from drake_dae.robots.surfaces.surface import (
     triple,
     unit_vector,
 )
+from drake_dae.trace.expressions import length_of, result_of
 from drake_dae.trace.formula import check_names, parse_formula
-from drake_dae.trace.given import numpy_explained, result_of
-from drake_dae.trace.smoothness import length_of
 
 _SOLID_LENGTH = 100.0
 """The length of the solid of a cylinder, in m: its ends are out of the reach of a robot."""
@@ -338,8 +337,7 @@ class ImplicitSurface(Surface):
                 self.function, {**dict(zip("xyz", ca.vertsplit(p), strict=True)), **names}
             )
         more = [SimpleNamespace(**names)] if names else []
-        with numpy_explained("the function of an ImplicitSurface"):
-            return result_of("function", self.function, p, *more)
+        return result_of("function", self.function, p, *more)
 
 
 def _components(

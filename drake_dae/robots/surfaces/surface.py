@@ -20,9 +20,9 @@ from drake_dae.robots.surfaces.meshes import (
     mesh_of_grid,
     sides,
 )
+from drake_dae.trace.expressions import length_of
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
-from drake_dae.trace.smoothness import length_of
 
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]
