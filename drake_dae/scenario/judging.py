@@ -32,14 +32,19 @@ from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind, o
 from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
-from drake_dae.scenario.build import tracking_law
+from drake_dae.scenario.build import check_task, tracking_law
 from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
-from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
-from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
+from drake_dae.scenario.model import (
+    completed_model,
+    examine_scenario,
+    exogenous_references,
+    reference_and_start,
+    references_of,
+    scenario_structure,
+)
 from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.task_controller import check_task
 from drake_dae.systems.control.contract import PhaseChange
 from drake_dae.trace.functions import TracedFunction
 
@@ -175,13 +180,6 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     """Analyzes the robot of a scenario, and what its reference requires of drives and joints.
 
     All numbers are those of the law's model without errors: the minimum requirements.
-
-    Args:
-        scenario: A scenario, as `load_scenario` returns it.
-
-    Raises:
-        ScenarioError: The scenario is not valid; the message names the key. A violated assumption
-            is no error: the analysis reports it.
     """
     return complete_and_examine(scenario, SceneGraph())[1]
 
@@ -189,16 +187,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
 def complete_and_examine(
     scenario: Scenario, scene_graph: SceneGraph, robot: RobotLinks | None = None
 ) -> tuple[Scenario, Feasibility]:
-    """Returns a scenario with what `complete_scenario` adds, and what `find_feasibility` finds.
-
-    Args:
-        scenario: The scenario.
-        scene_graph: The scene graph of the robot's geometry.
-        robot: What `robot_links` made of the robot with this scene graph; None to read it.
-
-    Raises:
-        ScenarioError: As for `find_feasibility`.
-    """
+    """Returns a scenario with what `complete_scenario` adds, and what `find_feasibility` finds."""
     if scenario.task is not None:
         check_task(scenario)
     completed, model, _ = completed_model(scenario, scene_graph, drawn=False, robot=robot)
@@ -268,13 +257,6 @@ def sample_times(
 
     Equidistant times would miss a sinusoid whose period is the interval. Each interval is tested at
     a random time and divided if the reference is not linear there, until no interval is divided.
-
-    Args:
-        reference: The function t -> R(t).
-        begin, end: The first and the last time, in s.
-
-    Returns:
-        From SAMPLES to MOST_SAMPLES increasing times in s, and whether these suffice.
     """
     random = np.random.default_rng(0)
     times = np.linspace(begin, end, SAMPLES)
@@ -308,16 +290,7 @@ def judge_run(
     statistics: RunStatistics | None = None,
     failure: str = "",
 ) -> RunSummary:
-    """Judges a run by its record.
-
-    Args:
-        scenario: The completed scenario.
-        loop: The loop that ran.
-        context: The context of the loop at the end of the run.
-        record: The record of the run, of at least one time.
-        statistics: The statistics of the run; None for a failed run, or one of an earlier time.
-        failure: Why it ended early; empty if it did not.
-    """
+    """Judges a run by its record."""
     model, changes = loop.plant.robot("a scenario"), loop.changes(record)
     limits = robot_limits(model, scenario.judgement.friction_cones)
     own, stop = loop.plant_parameters(record, context), record.time.size
