@@ -27,7 +27,6 @@ from drake_dae import (
     Torus,
     TrackingLaw,
     build_scenario,
-    dynamic_extension,
     find_structure,
     load_scenario,
     make_animation,
