@@ -183,9 +183,9 @@ class NormalForm:
                 raise InconsistentStateError(
                     f"{self.system.name}: no way from the guess to the given coordinates: "
                     f"{self.coordinate_signals[worst].name} does not reach {target[worst]:.6g}; "
-                    f"the search ended at x = {show(x)}. Start from a guess that is nearer. If the coordinates become dependent there, A(x) of "
-                    "Assumption (2) or B(x) of (16) loses its rank (Theorem 2.1), or xi does not "
-                    "complete the chains any more",
+                    f"the search ended at x = {show(x)}. Start from a guess that is nearer. If the "
+                    "coordinates become dependent there, A(x) of Assumption (2) or B(x) of (16) "
+                    "loses its rank (Theorem 2.1), or xi does not complete the chains any more",
                     missing,
                 )
         return x
