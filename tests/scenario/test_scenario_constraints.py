@@ -6,7 +6,7 @@ from pydrake.geometry import SceneGraph
 from runs import run_scenario, scenario_validator, untagged
 
 from drake_dae import build_scenario, load_scenario
-from drake_dae.analysis.limits import LimitKind
+from drake_dae.analysis import LimitKind
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model

@@ -36,7 +36,7 @@ from drake_dae import (
     find_structure,
     poles,
 )
-from drake_dae.analysis.limits import LimitKind, robot_limits
+from drake_dae.analysis import LimitKind, robot_limits
 from drake_dae.diagrams.wiring import make_closed_loop
 from drake_dae.errors import ModelError
 from drake_dae.references import SinusoidReference
