@@ -27,8 +27,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 import drake_dae as dd
-from drake_dae.analysis import Analysis
-from drake_dae.analysis.report import Assumption
+from drake_dae.analysis import Analysis, Assumption
 from drake_dae.blocks.block import Block
 from drake_dae.dae import (
     Derivatives,
@@ -185,7 +184,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "size of StateSensor": lambda: 4,
     "components": lambda: "xy",
     "duration": lambda: 0.01,
-    "law of DisturbanceObserver": observed_law,
     "law of StateEstimator": observed_law,
     "gains of AdvisedGains": lambda: dd.contact_gains(1e5, 0.03, 1e-3),
     "observing of StateEstimator": lambda: Observing(10.0, state_rate=40.0),
