@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_dae import Record, Signal
-from drake_dae.analysis.limits import LimitKind, SignalRange
+from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
 from drake_dae.running.judgement import FindingKind, Outcome, judge, late_rms
 from drake_dae.systems.control.contract import PhaseChange

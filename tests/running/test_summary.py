@@ -7,7 +7,7 @@ import pytest
 from arms import arm
 
 from drake_dae import Record, Signal
-from drake_dae.analysis.limits import LimitKind, SignalRange, robot_limits
+from drake_dae.analysis import LimitKind, SignalRange, robot_limits
 from drake_dae.diagrams.record import Recorded
 from drake_dae.running.judgement import judge
 from drake_dae.running.simulate import RunStatistics
