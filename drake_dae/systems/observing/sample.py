@@ -221,9 +221,9 @@ class EstimatorSample:
         if estimates:
             sample = ca.floor(TIME / period + _SAME)
             # The state before the first sample is zero, where a contact may have no direction.
-            first = {"state": self._measured, "control": self.inputs["control"]}
-            first |= {"measured_force": self._measured_force} if self.measures else {}
-            first = Memory(**{**vars(self.memory), **first})
+            given = {"state": self._measured, "control": self.inputs["control"]}
+            given |= {"measured_force": self._measured_force} if self.measures else {}
+            first = Memory(**{**vars(self.memory), **given})
             begun = ca.if_else(self.memory.sample >= 0, after.column, first.column)
             fresh = ca.vertcat(sample, begun[1:])
             column = ca.if_else(ca.eq(self.memory.sample, sample), self.memory.column, fresh)
