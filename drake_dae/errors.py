@@ -158,10 +158,6 @@ class AdviceWarning(UserWarning):
     """Recommended gains outside of the range of validity of the recommendation."""
 
 
-class NegligibleWarning(UserWarning):
-    """A number larger than round-off is treated as zero in the relative degrees."""
-
-
 class MachineCodeWarning(UserWarning):
     """Functions run interpreted although machine code was requested, or would be faster."""
 

@@ -42,10 +42,6 @@ def _print(options: argparse.Namespace) -> int:
     return 0
 
 
-def _schema_options(parser: Parser) -> None:
-    pass
-
-
 def _schema(options: argparse.Namespace) -> int:
     """Prints the JSON Schema of a scenario, by which editors complete and check keys."""
     from drake_dae.scenario.scenario import scenario_schema
@@ -57,5 +53,5 @@ def _schema(options: argparse.Namespace) -> int:
 COMMANDS = {
     "list": (_list_options, _list),
     "print": (_print_options, _print),
-    "schema": (_schema_options, _schema),
+    "schema": (lambda parser: None, _schema),
 }
