@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 import pytest
-from house import FLOORS, ROOT, imports, modules, room, violations
+from house import FLOORS, ROOT, WITHOUT_DRAKE, imports, modules, room, violations
 
 
 def test_every_import_points_down() -> None:
