@@ -248,7 +248,7 @@ def _rates(
             for j, (new, i) in enumerate(zip(expanded[0].elements(), places, strict=True))
             if not ca.is_equal(new, arguments[2][i])
         ]
-        values, expanded = ((each[0][kept], *each[1:]) for each in (values, expanded))
+        values, expanded = (values[0][kept], values[1]), [expanded[0][kept], *expanded[1:]]
         function = dense_function("update", arguments, expanded)
         rates.append((UpdateRate(*key, function, tuple(places[j] for j in kept)), values))
     for block in blocks.values():

@@ -18,7 +18,7 @@ from drake_dae.diagrams.record import Record, phase_spans
 from drake_dae.errors import ModelError
 from drake_dae.pictures.events import events_of, kinds_of
 from drake_dae.pictures.motion import follow, run_points, run_view
-from drake_dae.robots.surfaces.surface import axes_along
+from drake_dae.robots import axes_along
 from drake_dae.scene.arrows import FORCE_COLOR, LEAST_SCALE, MOMENT_COLOR, PATH_COLOR, path_of
 from drake_dae.scene.camera import view_angles
 from drake_dae.scene.surroundings import diagonal, floor_below, scene_points, surroundings

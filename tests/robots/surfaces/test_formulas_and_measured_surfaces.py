@@ -1,9 +1,5 @@
 """Surfaces from formulas and from data: what they are, and how far they are off it."""
 
-import re
-import tracemalloc
-import zipfile
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -11,7 +7,7 @@ from meshes import obj_of_grid, stl_of
 
 from drake_dae import Cylinder, ImplicitSurface, MeasuredSurface, PointOnSurface, Sphere
 from drake_dae.errors import ModelError
-from drake_dae.robots import tangents
+from drake_dae.robots import LinkExpressions, tangents
 from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.functions import TracedFunction
 
@@ -79,12 +75,6 @@ def test_a_formula_of_one_length_is_smooth_where_its_gradient_is_not_zero(
         np.testing.assert_allclose(np.array(hessian(place)), wanted, atol=2e-6)
 
 
-@pytest.mark.parametrize("text", ["1_0 - x", "0x10 - x", "0b1 - x", "x - 1e400", "x*1_000.5"])
-def test_numbers_of_python_alone_are_none_of_a_formula(text):
-    with pytest.raises(ModelError, match=re.escape(text)):
-        ImplicitSurface(text)
-
-
 @pytest.mark.parametrize(
     ("formula", "numbers", "built_in"),
     [
@@ -100,27 +90,20 @@ def test_a_formula_is_the_built_in_surface(formula, numbers, built_in):
         np.testing.assert_allclose(own(p)[0], known(p)[0], rtol=1e-12, atol=1e-12)
 
 
-def test_a_formula_of_squares_has_the_same_normal_on_the_sphere():
-    own = derivatives(ImplicitSurface("x**2 + y**2 + z**2 - r**2", parameters={"r": 0.7}), 1)
-    known = derivatives(Sphere((0, 0, 0), 0.7), 1)
-    for p in np.random.default_rng(0).normal(size=(10, 3)):
-        foot = 0.7 * p / np.linalg.norm(p)
-        np.testing.assert_allclose(own(foot)[0], known(foot)[0], rtol=0, atol=1e-14)
-
-
 def test_numbers_of_a_formula_are_parameters_of_the_constraint():
     surface = ImplicitSurface("sqrt(x**2 + y**2 + z**2) - r", parameters={"r": 0.5})
     first, second = (PointOnSurface("tool", surface, name=name) for name in ("a", "b"))
     assert [p.name for p in first.parameters] == ["a.position", "a.r"]
     assert first.parameters[1].value == 0.5
     # One surface of two constraints has a number for each.
-    p = ca.SX.sym("p", 3)
+    links = LinkExpressions(
+        ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.eye(3), ca.SX(3, 1), {"tool": ca.SX.sym("p", 3)}
+    )
     radius = first.parameters[1].symbol
-    assert ca.depends_on(first.surface.distance(p), radius)
-    assert not ca.depends_on(second.surface.distance(p), radius)
-    assert surface == first.surface
+    assert ca.depends_on(first.residual(links), radius)
+    assert not ca.depends_on(second.residual(links), radius)
     # Drawn with the number that it has now.
-    mesh = first.picture(np.array([0, 0, 0, 0.9]), np.array([0.0, 0.0, 0.9]), 0.4).form
+    mesh = first.surface_at(np.array([0, 0, 0, 0.9])).picture([0.0, 0.0, 0.9], 0.4).form
     vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.9, atol=1e-12)
 
@@ -202,8 +185,6 @@ def test_the_error_of_smoothing_is_reported():
     assert 0.5e-4 < np.sqrt(np.mean(off**2)) < 1.2e-4
     # It is nearer to the wave than the noise is.
     assert np.sqrt(np.mean((surface.fit.heights(X, Y) - WAVES) ** 2)) < 0.7e-4
-    assert PointOnSurface("tool", surface, name="bench").remark == f"bench: {surface.remark}"
-    assert PointOnSurface("tool", Sphere((0, 0, 0), 1.0)).remark == ""
 
 
 @pytest.mark.parametrize("rough", [np.abs(X - 0.13), 1.0 * (X > 0.17), np.sin(300 * X)])
@@ -262,24 +243,6 @@ def test_files_hold_what_the_table_does(tmp_path):
     np.save(tmp_path / "a.npy", 2.0 * tall[:-1])
     changed = MeasuredSurface((0.4, 0.3), file=tmp_path / "a.npy")
     assert changed.fit.heights(X, Y)[0, 0] == pytest.approx(2.0 * wanted[0, 0], rel=1e-3)
-
-
-@pytest.mark.parametrize("kind", ["npz", "obj"])
-def test_what_an_archive_unpacks_to_is_bounded_before_it_is_read(kind, tmp_path):
-    """A megabyte that would be a gigabyte: refused without the memory for it."""
-    file = tmp_path / f"bomb.{kind}"
-    with (
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
-        archive.open("heights.npy", "w") as member,
-    ):
-        for _ in range(1024):
-            member.write(bytes(1 << 20))
-    assert file.stat().st_size < 2 << 20
-    tracemalloc.start()
-    with pytest.raises(ModelError, match="1,073,741,824"):
-        MeasuredSurface((0.4, 0.3), file=file)
-    assert tracemalloc.get_traced_memory()[1] < 10 << 20
-    tracemalloc.stop()
 
 
 def test_a_map_stands_where_its_point_and_normal_say():
@@ -346,12 +309,12 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
     """A shelf over the half x > 0.5 of a table, and a rectangle that is wider than the table."""
     low, high = box([0, 0, 0], [1, 1, 0.1]), box([0.5, 0, 0.4], [0.5, 1, 0.1])
     both = np.vstack([low[0], high[0]]), np.vstack([low[1], high[1] + 8])
-    with pytest.raises(ModelError, match=r"at \[0\.[5-9]\d* *, +0\.\d+ *\] m"):
+    with pytest.raises(ModelError, match=r"at \[0\.5\d* *, +0\.\d* *\] m"):
         MeasuredSurface(file=stl_of(tmp_path / "shelf.stl", *both))
     file = stl_of(tmp_path / "table.stl", *low)
     part = MeasuredSurface((0.4, 0.8), file=file)
     assert part.fit.heights(np.array([0.5]), np.array([0.5]))[0, 0] == pytest.approx(0.1)
-    with pytest.raises(ModelError, match=r"at \[[-1]\.*\d* *, +0\.\d+ *\] m"):
+    with pytest.raises(ModelError, match=r"at \[-1\.\d* *, +0\.\d* *\] m"):
         MeasuredSurface((3.0, 0.8), file=file)
 
 
@@ -387,10 +350,3 @@ def test_refusals(make, words, tmp_path):
         make(tmp_path)
     assert words in str(caught.value)
     assert len(str(caught.value)) < 400
-
-
-def test_what_is_missing_to_read_a_mesh_is_reported(tmp_path, monkeypatch):
-    file = stl_of(tmp_path / "box.stl", *box([0, 0, 0], [1, 1, 1]))
-    monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
-    with pytest.raises(ModelError, match=r"drake_dae\[meshes\]"):
-        MeasuredSurface(file=file)

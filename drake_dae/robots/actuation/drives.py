@@ -1,0 +1,244 @@
+"""Drives: flexible joints, DC motors and electrohydraulic servos.     (64)-(65), (74)-(75)"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.dae import Parameter, Signal
+from drake_dae.errors import ModelError
+from drake_dae.robots.actuation.stage import (
+    AttachedStage,
+    Stage,
+    diagonal_parameter,
+    full_matrix,
+    matrix_parameter,
+)
+from drake_dae.robots.links.links import Links
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class FlexibleJoints(Stage):
+    """Elastic transmissions (64)-(65), with joint damping D beside the paper's stiffness K_2:
+
+        M(q_1) q_1'' + H = J^T lambda + K_2 (q_2 - q_1) + D (q_2' - q_1'),
+        M_2 q_2'' + K_2 (q_2 - q_1) + D (q_2' - q_1') = u.
+
+    A law with a delay compensates the springs late, and needs poles that are fast beside them; the
+    law takes accelerations of the links from its model. Model springs that are too stiff for the
+    sample time as rigid joints.
+
+    The rotor inertia that the URDF declares moves from the links to the shafts. Degrees: mu = 4 for
+    positions and 2 for forces; 3 and 1 with damping. Damping adds zero dynamics of dimension p,
+    which the law does not change: K_2 d + D d' = tau for the deflections d, with the rates of D^-1
+    K_2. They are stable, but limit the step of an explicit integrator. The law needs positions and
+    velocities of links and shafts. The plant has the port `motor_state`, (q_2, q_2'), shape (2p,).
+
+    Attributes:
+        stiffness: K_2 in N m/rad (N/m), a number, shape (p,) or (p, p), positive definite. All are
+            finite: with rigid joints among flexible ones B(x) of Assumption (5) is singular, since
+            the control reaches the outputs at different orders. Use a high stiffness instead.
+        inertia: M_2 in kg m^2 (kg), likewise; that of the URDF if None.
+        damping: D in N m s/rad (N s/m), likewise positive definite; 0 for none.
+        friction: Coulomb friction of the motors, F_c in N m (N), not negative, a number or shape
+            (p,): u less F_c s drives the shafts, with s_i = q_2i' / sqrt(q_2i'^2 + v_s^2), which
+            creeps below v_s. None for none and no such parameters; 0 for motors whose friction the
+            law does not know, so that a plant may have other values. The law (28) differentiates s
+            if F_c is not 0 in its model.
+        stiction_tolerance: v_s in rad/s (m/s), positive; only with friction.
+    """
+
+    stiffness: ArrayLike
+    inertia: ArrayLike | None = None
+    damping: ArrayLike = 0.0
+    friction: ArrayLike | None = None
+    stiction_tolerance: float = 0.01
+
+    def attach(self, links: Links) -> AttachedStage:
+        names = [signal.name for signal in links.actuator_signals]
+        p = len(names)
+        inertia = self.inertia
+        if inertia is None:
+            inertia = links.reflected_inertia
+            bare = [n for n, i in zip(names, links.reflected_inertia, strict=True) if i <= 0]
+            if bare:
+                raise ModelError(
+                    f"FlexibleJoints: no rotor inertia is declared for {', '.join(bare)}; give "
+                    "'inertia', or drake:rotor_inertia and drake:gear_ratio in the URDF"
+                )
+        rotary = all(signal.unit == "N m" for signal in links.actuator_signals)
+        units = ("N m/rad", "kg m^2", "N m s/rad") if rotary else ("", "", "")
+        stiffness, k = matrix_parameter("flexible_joints.stiffness", self.stiffness, p, units[0])
+        rotors, m_2 = matrix_parameter("flexible_joints.inertia", inertia, p, units[1])
+        parameters = [stiffness, rotors]
+        d = ca.SX(p, p)
+        if np.any(full_matrix("flexible_joints.damping", self.damping, p)):
+            try:
+                damping, d = matrix_parameter("flexible_joints.damping", self.damping, p, units[2])
+            except ModelError as error:
+                raise ModelError(
+                    f"{error}. Damp all flexible joints or none: where only some are damped, the "
+                    "control reaches the outputs at different orders"
+                ) from None
+            parameters.append(damping)
+        q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
+        drag = ca.SX(p, 1)
+        if self.friction is not None:
+            given = np.asarray(self.friction, dtype=float)
+            if given.shape not in ((), (p,)) or not np.all(given >= 0):
+                raise ModelError(
+                    f"flexible_joints.friction must be 0 or more, a number or shape ({p},), got "
+                    f"{self.friction!r}"
+                )
+            coefficients = Parameter(
+                "flexible_joints.friction",
+                np.broadcast_to(given, (p,)).copy(),
+                "N m" if rotary else "",
+                nonnegative=True,
+            )
+            slow = np.array([self.stiction_tolerance])
+            creep = Parameter("flexible_joints.stiction_tolerance", slow, positive=True)
+            parameters += [coefficients, creep]
+            drag = coefficients.symbol * rate / ca.sqrt(rate**2 + creep.symbol**2)
+
+        def force(position: ca.SX, velocity: ca.SX) -> ca.SX:
+            return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)  # (64)
+
+        kinds = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
+        positions = [Signal(f"{n}.position", unit) for n, unit in zip(names, kinds, strict=True)]
+        rates = [Signal(f"{n}.velocity", f"{unit}/s") for n, unit in zip(names, kinds, strict=True)]
+        return AttachedStage(
+            state=ca.vertcat(q_2, rate),
+            state_signals=(*positions, *rates),
+            mass=ca.diagcat(ca.SX.eye(p), m_2),
+            drift=lambda position, velocity: ca.vertcat(  # (65)
+                rate, -force(position, velocity) - drag
+            ),
+            drive_matrix=ca.vertcat(ca.SX(p, p), ca.SX.eye(p)),
+            drive_signals=tuple(links.actuator_signals),
+            force=force,
+            shaft=(q_2, rate),
+            carries_rotors=True,
+            ports={"motor_state": slice(0, 2 * p)},
+            parameters=tuple(parameters),
+        )
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class DcMotors(Stage):
+    """Armature-controlled direct-current motors (74)-(75), driven by voltages u:
+
+        M(q) q'' + H = J^T lambda + N K_m I_a,    L I_a' + R I_a + K_m N q' = u.
+
+    After `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
+    positions and 1 for forces. The law needs positions and velocities, and the currents. The plant
+    has the port `motor_current`, I_a in A, shape (p,).
+
+    Attributes:
+        torque_constant: K_m in N m/A, a number or shape (p,), not 0.
+        inductance: L in H, positive.
+        resistance: R in ohm, not negative.
+        gear_ratio: N; that of the URDF if None.
+    """
+
+    torque_constant: ArrayLike
+    inductance: ArrayLike
+    resistance: ArrayLike
+    gear_ratio: ArrayLike | None = None
+
+    def attach(self, links: Links) -> AttachedStage:
+        names = [signal.name for signal in links.actuator_signals]
+        p = len(names)
+        ratio = links.gear_ratios if self.gear_ratio is None else self.gear_ratio
+        constant, k_m = diagonal_parameter(
+            "dc_motors.torque_constant", self.torque_constant, p, "N m/A"
+        )
+        inductance, l = diagonal_parameter("dc_motors.inductance", self.inductance, p, "H", True)  # noqa: E741
+        resistance, r = diagonal_parameter("dc_motors.resistance", self.resistance, p, "ohm")
+        gears, n = diagonal_parameter("dc_motors.gear_ratio", ratio, p, "")
+        for parameter, wrong, rule in (
+            (constant, constant.value == 0, "not be zero"),
+            (gears, gears.value == 0, "not be zero"),
+            (resistance, resistance.value < 0, "not be negative"),
+        ):
+            if wrong.any():
+                raise ModelError(f"{parameter.name} must {rule}, got {parameter.value}")
+        current = ca.SX.sym("I", p)
+
+        return AttachedStage(
+            state=current,
+            state_signals=tuple(Signal(f"{name}.current", "A") for name in names),
+            mass=ca.diag(l),
+            drift=lambda position, velocity: -r * current - k_m * n * velocity,  # (75)
+            drive_matrix=ca.SX.eye(p),
+            drive_signals=tuple(Signal(f"{name}.voltage", "V") for name in names),
+            force=lambda position, velocity: n * k_m * current,  # (74)
+            ports={"motor_current": slice(0, p)},
+            parameters=(constant, inductance, resistance, gears),
+        )
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class ElectrohydraulicServos(Stage):
+    """Electrohydraulic servos (the last model of section 3.3), driven by normalized currents u:
+
+        M(q) q'' + H = J^T lambda + G(q) f_a,    K_h^-1 f_a' + G_p f_a + G(q)^T q' = u.
+
+    After `FlexibleJoints`, q is the position of the shafts. Degrees on rigid joints: mu = 3 for
+    positions and 1 for forces. The law needs positions and velocities, and the actuator forces. The
+    plant has the port `actuator_force`, f_a in N, shape (p,).
+
+    Attributes:
+        stiffness: K_h of the fluid in N/m, a number or shape (p,), positive.
+        leakage: G_p in m/(N s), a number, shape (p,) or (p, p), positive semidefinite.
+        geometry: The function G of the actuated positions, a CasADi column of shape (p, 1), with
+            values of shape (p, p) in m; or a constant: a number, shape (p,) or (p, p). 1 by
+            default.
+    """
+
+    stiffness: ArrayLike
+    leakage: ArrayLike
+    geometry: Callable[[ca.SX], ca.SX] | ArrayLike = 1.0
+
+    def attach(self, links: Links) -> AttachedStage:
+        names = [signal.name for signal in links.actuator_signals]
+        p = len(names)
+        fluid, k_h = diagonal_parameter("hydraulics.stiffness", self.stiffness, p, "N/m", True)
+        leakage, g_p = matrix_parameter(
+            "hydraulics.leakage", self.leakage, p, "m/(N s)", definite=False
+        )
+        pressing = ca.SX.sym("fa", p)
+
+        def geometry(position: ca.SX) -> ca.SX:
+            if not callable(self.geometry):
+                return ca.SX(full_matrix("hydraulics.geometry", self.geometry, p))
+            try:
+                value = ca.SX(self.geometry(position))
+            except (NotImplementedError, TypeError) as error:
+                raise ModelError(
+                    f"hydraulics.geometry must return a CasADi matrix, for example "
+                    f"casadi.diag(...): {error}"
+                ) from error
+            if value.shape != (p, p):
+                raise ModelError(f"hydraulics.geometry has shape {value.shape}, expected {(p, p)}")
+            return value
+
+        return AttachedStage(
+            state=pressing,
+            state_signals=tuple(Signal(f"{name}.actuator_force", "N") for name in names),
+            mass=ca.diag(1 / k_h),
+            drift=lambda position, velocity: (
+                -ca.mtimes(g_p, pressing) - ca.mtimes(geometry(position).T, velocity)
+            ),
+            drive_matrix=ca.SX.eye(p),
+            drive_signals=tuple(Signal(f"{name}.valve_current") for name in names),
+            force=lambda position, velocity: ca.mtimes(geometry(position), pressing),
+            ports={"actuator_force": slice(0, p)},
+            parameters=(fluid, leakage),
+        )
