@@ -154,9 +154,10 @@ def _new_folder(name: str) -> Path:
 @contextmanager
 def _watched(meshcat: Meshcat | None) -> Iterator[None]:
     """Waits on a terminal for somebody who looks, and at the end for Enter: then the view ends."""
-    if meshcat is not None:
-        print(f"watch at {meshcat.web_url()}", flush=True)
     is_asked = meshcat is not None and sys.stdin is not None and sys.stdin.isatty()
+    if meshcat is not None:
+        waits = "; the run begins when this page is open" * is_asked
+        print(f"watch at {meshcat.web_url()}{waits}", flush=True)
     while is_asked and meshcat is not None and not meshcat.GetNumActiveConnections():
         time.sleep(0.1)
     yield

@@ -5,7 +5,6 @@ import json
 
 from drake_dae.commands.parser import Parser
 from drake_dae.errors import ScenarioError
-from drake_dae.files import read_text
 from drake_dae.scenario.shipped import (
     DEFAULT_SCENARIO,
     description,
@@ -33,6 +32,8 @@ def _print_options(parser: Parser) -> None:
 
 def _print(options: argparse.Namespace) -> int:
     """Prints a shipped scenario with its comments, as the beginning of your own."""
+    from drake_dae.files import read_text
+
     path = find_scenario(options.scenario)
     try:
         print(f"{path}\n" if options.path else read_text(path), end="")
