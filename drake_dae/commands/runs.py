@@ -290,8 +290,10 @@ def _plot(options: argparse.Namespace) -> int:
     if options.all:
         check_unwritten((folder / name for folder in runs for name in PLOTS), options.force)
         for folder in runs:
-            with waiting(f"drawing {folder}"), complete(folder, PLOTS[0]) as place:
-                save_plots(*_run_again(folder), place)
+            with waiting(f"drawing {folder}"):
+                again = _run_again(folder)
+                with complete(folder, PLOTS[0]) as place:
+                    save_plots(*again, place)
             written = [name for name in PLOTS if (folder / name).exists()]
             print(f"written to {folder}/: {', '.join(written)}")
         return 0
