@@ -47,6 +47,7 @@ from .diagrams.wiring import wire_loop as wire_loop
 from .errors import DrakeDaeError as DrakeDaeError
 from .pictures.animation import make_animation as make_animation
 from .pictures.film import save_film as save_film
+from .pictures.page.page import write_page as write_page
 from .pictures.runs import plot_runs as plot_runs
 from .references import CircleReference as CircleReference
 from .references import ConstantReference as ConstantReference
@@ -99,10 +100,8 @@ from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
 from .robots.surfaces.surfaces import Plane as Plane
 from .robots.surfaces.surfaces import Sphere as Sphere
 from .robots.surfaces.surfaces import Torus as Torus
-from .running.bench.page import write_page as write_page
-from .running.export.export import export_code as export_code
-from .running.export.steps.controller import export_controller as export_controller
-from .running.export.wasm.wasm import export_wasm as export_wasm
+from .running.export.controller import export_controller as export_controller
+from .running.export.loop import export_loop as export_loop
 from .running.rollout.problems import start_values as start_values
 from .running.rollout.rollout import rollout as rollout
 from .scenario.build import build_scenario as build_scenario

@@ -30,7 +30,7 @@ from drake_dae import (
     TrackingLaw,
     build_scenario,
     dynamic_extension,
-    export_code,
+    export_loop,
     find_structure,
     load_scenario,
     make_animation,
@@ -225,7 +225,7 @@ def test_a_context_of_another_loop_is_refused_in_a_sentence(tmp_path):
         lambda: loop.record(context),
         lambda: loop.set_state(context, arm("two_link").structure.states[0]),
         lambda: start_values(loop, context),
-        lambda: export_code(loop, context, "a", tmp_path),
+        lambda: export_loop(loop, context, "a", tmp_path),
         lambda: make_animation(loop, loop.record(loop.diagram.CreateDefaultContext()), context),
     ):
         with pytest.raises(ModelError, match=r"'(closed_loop|two_link_arm)'"):
