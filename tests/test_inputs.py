@@ -17,9 +17,7 @@ from drake_dae import (
     FlexibleJoints,
     ForceSensor,
     JointPositions,
-    MultibodyExpressions,
     NormalForm,
-    Observing,
     Parameter,
     PointToPointReference,
     Record,
@@ -29,25 +27,23 @@ from drake_dae import (
     Torus,
     TrackingLaw,
     build_scenario,
-    dynamic_extension,
-    export_loop,
     find_structure,
     load_scenario,
     make_animation,
     poles,
     simulate,
-    start_values,
-    with_disturbance,
 )
 from drake_dae.arrays import brief, numbers
 from drake_dae.cli import main
-from drake_dae.dae import Signal
+from drake_dae.dae import Signal, with_disturbance
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
-from drake_dae.pictures.axes import labelled
-from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.robots import MultibodyExpressions
+from drake_dae.running import export_loop, start_values
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.simulation.records.record import Recorded
+from drake_dae.scenario.typed_yaml import load_yaml
+from drake_dae.systems import Observing
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
@@ -284,7 +280,6 @@ ARGUMENTS = {
     "constant(nan)": lambda: ConstantReference(np.nan),
     "point_to_point(nan)": lambda: PointToPointReference(0.0, 1.0, np.nan, 1.0),
     "Torus(inf)": lambda: Torus((0, 0, 0), (0, 0, 1), np.inf, 1.0),
-    "max_integrators=-1": lambda: dynamic_extension(arm("two_link").model.dae, max_integrators=-1),
     "spread=-1": lambda: find_structure(arm("two_link").model.dae, spread=-1.0),
     "a row as a state": lambda: law("two_link").control(
         np.zeros((1, 4)), np.zeros(law("two_link").layout.reference_size)
@@ -327,10 +322,6 @@ def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
         Record.load(tmp_path / "record.npz")
     with pytest.raises(ModelError, match="nowhere"):
         Record.load("nowhere")
-
-
-def test_dollars_in_names_are_no_mathematics():
-    assert labelled(Signal("$x^$", "m")) == r"\$x^\$ [m]"
 
 
 def test_a_folder_that_is_none(tmp_path, capsys):

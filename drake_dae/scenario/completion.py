@@ -15,19 +15,20 @@ from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.by_name import denoted
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.constraints.plant_constraints import plant_constraints
-from drake_dae.robots.force_outputs import force_outputs, force_rows
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.outputs import (
+from drake_dae.robots import (
     AxisCoordinates,
+    Constraint,
+    ConstraintSet,
     JointPositions,
+    Links,
     PointCoordinates,
     PositionOutput,
+    as_force_outputs,
+    force_rows,
+    plant_constraints,
 )
-from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.parts.written import TiltFromNormalForm, WrittenOutput, make
+from drake_dae.scenario.form import at
+from drake_dae.scenario.parts import TiltFromNormalForm, WrittenOutput, make
 from drake_dae.scenario.postures import INDEPENDENT, Posture, Postures, tool_axis
 from drake_dae.scenario.scenario import Scenario
 
@@ -63,19 +64,10 @@ def completions(
     For the rule see `complete_scenario`. Starts and sets of joints are compared by the least
     `Postures.quality` along the reference; it is zero where a joint leaves its limits of position
     or speed.
-
-    Args:
-        scenario: The scenario.
-        links: Its robot.
-        constraints: Its constraints; those in the robot's file are appended.
-        guess: The default configuration with start.positions, shape (nq,).
-
-    Raises:
-        ScenarioError: The robot cannot reach the start, or no choice of outputs is independent.
     """
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
     outputs = [make(form, constraints) for form in scenario.outputs]
-    steered = force_outputs(scenario.forces, bound)
+    steered = as_force_outputs(scenario.forces, bound)
     S = force_rows(steered, bound, links)
     rows = _Rows(scenario, links, outputs, bound)
     missing = len(links.actuator_signals) + len(bound.motors) - rows.given - S.shape[0]

@@ -10,16 +10,16 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record, RecordAfter
 from drake_dae.diagrams.state_feedback import (
     ENCODER_NOISE,
     encoder_seed,
 )
 from drake_dae.errors import ModelError, SimulationError
+from drake_dae.running.divergence import DivergenceWatch
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, diagnosed, run_loop
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.divergence import DivergenceWatch
-from drake_dae.simulation.records.record import Record, RecordAfter
 
 ROWS = 1000
 """The number of rows of a record of a rollout under error control, after the first."""
@@ -51,15 +51,7 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
 
 
 def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
-    """The times of the rows of a rollout's record, in s: equidistant, or those of fixed steps.
-
-    Args:
-        scenario: The scenario.
-        time_step: The step of a plant that Drake steps, in s; 0 for any other plant.
-
-    Raises:
-        ModelError: There are too many.
-    """
+    """The times of the rows of a rollout's record, in s: equidistant, or those of fixed steps."""
     config, duration = scenario.integrator, scenario.duration
     start, end = config.start_time, config.start_time + duration
     fixed = time_step or (0.0 if config.use_error_control else config.max_step_size)
@@ -85,20 +77,7 @@ def roll_scenario(
     lasting: float | None = None,
     look: Callable[[RecordAfter], bool] = lambda record: False,
 ) -> Rollout:
-    """Runs a scenario by `rollout`; a diverging run ends, as by `simulate`.
-
-    Args:
-        scenario: The scenario.
-        loop: Its closed loop.
-        context: The start, by `start_scenario`.
-        lasting: The expected total duration of runs of this loop, in s, for the decision whether to
-            compile it; None for a single run, which uses the cache.
-        look: As for `run_loop`.
-
-    Raises:
-        ModelError: The loop cannot be rolled out.
-        InconsistentStateError: The start is not on N*.
-    """
+    """Runs a scenario by `rollout`; a diverging run ends, as by `simulate`."""
     start, parameters = start_values(loop, context)
     sensors, seeds = scenario.sensors, dict[str, int]()
     if sensors.force is not None:

@@ -67,7 +67,7 @@ def test_rollouts_are_as_recorded(name, compiled):
 
 @pytest.mark.parametrize("name", params(["two_link_wall", "seven_joint_wall"]))
 def test_exported_c_is_as_recorded(name, tmp_path):
-    """All signals of the loop that runs in C; its rows come after a projection, recorded ones before."""
+    """All signals of the loop in C, whose rows come after a projection, recorded ones before."""
     if shutil.which("cc") is None:
         pytest.skip("there is no C compiler")
     chosen, loop, context = built(CASES[name])

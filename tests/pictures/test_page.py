@@ -9,10 +9,11 @@ import pytest
 from browser import LOW_CONTRAST, in_page, needs_chromium
 from runs import scenario
 
-from drake_dae import build_commanded, write_page
+from drake_dae import write_page
 from drake_dae.cli import main
 from drake_dae.errors import MachineCodeError
 from drake_dae.pictures.page import wasm
+from drake_dae.scenario import build_commanded
 
 needs_zig = pytest.mark.skipif(find_spec("ziglang") is None, reason="there is no ziglang")
 

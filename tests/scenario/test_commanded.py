@@ -6,7 +6,8 @@ from by_inputs import parameter_names, set_inputs
 from pydrake.systems.analysis import SimulatorConfig
 from runs import run, scenario
 
-from drake_dae import build_commanded, build_scenario
+from drake_dae import build_scenario
+from drake_dae.scenario import build_commanded
 from drake_dae.scenario.shipped import shipped_scenarios
 
 FIXED = SimulatorConfig(

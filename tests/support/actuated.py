@@ -12,10 +12,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_dae import RobotModel, find_structure
 from drake_dae.dae import Structure
-from drake_dae.robots.actuation.dc_motors import DcMotors
-from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
-from drake_dae.robots.actuation.hydraulics import ElectrohydraulicServos
-from drake_dae.robots.actuation.stage import Stage
+from drake_dae.robots import DcMotors, ElectrohydraulicServos, FlexibleJoints, Stage
 
 ARMS = ["two_link", "seven_joint"]
 DEGREES = {

@@ -25,7 +25,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.dae import GainDesign, Structure, find_structure
-from drake_dae.robots.actuation.stage import Stage
+from drake_dae.robots import Stage
 from drake_dae.scenario.shipped import FOLDER, find_scenario
 
 

@@ -26,13 +26,13 @@ FLOORS = (
     ("trace",),
     ("dae",),
     ("references",),
-    ("analysis", "robots"),
+    ("robots",),
     ("blocks",),
     ("systems",),
     ("scene",),
     ("compiler",),
-    ("simulation",),
     ("diagrams",),
+    ("analysis",),
     ("running",),
     ("pictures",),
     ("scenario",),
@@ -45,20 +45,36 @@ FLOORS = (
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 # The mathematics can be read, tested and used without Drake.
-WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references", "analysis")
+WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references")
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
+    "signals",
+    "contacts",
+    "fields",
     "system",
+    "settling",
     "manifold",
     "derivatives",
     "elimination",
-    "states",
+    "samples",
+    "margins",
+    "family",
+    "assumptions",
+    "redundancy",
+    "relative_degrees",
     "structure",
     "normal_form",
+    "gains",
+    "law_model",
+    "law_terms",
     "tracking",
     "linearization",
     "beyond",
+    "pinned_outputs",
+    "pinned_motion",
+    "equilibria",
+    "floquet",
     "zero_dynamics",
     "extension",
 )

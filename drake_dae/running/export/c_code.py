@@ -16,7 +16,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import stacked
 from drake_dae.blocks.compose import Composed
 from drake_dae.blocks.stepping import StepFunctions
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import generate, renamed, without_branches
 

@@ -154,7 +154,7 @@ class ControllerPart:
     inputs: Mapping[str, Port]
     outputs: Mapping[str, Port]
     acts_at_once: bool
-    """Whether the control has direct feedthrough from measurements; else updates alone change it."""
+    """Whether the control has direct feedthrough from measurements; else updates change it."""
 
     def words(self, name: str, start: float) -> dict[str, str]:
         """The texts for the templates."""

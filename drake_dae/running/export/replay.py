@@ -42,7 +42,7 @@ def recorded_run(
 ) -> str:
     """A run as CSV: each line has the time in s, the inputs, and the resulting outputs.
 
-    Inputs are those before the updates of the instant, outputs those after, unless they act at once.
+    Inputs are those before the updates of the instant, outputs those after, or at once before.
     """
     simulator = Simulator(diagram, context.Clone())
     ApplySimulatorConfig(config, simulator)

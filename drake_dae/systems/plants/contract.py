@@ -12,7 +12,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import check_context
 from drake_dae.dae import ConstraintStructure, DaeSystem, DerivativeLayout, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System

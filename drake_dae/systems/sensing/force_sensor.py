@@ -12,7 +12,7 @@ from drake_dae.arrays import vector
 from drake_dae.blocks.block import TIME, Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 
 

@@ -2,7 +2,6 @@
 
 import re
 import tracemalloc
-import warnings
 import zipfile
 
 import casadi as ca
@@ -10,18 +9,11 @@ import numpy as np
 import pytest
 from meshes import obj_of_grid, stl_of
 
-from drake_dae import (
-    Cylinder,
-    ImplicitSurface,
-    MeasuredSurface,
-    PointOnSurface,
-    Sphere,
-)
+from drake_dae import Cylinder, ImplicitSurface, MeasuredSurface, PointOnSurface, Sphere
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.robots import LinkExpressions, tangents
+from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.given import numpy_explained
-from drake_dae.trace.smoothness import find_flaw
 
 X, Y = np.linspace(-0.2, 0.2, 33), np.linspace(-0.15, 0.15, 25)
 A, B = 0.02, 15.0
@@ -72,7 +64,7 @@ def test_a_formula_of_one_length_is_smooth_where_its_gradient_is_not_zero(
     """
     p, h = ca.SX.sym("p", 3), 1e-4
     found = ImplicitSurface(formula).distance(p)
-    assert find_flaw(found, p, ca.SX(0, 1)) is None
+    assert not find_flaw(found, p, ca.SX(0, 1))
     hessian = ca.Function("hessian", [p], [ca.hessian(found, p)[0]])
     for place in np.array(places, dtype=float):
         steps = h * np.eye(3)
@@ -122,13 +114,14 @@ def test_numbers_of_a_formula_are_parameters_of_the_constraint():
     assert [p.name for p in first.parameters] == ["a.position", "a.r"]
     assert first.parameters[1].value == 0.5
     # One surface of two constraints has a number for each.
-    p = ca.SX.sym("p", 3)
+    links = LinkExpressions(
+        ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.eye(3), ca.SX(3, 1), {"tool": ca.SX.sym("p", 3)}
+    )
     radius = first.parameters[1].symbol
-    assert ca.depends_on(first.surface.distance(p), radius)
-    assert not ca.depends_on(second.surface.distance(p), radius)
-    assert surface == first.surface
+    assert ca.depends_on(first.residual(links), radius)
+    assert not ca.depends_on(second.residual(links), radius)
     # Drawn with the number that it has now.
-    mesh = first.picture(np.array([0, 0, 0, 0.9]), np.array([0.0, 0.0, 0.9]), 0.4).form
+    mesh = first.surface_at(np.array([0, 0, 0, 0.9])).picture([0.0, 0.0, 0.9], 0.4).form
     vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.9, atol=1e-12)
 
@@ -210,8 +203,6 @@ def test_the_error_of_smoothing_is_reported():
     assert 0.5e-4 < np.sqrt(np.mean(off**2)) < 1.2e-4
     # It is nearer to the wave than the noise is.
     assert np.sqrt(np.mean((surface.fit.heights(X, Y) - WAVES) ** 2)) < 0.7e-4
-    assert PointOnSurface("tool", surface, name="bench").remark == f"bench: {surface.remark}"
-    assert PointOnSurface("tool", Sphere((0, 0, 0), 1.0)).remark == ""
 
 
 @pytest.mark.parametrize("rough", [np.abs(X - 0.13), 1.0 * (X > 0.17), np.sin(300 * X)])
@@ -354,12 +345,12 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
     """A shelf over the half x > 0.5 of a table, and a rectangle that is wider than the table."""
     low, high = box([0, 0, 0], [1, 1, 0.1]), box([0.5, 0, 0.4], [0.5, 1, 0.1])
     both = np.vstack([low[0], high[0]]), np.vstack([low[1], high[1] + 8])
-    with pytest.raises(ModelError, match=r"at \[0\.[5-9]\d* *, +0\.\d+ *\] m"):
+    with pytest.raises(ModelError, match=r"at \[0\.5\d* *, +0\.\d* *\] m"):
         MeasuredSurface(file=stl_of(tmp_path / "shelf.stl", *both))
     file = stl_of(tmp_path / "table.stl", *low)
     part = MeasuredSurface((0.4, 0.8), file=file)
     assert part.fit.heights(np.array([0.5]), np.array([0.5]))[0, 0] == pytest.approx(0.1)
-    with pytest.raises(ModelError, match=r"at \[[-1]\.*\d* *, +0\.\d+ *\] m"):
+    with pytest.raises(ModelError, match=r"at \[-1\.\d* *, +0\.\d* *\] m"):
         MeasuredSurface((3.0, 0.8), file=file)
 
 
@@ -402,24 +393,3 @@ def test_what_is_missing_to_read_a_mesh_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
     with pytest.raises(ModelError, match=r"drake_dae\[meshes\]"):
         MeasuredSurface(file=file)
-
-
-def test_functions_of_numpy_are_reported_in_one_line_and_once():
-    """CasADi tells them in twenty lines, each time that the surface is asked."""
-    p = ca.SX.sym("p", 3)
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        surface = ImplicitSurface(lambda p: p[2] - 0.1 * np.sin(3.0 * p[0]))
-        for _ in range(3):
-            surface.distance(p)
-            surface.unit_normal(p)
-        for _ in range(2):
-            with numpy_explained("this function"):
-                warnings.warn("casadi: a numpy function was called", FutureWarning, stacklevel=1)
-                warnings.warn("something else", FutureWarning, stacklevel=1)
-    texts = [str(one.message) for one in told]
-    assert texts.count("something else") == 2
-    assert sum("this function calls a function of NumPy" in text for text in texts) == 1
-    assert sum("an ImplicitSurface calls a function of NumPy" in text for text in texts) <= 1
-    assert len(texts) <= 4
-    assert not any("\n" in text for text in texts)

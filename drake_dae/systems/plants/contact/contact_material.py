@@ -18,8 +18,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import own_values
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel, own_values
 
 FRICTION = Signal("plant.friction")
 """The coefficient of friction of all contacts, among `PointMaterial.signals`."""
@@ -88,7 +87,8 @@ class PointMaterial:
         forms = [
             solid.form
             for constraint in model.constraints
-            for solid in constraint.solids(own_values(constraint, model.dae, values))
+            if (surface := constraint.surface_at(own_values(constraint, model.dae, values)))
+            for solid in surface.solids()
         ]
         spheres = {form.radius() if isinstance(form, Sphere) else None for form in forms}
         return max(self.stiffness_at(force, sphere) for sphere in spheres or {None})

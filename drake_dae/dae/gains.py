@@ -1,0 +1,283 @@
+"""Feedback gains, the error dynamics that they assign, and their exact response.   (30)-(34)"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, brief, numbers, show, vector
+from drake_dae.dae.signals import DerivativeLayout
+from drake_dae.errors import GainError
+
+
+@checked(GainError)
+@dataclass(frozen=True, eq=False)
+class FeedbackGains:
+    """The feedback gains of the law (28), which determine the error dynamics (30).
+
+    With the error coordinates e = (e_1, e_1', ..., e_1^(mu_1 - 1), ..., e_p^(mu_p - 1)), shape
+    (N,), N = sum mu_i, the law sets
+
+        (e_1^(mu_1), ..., e_p^(mu_p)) = -K e.
+
+    A row of K may contain the errors of other outputs, as the full matrices Lambda_1, Lambda_2, ...
+    of (60), (72) and (82) do.
+
+    Attributes:
+        names: Names of the p outputs, in their order.
+        degrees: mu_1, ..., mu_p; 0 for an output with e = 0 at all times (31).
+        matrix: K, shape (p, N); rows of outputs with degree 0 are zero.
+
+    Raises:
+        GainError: The shape is wrong, or the error dynamics are not Hurwitz (32).
+    """
+
+    names: tuple[str, ...]
+    degrees: tuple[int, ...]
+    matrix: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "degrees", tuple(int(degree) for degree in self.degrees))
+        if len(self.names) != len(self.degrees):
+            raise GainError(f"{len(self.names)} output names for {len(self.degrees)} degrees")
+        matrix = numbers("gains", self.matrix, GainError)
+        shape = (len(self.degrees), sum(self.degrees))
+        if matrix.shape != shape:
+            raise GainError(f"gains must have shape (p, sum mu_i) = {shape}, got {matrix.shape}")
+        if not np.all(np.isfinite(matrix)):
+            raise GainError(f"gains must be finite, got {matrix}")
+        for name, degree, row in zip(self.names, self.degrees, matrix, strict=True):
+            if degree == 0 and row.any():
+                raise GainError(
+                    f"output '{name}' has degree 0 and takes no gain: the law attains it without "
+                    "delay"
+                )
+        matrix.setflags(write=False)
+        object.__setattr__(self, "matrix", matrix)
+        slowest = np.max(self.poles.real, initial=-np.inf)
+        if slowest >= 0.0:
+            raise GainError(
+                "the error dynamics (30) are not Hurwitz: poles "
+                f"{show(self.poles)}; all real parts must be negative"
+            )
+
+    @property
+    def layout(self) -> DerivativeLayout:
+        """The layout of the error coordinates."""
+        return DerivativeLayout(self.degrees)
+
+    @property
+    def error_matrix(self) -> FloatArray:
+        """E of e' = E e, shape (N, N)."""
+        layout = self.layout
+        result = np.eye(layout.chain_size, k=1)
+        result[layout.ends] = -self.matrix[layout.dynamic]  # (30)
+        return result
+
+    @property
+    def poles(self) -> np.typing.NDArray[np.complex128]:
+        """The poles of the errors, the eigenvalues of E, in 1/s, shape (N,)."""
+        return np.linalg.eigvals(self.error_matrix).astype(complex)
+
+    @checked(GainError)
+    def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
+        """Returns the exact tracking error exp(E t) e(0) of (30), (31), shape (k, p).
+
+        Args:
+            times: Times in s after the start, shape (k,).
+            initial: Error coordinates at the start, shape (N,).
+        """
+        moments = vector("times", np.atleast_1d(times), None, GainError)
+        coordinates = numbers("initial", initial, GainError)
+        matrix = self.error_matrix
+        if coordinates.shape != (matrix.shape[0],):
+            raise GainError(
+                f"the error has sum mu_i = {matrix.shape[0]} coordinates, got shape "
+                f"{coordinates.shape}"
+            )
+        # From one time to the next: a log with fixed steps has few different step lengths once its
+        # times are rounded to a power of 2, whose differences floating-point numbers compute
+        # exactly.
+        grid = np.exp2(np.floor(np.log2(np.max(np.abs(moments), initial=1e-300))) - 50.0)
+        order = np.argsort(moments)
+        steps = np.diff(np.round(moments[order] / grid) * grid, prepend=0.0)
+        lengths, which = np.unique(steps, return_inverse=True)
+        result = np.zeros((moments.size, len(self.degrees)))  # (31), (34)
+        orders, owner = self.layout.orders, self.layout.owners
+        for outputs in _coupled(self.layout, self.matrix):
+            rows = np.flatnonzero(np.isin(owner, outputs))
+            block = matrix[np.ix_(rows, rows)]
+            # In units of its own rate, a power of 2, so that the entries of exp(E t) have similar
+            # sizes.
+            rate = np.exp2(np.round(np.log2(np.max(np.abs(np.linalg.eigvals(block))))))
+            scale = rate ** orders[rows]
+            transitions = scipy.linalg.expm(
+                lengths[:, None, None] * (block / scale[:, None] * scale)
+            )
+            current = coordinates[rows] / scale
+            response = np.zeros((moments.size, rows.size))
+            for row, index in zip(order, which, strict=True):
+                current = transitions[index] @ current
+                response[row] = current
+            result[:, owner[rows[orders[rows] == 0]]] = response[:, orders[rows] == 0]
+        return result
+
+
+GainDesign = Callable[[Sequence[str], Sequence[int]], FeedbackGains]
+"""A function that makes gains for outputs of given names and degrees."""
+
+
+Poles = float | complex | Sequence[float | complex]
+
+
+@checked(GainError)
+def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
+    """Designs gains K_ij that assign poles to each output: the coefficients of (32).
+
+    Args:
+        values: One pole in 1/s for all, or a sequence of mu_i poles for every output, or these per
+            output name, "*" for all others. Complex poles come in conjugate pairs.
+    """
+
+    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
+        chosen: list[tuple[str, int, Poles]] = _per_output(values, names, degrees)
+        polynomials = {name: _polynomial(name, degree, own) for name, degree, own in chosen}
+        return gain_coefficients(polynomials)(names, degrees)
+
+    return design
+
+
+@checked(GainError)
+def gain_coefficients(
+    values: Sequence[float] | Mapping[str, float | Sequence[float]],
+) -> GainDesign:
+    """Designs the gains K_i1, ..., K_i mu_i of (32) from numbers, lowest derivative first.
+
+    Args:
+        values: mu_i numbers for every output, or these per output name, "*" for all others.
+    """
+
+    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
+        matrix = np.zeros((len(names), sum(degrees)))
+        starts = dict(zip(names, DerivativeLayout(tuple(degrees)).starts, strict=True))
+        chosen: list[tuple[str, int, float | Sequence[float]]]
+        chosen = _per_output(values, names, degrees)
+        for name, degree, row in chosen:
+            entries = np.atleast_1d(numbers(f"coefficients of output '{name}'", row, GainError))
+            if entries.shape != (degree,):
+                raise GainError(
+                    f"output '{name}' has degree {degree} and takes {degree} coefficients "
+                    f"K_i1, ..., K_i{degree}, got {entries.size}"
+                )
+            start = int(starts[name])
+            matrix[list(names).index(name), start : start + degree] = entries
+        return FeedbackGains(tuple(names), tuple(degrees), matrix)
+
+    return design
+
+
+def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
+    """Designs gains from full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ... of (72)-(73).
+
+    Args:
+        groups: For each degree mu >= 1 that occurs among the outputs, highest first, the mu
+            matrices (lowest derivative first) that couple the outputs of this degree, in the
+            outputs' order. Rigid joints: `gain_matrices([Lambda_1, Lambda_2])`.
+    """
+    for k, group in enumerate(groups):
+        if isinstance(group, str) or not isinstance(group, Collection):
+            raise GainError(f"gain_matrices: groups[{k}] must be matrices, got {brief(group)}")
+    blocks = [
+        [numbers(f"gain_matrices: groups[{k}]", block, GainError) for block in group]
+        for k, group in enumerate(groups)
+    ]
+
+    def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
+        occurring = sorted({degree for degree in degrees if degree}, reverse=True)
+        if len(blocks) != len(occurring):
+            raise GainError(
+                f"the outputs have the degrees {occurring}. Give a group of gain matrices for "
+                f"each degree: {len(occurring)} are needed, got {len(blocks)}"
+            )
+        matrix = np.zeros((len(names), sum(degrees)))
+        starts = DerivativeLayout(tuple(degrees)).starts
+        for degree, group in zip(occurring, blocks, strict=True):
+            members = [i for i, d in enumerate(degrees) if d == degree]
+            if len(group) != degree:
+                raise GainError(
+                    f"outputs of degree {degree} take {degree} matrices, got {len(group)}"
+                )
+            for order, block in enumerate(group):
+                block = np.atleast_2d(block)
+                if block.shape != (len(members), len(members)):
+                    raise GainError(
+                        f"a gain matrix has shape {block.shape}, but "
+                        f"{', '.join(names[i] for i in members)} need "
+                        f"({len(members)}, {len(members)})"
+                    )
+                # (60), (72)-(73), (82)-(83)
+                matrix[np.ix_(np.array(members), starts[members] + order)] = block
+        return FeedbackGains(tuple(names), tuple(degrees), matrix)
+
+    return design
+
+
+T = TypeVar("T")
+
+
+def _per_output(
+    values: T | Mapping[str, T], names: Sequence[str], degrees: Sequence[int]
+) -> list[tuple[str, int, T]]:
+    """Returns name, degree and value of each output with a degree above 0."""
+    dynamic = [(name, degree) for name, degree in zip(names, degrees, strict=True) if degree]
+    if not isinstance(values, Mapping):
+        return [(name, degree, values) for name, degree in dynamic]
+    expected = [name for name, _ in dynamic]
+    unknown = [name for name in values if name not in (*names, "*")]
+    missing = [name for name in expected if name not in values and "*" not in values]
+    useless = [name for name in values if name in names and name not in expected]
+    if unknown or missing or useless:
+        parts = [
+            f"{text}: {', '.join(is_wrong)}"
+            for text, is_wrong in (
+                ("unknown outputs", unknown),
+                ("no gains for", missing),
+                ("degree 0, no gains", useless),
+            )
+            if is_wrong
+        ]
+        raise GainError(f"gains per output: {'; '.join(parts)}. Needed: {', '.join(expected)}")
+    return [(name, degree, values[name if name in values else "*"]) for name, degree in dynamic]
+
+
+def _polynomial(name: str, degree: int, chosen: Poles) -> list[float]:
+    """K_i1, ..., K_i mu_i of the polynomial (32) with the chosen roots."""
+    try:
+        roots = np.atleast_1d(np.asarray(chosen, dtype=complex))
+    except (TypeError, ValueError) as error:
+        raise GainError(f"poles of output '{name}' must be numbers, got {chosen!r}") from error
+    if roots.size == 1:
+        roots = np.repeat(roots, degree)
+    if roots.shape != (degree,):
+        raise GainError(
+            f"output '{name}' has degree {degree} and takes 1 or {degree} poles, got {roots.size}"
+        )
+    monic = np.poly(roots)  # (32)
+    if np.abs(np.imag(monic)).max() > 1e-12 * np.abs(monic).max():
+        raise GainError(f"complex poles of output '{name}' must come in conjugate pairs: {roots}")
+    return [float(number) for number in np.real(monic)[:0:-1]]
+
+
+def _coupled(layout: DerivativeLayout, matrix: FloatArray) -> list[list[int]]:
+    """Groups of outputs whose errors are coupled."""
+    groups: list[set[int]] = []
+    for i in map(int, layout.dynamic):
+        joined = {i, *map(int, layout.owners[np.flatnonzero(matrix[i])])}
+        apart = [group for group in groups if not group & joined]
+        groups = [*apart, joined.union(*(group for group in groups if group & joined))]
+    return [sorted(group) for group in groups]

@@ -1,0 +1,6 @@
+"""The names of the room, each with its home."""
+
+from .export.controller import export_controller as export_controller
+from .export.loop import export_loop as export_loop
+from .record_writer import RecordWriter as RecordWriter
+from .rollout.problems import start_values as start_values

@@ -1,0 +1,407 @@
+"""Parts of a scenario without a class in the library, or written otherwise than that has it."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.dae import GainDesign, gain_coefficients, gain_matrices, poles
+from drake_dae.errors import GainError, ModelError
+from drake_dae.references import Reference
+from drake_dae.robots import (
+    Constraint,
+    FrictionCone,
+    PositionOutput,
+    SurfaceCoordinates,
+    TiltFromNormal,
+    WeldedFrames,
+)
+from drake_dae.scenario.robot_file.robot import Pose
+from drake_dae.systems.observing.observing import Observing
+from drake_dae.systems.sensing.encoders import Encoders
+from drake_dae.systems.sensing.force_sensor import ForceSensor
+from drake_dae.systems.task.phases import Phase
+from drake_dae.systems.task.task import Task
+
+T = TypeVar("T", Constraint, PositionOutput)
+
+
+@dataclass(frozen=True)
+class WeldedFramesForm:
+    """Frame B has a fixed pose in frame A, given by angles.
+
+    Attributes:
+        frame_a: Name of frame A; it may be "world".
+        frame_b: Name of frame B, on another body.
+        pose: The pose of B in A; by default the frames coincide.
+        name: The name of the constraint, the prefix of its forces and its parameter.
+    """
+
+    frame_a: str
+    frame_b: str
+    pose: Pose = field(default_factory=Pose)
+    name: str = "weld"
+
+    def make(self, constraints: Sequence[Constraint]) -> Constraint:
+        """The constraint."""
+        rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
+        pose = RigidTransform(rotation, self.pose.translation)
+        return WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
+
+
+@dataclass(frozen=True)
+class SurfaceCoordinatesForm:
+    """The coordinates along a constraint.
+
+    Attributes:
+        constraint: The name of a constraint with coordinates, such as a PointOnSurface on a !Plane.
+    """
+
+    constraint: str
+
+    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
+        """The output."""
+        return SurfaceCoordinates(_named(self.constraint, constraints))
+
+
+@dataclass(frozen=True)
+class TiltFromNormalForm:
+    """The tilt of a tool's axis from the surface normal at its contact.
+
+    Attributes:
+        constraint: The name of a constraint with a free side, such as a PointOnSurface.
+        axis: The axis of its frame, "x", "y" or "z".
+        components: The rows, a choice of the two other axes, "xy" for example; both if empty.
+    """
+
+    constraint: str
+    axis: str
+    components: str = ""
+
+    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
+        """The output."""
+        return TiltFromNormal(_named(self.constraint, constraints), self.axis, self.components)
+
+
+WrittenConstraint = Constraint | WeldedFramesForm
+WrittenOutput = PositionOutput | SurfaceCoordinatesForm | TiltFromNormalForm
+
+
+def make(
+    form: T | WeldedFramesForm | SurfaceCoordinatesForm | TiltFromNormalForm,
+    constraints: Sequence[Constraint],
+) -> T:
+    """The library's object of a form that may name constraints; such an object as it is."""
+    return cast(T, form.make(constraints) if hasattr(form, "make") else form)
+
+
+def _named(name: str, constraints: Sequence[Constraint]) -> Constraint:
+    named = {constraint.name: constraint for constraint in constraints}
+    if name not in named:
+        raise ModelError(unknown_name("constraint", name, named))
+    return named[name]
+
+
+@dataclass(frozen=True)
+class MeasuredForce:
+    """The law uses the constraint force that a `ForceSensor` measures: (59), (71), (81).
+
+    Attributes:
+        time_constant: The time constant of the sensor's lag, in s; 0 for none.
+        sample_period: The time between samples, in s; 0 for none.
+        bias: A constant error in N or N m, one number for all forces or one per force.
+        noise_deviation: The standard deviation of the noise in N or N m, one number for all forces
+            or one per force.
+        drift: The rate at which the bias changes, in N/s or N m/s, one number for all forces or one
+            per force. No law and no estimator knows it; a task subtracts the bias that it finds
+            within `tare_time`, and feels what the drift adds from then on.
+        seed: The seed of the noise.
+    """
+
+    time_constant: float = 0.0
+    sample_period: float = 0.0
+    bias: ArrayLike = 0.0
+    noise_deviation: ArrayLike = 0.0
+    drift: ArrayLike = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**32:
+            raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
+
+    def sensor(self, size: int) -> ForceSensor:
+        """The sensor of m = `size` forces."""
+        lags = self.time_constant, self.sample_period
+        return ForceSensor(size, *lags, self.bias, self.noise_deviation, self.drift)
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What the law measures; it knows exactly what no sensor measures.
+
+    Attributes:
+        encoders: The measurement of positions and velocities, with `sampling`.
+        force: The measurement of the constraint force, in place of that of the law's model.
+    """
+
+    encoders: Encoders | None = None
+    force: MeasuredForce | None = None
+
+    @property
+    def force_noise(self) -> FloatArray:
+        """The standard deviation of the noise of the measured force, in N or N m."""
+        return np.asarray(0.0 if self.force is None else self.force.noise_deviation)
+
+
+@dataclass(frozen=True)
+class LargestErrors:
+    """The largest rms errors by which gains are computed, see `AdvisedGains`.
+
+    Attributes:
+        position: Of a point that follows a path, in m; no bound if left out.
+        force: Of a contact force, in N; no bound if left out.
+    """
+
+    position: float | None = None
+    force: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, most in vars(self).items():
+            if most is not None:
+                positive(f"largest {name} error", most)
+
+
+@dataclass(frozen=True)
+class Estimator(Observing):
+    """The settings of a `StateEstimator` of model errors.
+
+    Attributes:
+        rate: k_o in 1/s, the rate of disturbances along the free directions; it is computed with
+            the gains if it is left out.
+        identify: Names of parameters that are estimated while the robot moves: coefficients of
+            friction of contacts, as "wall.friction", whose initial value is that of the constraint
+            (write 0 if it is unknown); and, each with a standard deviation and within `bounds`,
+            masses and places of payloads, friction of joints, "wall.rpy" of a surface.
+    """
+
+    rate: float | None = None  # type: ignore[assignment]
+    identify: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.rate is not None:
+            super().__post_init__()
+
+
+class Gains(ABC):
+    """Gains of the tracking law, as they are written."""
+
+    @abstractmethod
+    def design(self) -> GainDesign:
+        """The design of the gains."""
+
+
+@dataclass(frozen=True)
+class PerOutput:
+    """Numbers for all outputs, or for each output.
+
+    Attributes:
+        all: The numbers for every output.
+        outputs: Output name -> its numbers; "*" is all others. Only without `all`.
+    """
+
+    all: list[float] = field(default_factory=list)
+    outputs: dict[str, list[float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.all and self.outputs:
+            raise GainError("give either 'all' or 'outputs', not both")
+
+
+@dataclass(frozen=True)
+class Poles(PerOutput, Gains):
+    """Real poles of the errors in 1/s, one number or mu_i per output; see also Coefficients."""
+
+    def design(self) -> GainDesign:
+        return poles(self.all or self.outputs)
+
+
+@dataclass(frozen=True)
+class Coefficients(PerOutput, Gains):
+    """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first; in 1/s^mu_i, ..., 1/s."""
+
+    def design(self) -> GainDesign:
+        return gain_coefficients(self.all or self.outputs)
+
+
+@dataclass(frozen=True)
+class Matrices(Gains):
+    """Gains that couple outputs of equal degree; see `gain_matrices`.
+
+    Attributes:
+        groups: For each degree mu, highest first, its Lambda_1, ..., Lambda_mu, each row by row,
+            in 1/s^mu, ..., 1/s.
+    """
+
+    groups: list[list[list[list[float]]]]
+
+    def __post_init__(self) -> None:
+        for matrix in (matrix for group in self.groups for matrix in group):
+            if len({len(row) for row in matrix}) != 1:
+                raise GainError(f"groups: the rows of {matrix} have different lengths")
+
+    def design(self) -> GainDesign:
+        return gain_matrices(*self.groups)
+
+
+@dataclass(frozen=True)
+class Law:
+    """The tracking law (28).
+
+    Attributes:
+        gains: Its gains. If they are left out: poles at -4 1/s with ideal constraints. With contact
+            that gives way gains are computed, together with `integral`, `constraint_damping`,
+            `estimator` and `sensors.force` if these are left out; the scenario in the folder of the
+            run contains them; not with `actuation`.
+        integral: Names of outputs whose errors are integrated as well, with one more pole:
+            positions, and forces if `sensors.force` measures them; none if left out while `gains`
+            are given.
+        constraint_damping: Damping of compliant constraints by the law, written as gains, with r_i
+            - 1 poles per constraint; none if left out while `gains` are given.
+        contact_stiffness: The stiffness of compliant contacts in N/m, if it is known and references
+            of forces change within periods of the contact: its deflection is then fed ahead. It
+            needs rigid joints, and references, no task.
+        force_gain: Gbar of (59), a number or a matrix row by row, with `sensors.force`; for rigid
+            joints only.
+        control_weights: One weight per actuator, if there are more actuators than outputs. The law
+            then chooses the control with the least sum of weight * (u - free_control)^2. The
+            parameter "free_control" is zero unless it is in `exogenous`.
+        largest_roughness: The largest permitted rms change of the controls from sample to sample by
+            the noise of encoders, over all joints, in N m, for computed gains; if left out 0.3 % of
+            the largest effort limit, or 1 N m without limits.
+        largest_errors: The largest permitted errors for computed gains: those are then the
+            smoothest ones within them, and without a bound the ones with the least errors.
+    """
+
+    gains: Gains | None = None
+    integral: list[str] | None = None
+    constraint_damping: Gains | None = None
+    contact_stiffness: float | None = None
+    force_gain: ArrayLike = 0.0
+    control_weights: list[float] = field(default_factory=list)
+    largest_roughness: float | None = None
+    largest_errors: LargestErrors | None = None
+
+
+@dataclass(frozen=True)
+class ScenarioTask:
+    """A sequence of phases, in place of `references`.
+
+    It starts at rest at start.positions, or in contact near them if the first phase requires
+    contact. Without start.positions it starts 20 mm before the surface, with the first reference of
+    each output. While the contact is open, its distance, such as "wall.distance", is an output in
+    place of its force, and so is each distance of several points. `plant` has a contact that opens,
+    such as `!CompliantContact`.
+
+    Attributes:
+        phases: The phases in their order; after the last one the robot rests.
+        contact: The name of the constraint that opens and closes; not needed if there is only one.
+            Or the list of points that do so together, with as many `!ForceCombination`s of their
+            forces, one of them their sum.
+        contact_force: The force in N below which the contact counts as open.
+        patience: The time in s after which a contact without force counts as lost.
+        tare_time: The time in s at the beginning for which a task without contact measures the bias
+            of the force sensor. No phase ends before, and the bias is subtracted afterwards. 0 for
+            no taring.
+        retries: How many times a phase may be entered again, where it does not say it itself.
+        signals: Name -> reference of a signal that conditions of phases watch.
+        gains: The gains of the law without contact, with the distance among its outputs; those of
+            `law.gains` if left out.
+    """
+
+    phases: Sequence[Phase]
+    contact: str | Sequence[str] = ""
+    contact_force: float = 0.5
+    patience: float = 0.25
+    tare_time: float = 0.0
+    retries: int = 10
+    signals: Mapping[str, Reference | float] = field(default_factory=dict)
+    gains: Gains | None = None
+
+    def __post_init__(self) -> None:
+        signals = self.make().watched("signal")
+        for name in self.signals:
+            if name not in signals:
+                text = unknown_name("signal of a condition", name, signals)
+                raise ModelError(f"signals: {text}")
+
+    def make(self, force_noise: float = 0.0) -> Task:
+        """The `Task` of these phases, for a standard deviation of the force sensor's noise in N."""
+        limits = self.contact_force, self.patience, force_noise, self.tare_time, self.retries
+        return Task(tuple(self.phases), *limits)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What counts in the verdict of a run.
+
+    Attributes:
+        tolerances: Output name -> the tolerated error in its unit; null if its error does not
+            count, as for joints that complete the outputs. For others it is 1 % of the
+            range of the references in their unit.
+        friction_cones: Contacts that must not slide, such as grips: `analyze` and the verdict say
+            where their forces leave these cones.
+        may_diverge: Whether a run continues when its errors or states diverge; otherwise it ends
+            with the reason.
+    """
+
+    tolerances: dict[str, float | None] = field(default_factory=dict)
+    friction_cones: list[FrictionCone] = field(default_factory=list)
+    may_diverge: bool = False
+
+    @property
+    def tolerated(self) -> dict[str, float]:
+        """Output name -> the tolerated error; infinite if it does not count."""
+        return {name: np.inf if e is None else e for name, e in self.tolerances.items()}
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start at rest, on the constraints, with given errors of the outputs.
+
+    The constraints are those of the plant, and the outputs those of the law's model, which may
+    assume another wall (`plant.parameters`): the law sees no other errors than these. If a scenario
+    has `exogenous` signals, the robot starts in motion with its references.
+
+    Attributes:
+        positions: Joint name -> position near which the robot starts, in rad or m; by default that
+            of the robot's file.
+        velocities: Velocity name -> its value in rad/s or m/s, for a start in motion; the others
+            follow from the constraints.
+        errors: Output name -> z - r at the start, in the output's unit; 0 by default. Errors of
+            forces are possible only if actuators have dynamics.
+    """
+
+    positions: dict[str, float] = field(default_factory=dict)
+    velocities: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Write:
+    """The files that a run writes, besides the scenario and the summary.
+
+    Attributes:
+        record: Whether it writes record.npz, all signals at all times.
+        plots: Whether it writes plots, as `drake-dae plot FOLDER --all` does at any later time.
+            Drawing takes about as long as all else of a short run.
+        animation: Whether it writes animation.html, which plays in a browser.
+    """
+
+    record: bool = True
+    plots: bool = False
+    animation: bool = True

@@ -1,0 +1,165 @@
+"""YAML as plain data and back, where a tag `!Sphere` is an entry "_tag" as Drake has it."""
+
+import re
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import yaml  # type: ignore[import-untyped]
+
+from drake_dae.arrays import brief, can_be_written
+from drake_dae.errors import ScenarioError
+
+TAG = "_tag"
+"""The key under which a mapping holds its tag."""
+
+
+_REDEFINED = ("int", "float", "timestamp")
+"""The types of YAML 1.1 whose forms are replaced below."""
+
+MOST_VALUES, MOST_TEXT = 100_000, 1_000_000
+"""The limits of a file; an alias counts as often as it is used. Shipped scenarios have 200 values
+in 4,000 characters."""
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 with numbers as in JSON, unique text keys, and tags."""
+
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, form) for tag, form in resolvers if tag.rpartition(":")[2] not in _REDEFINED]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if node is not None:
+            self._check_size(node, {})
+        return node
+
+    def _check_size(self, node: yaml.Node, sizes: dict[int, int]) -> int:
+        """Counts the values of a node, at most `MOST_VALUES`."""
+        if id(node) not in sizes:
+            sizes[id(node)] = MOST_VALUES  # For an alias inside itself.
+            parts = node.value if isinstance(node, yaml.CollectionNode) else []
+            if isinstance(node, yaml.MappingNode):
+                parts = [part for pair in parts for part in pair]
+            size = 1 + sum(self._check_size(part, sizes) for part in parts)
+            if size > MOST_VALUES:
+                text = f"more than {MOST_VALUES} values, counting aliases as often as they are used"
+                raise self._error(text, node)
+            sizes[id(node)] = size
+        return sizes[id(node)]
+
+    def construct_scalar(self, node: yaml.ScalarNode) -> Any:
+        value = super().construct_scalar(node)
+        if not can_be_written(value):
+            text = "the text has half of a letter (\\ud800 to \\udfff), which no file can hold"
+            raise self._error(text, node)
+        return value
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
+        names = set()
+        for key, _ in node.value:
+            if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
+                raise self._error(f"the key {brief(key.value)} is not text; quote it", key)
+            if key.value in names:
+                raise self._error(f"the key '{key.value}' is given twice", key)
+            names.add(key.value)
+        return super().construct_mapping(node, deep)
+
+    def construct_tagged(self, tag: str, node: yaml.Node) -> dict[str, Any]:
+        if not isinstance(node, yaml.MappingNode):
+            raise self._error(f"the tag !{tag} must be followed by keys, or by {{}}", node)
+        return {TAG: f"!{tag}", **self.construct_mapping(node, deep=True)}
+
+    @staticmethod
+    def _error(problem: str, node: yaml.Node) -> yaml.MarkedYAMLError:
+        return yaml.constructor.ConstructorError(problem=problem, problem_mark=node.start_mark)
+
+
+_Loader.add_multi_constructor("!", _Loader.construct_tagged)
+# YAML 1.1 also has 1_000, 010 for eight and 1:30 for ninety. Here these are text.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:int", re.compile(r"[-+]?(0|[1-9][0-9]*)$"), list("-+0123456789")
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
+        r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
+    ),
+    list("-+.0123456789"),
+)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Keeps the order of keys, and writes tags."""
+
+    def represent_tagged(self, data: dict[str, Any]) -> yaml.MappingNode:
+        entries = [(key, value) for key, value in data.items() if key != TAG]
+        return self.represent_mapping(data.get(TAG, "tag:yaml.org,2002:map"), entries)
+
+
+_Dumper.add_representer(dict, _Dumper.represent_tagged)
+
+
+def load_yaml(text: str, name: str) -> Any:
+    """YAML as lists, dictionaries and plain values; a tag becomes the entry "_tag"."""
+    return load_lines(text, name)[0]
+
+
+def load_lines(text: str, name: str) -> tuple[Any, Callable[[str], int | None]]:
+    """What `load_yaml` returns, and the function from a dotted key to its line.
+
+    The line is that of the deepest key in the text, and None for a key that the text has not.
+    """
+    if len(text) > MOST_TEXT:
+        raise ScenarioError((name, f"more than {MOST_TEXT} characters, got {len(text)}"))
+    loader = None
+    try:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        data = None if node is None else loader.construct_document(node)
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        what = ", ".join(part for part in (error.context, error.problem) if part)
+        if "<document start>" in what:
+            what = "more than one value; several stand in brackets, as in [[-4], [-8]]"
+        raise ScenarioError((name, line + what)) from None
+    except yaml.YAMLError as error:  # Control characters.
+        raise ScenarioError((name, str(error))) from None
+    except RecursionError:
+        raise ScenarioError((name, "too many lists or keys in each other")) from None
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+        # Of PyYAML, where a tag such as !!int or !!timestamp has a value that is none.
+        raise ScenarioError((name, "a tag of YAML (!!...) does not fit its value")) from None
+    finally:
+        if loader is not None:
+            loader.dispose()
+    return data, lambda key: None if node is None else _line_of(node, key)
+
+
+def _line_of(node: yaml.Node, key: str) -> int | None:
+    """The line of a dotted key below a node; names may have dots themselves."""
+    line = node.start_mark.line + 1
+    while key:
+        if isinstance(node, yaml.SequenceNode):
+            entries = {str(index): (part, part) for index, part in enumerate(node.value)}
+        elif isinstance(node, yaml.MappingNode):
+            entries = {name.value: (name, part) for name, part in node.value}
+        else:
+            return None
+        found = [name for name in entries if f"{key}.".startswith(f"{name}.")]
+        if not found:
+            return None
+        name = max(found, key=len)
+        start, node = entries[name]
+        line, key = start.start_mark.line + 1, key[len(name) + 1 :]
+    return int(line)
+
+
+def dump_yaml(data: Any, on_one_line: bool = False) -> str:
+    """The text of plain data, which `load_yaml` reads back equal."""
+    width, flow = (float("inf"), True) if on_one_line else (100, None)
+    return str(
+        yaml.dump(data, Dumper=_Dumper, allow_unicode=True, default_flow_style=flow, width=width)
+    )
