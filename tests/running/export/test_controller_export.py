@@ -42,11 +42,12 @@ def exported(folder, name: str, *settings: str, steps: float = 300) -> str:
 
 
 def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]":
-    source = (folder / f"play_{name}.c").read_text()
+    program = folder / f"play_{name}_controller.c"
+    source = program.read_text()
     # A million calls tell the time; here a few will do.
-    (folder / f"play_{name}.c").write_text(source.replace("CALLS = 1000000", "CALLS = 1000"))
-    program = compile_c(folder, [f"play_{name}.c", f"{name}_controller.c"], "play", *flags)
-    run = [program, str(folder / f"{name}_run.csv")]
+    program.write_text(source.replace("CALLS = 1000000", "CALLS = 1000"))
+    sources = [f"play_{name}_controller.c", f"{name}_controller.c"]
+    run = [compile_c(folder, sources, "play", *flags), str(folder / f"{name}_controller_run.csv")]
     return subprocess.run(run, capture_output=True, text=True, check=False)
 
 
@@ -120,7 +121,7 @@ def controller(two_link):
 @pytest.fixture
 def rows(two_link):
     """Times and inputs of the run."""
-    table = np.loadtxt(two_link / "two_link_wall_run.csv", delimiter=",", skiprows=1)
+    table = np.loadtxt(two_link / "two_link_wall_controller_run.csv", delimiter=",", skiprows=1)
     return [(row[0], row[1:6]) for row in table]
 
 
