@@ -75,7 +75,7 @@ class Numbers:
         part = self.systems.get(system)
         if part is None:
             return {}
-        named = system.block.signals["parameters"]
+        named = system.block.signals.get("parameters", ())
         return {signal.name: part.start + i for i, signal in enumerate(named)}
 
 

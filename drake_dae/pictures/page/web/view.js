@@ -50,10 +50,7 @@ class View {
     this.push.setLength((FULL * data.size * size) / most, 0.05 * data.size, 0.03 * data.size);
   }
   label() {
-    const made = document.createElement("div");
-    made.className = "bench-label";
-    document.body.append(made);
-    return made;
+    return document.body.appendChild(make("div", { className: "bench-label" }));
   }
   /* A ball that is dragged; it is seen through what is before it. */
   handle(color) {
