@@ -102,7 +102,7 @@ from .diagrams import (
     Record as Record,
 )
 from .scene import start_meshcat as start_meshcat
-from .analysis.analyze import analyze as analyze
+from .analysis import analyze as analyze
 from .running.simulate import simulate as simulate
 from .running.rollout.rollout import rollout as rollout
 from .running import export_controller as export_controller

@@ -10,17 +10,24 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context
 
-from drake_dae.analysis.analyze import along, analyze, examine
-from drake_dae.analysis.limits import (
+from drake_dae.analysis import (
+    Analysis,
     LimitKind,
     LimitsAlong,
+    Part,
     SignalLimits,
     SignalRange,
+    Table,
+    along,
+    analyze,
+    count_of,
+    digits,
+    examine,
     limits_along,
     robot_limits,
+    to_markdown,
+    to_text,
 )
-from drake_dae.analysis.report import Analysis
-from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal, ZeroDynamics, find_structure
 from drake_dae.diagrams.closed_loop import ClosedLoop

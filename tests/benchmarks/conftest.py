@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from drake_dae.analysis.tables import Table
+from drake_dae.analysis import Table
 
 LINES = pytest.StashKey[list[list[str]]]()
 OTHERS = pytest.StashKey[list[list[str]]]()

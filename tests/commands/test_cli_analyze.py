@@ -9,7 +9,7 @@ from runs import TASKS, each_scenario, run, scenario, some
 from scipy.optimize import brentq
 
 from drake_dae import build_scenario
-from drake_dae.analysis.limits import LimitKind
+from drake_dae.analysis import LimitKind
 from drake_dae.cli import main
 from drake_dae.scenario import judging as module
 from drake_dae.scenario.judging import Feasibility, find_feasibility

@@ -52,30 +52,6 @@ def test_derivatives_are_those_along_the_constrained_motion(problem):
         np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-10 * np.abs(two).max())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
-def test_the_rate_is_that_of_the_elimination(problem):
-    system = problem.system
-    motion, elimination = motion_of(system), find_structure(system).elimination
-    values = TracedFunction(
-        "rates",
-        {"x": system.state, "u": motion.control, "p": system.parameter_symbol},
-        {
-            "rate": motion.expand(motion.rate),
-            "by_hand": elimination.f_star + ca.mtimes(elimination.h_star, motion.control),
-            "matrix": motion.constraint_matrix,
-        },
-    )
-    random = np.random.default_rng(1)
-    state = problem.consistent(random)
-    controls = random.standard_normal(system.num_controls)
-    rate, by_hand, matrix = values(state, controls, system.parameter_values)
-    # A few operations on numbers up to 100.
-    np.testing.assert_allclose(rate, by_hand, rtol=1e-13, atol=1e-13)
-    expected = problem.known(state).constraint_matrix
-    np.testing.assert_allclose(matrix.reshape(expected.shape), expected, rtol=1e-12, atol=1e-12)
-
-
 def with_inertia(arm: DaeSystem, **fields) -> DaeSystem:
     """The two-link arm as E x' = f + g v + h u with E = diag(1, 1, M), as a robot is given."""
     inertia = ca.inv(arm.h[2:, :])
@@ -149,30 +125,6 @@ def test_the_implicit_form_may_be_given_in_fewer_operations():
     for wrong in wrongs:
         with pytest.raises(ModelError, match="'implicit'"):
             find_structure(with_inertia(arm, implicit=wrong))
-
-
-def test_the_inverse_holds_no_unknown_whose_slope_cancels():
-    """c (s w) - s (c w) is zero to the Jacobian, and still an expression of w: each wanted value
-    asks so for the other unknown, whichever is solved for first. u is x'' here."""
-    x = ca.SX.sym("x", 4)
-    system = DaeSystem(
-        state=x,
-        f=ca.vertcat(x[2:], 0, 0),
-        g=[],
-        h=ca.vertcat(ca.SX(2, 2), ca.SX.eye(2)),
-        k=[],
-        l=x[:2],
-        m=[],
-        nominal_state=[0.3, 0.2, 0.1, 0.4],
-    )
-    motion = find_structure(system).derivatives
-    c, s, rate = ca.cos(x[0]), ca.sin(x[0]), motion.rate[2:]
-    both = rate + c * (s * rate[[1, 0]]) - s * (c * rate[[1, 0]])
-    assert ca.sparsify(ca.jacobian(both, rate)).nnz() == 2
-    wanted = ca.SX.sym("wanted", 2)
-    found, *_ = motion.inverse(both, wanted)
-    function = TracedFunction("inverse", {"x": x, "wanted": wanted}, {"u": found})
-    np.testing.assert_allclose(function([0.3, 0.2, 0.1, 0.4], [5.0, 7.0])[0], [5.0, 7.0])
 
 
 @pytest.mark.parametrize("angle", [1.0, 0.3, -1e-3, 1e-13, 0.0])

@@ -8,13 +8,11 @@ from problems import (
     changed,
     hidden_normal_form,
     in_other_units,
-    system_of,
 )
 from problems.found import degrees, untidy_one, violation
 from runs import some
 
 from drake_dae.dae import DaeSystem, find_structure
-from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -46,35 +44,6 @@ def test_the_order_of_the_outputs_is_that_of_15(problem):
         # Entries of order 1, or zero up to round-off.
         assert np.abs(value[:s]).max(initial=0.0) < 1e-14
         assert np.abs(value[s:]).max(axis=1, initial=0.0).min(initial=1.0) > 1e-3
-
-
-@pytest.mark.slow
-def test_margins_are_singular_values_at_the_states(problem):
-    structure = problem.structure
-    b = [np.linalg.svd(problem.known(x).control_matrix)[1][-1] for x in structure.states]
-    assert structure.control_margin.singular_value == pytest.approx(min(b), rel=1e-10)
-    assert 0.0 < structure.control_margin.relative <= 1.0 + 1e-12 or len(b) > 1
-    if problem.constraint_degrees:
-        a = [np.linalg.svd(problem.known(x).constraint_matrix)[1][-1] for x in structure.states]
-        assert structure.constraint_margin.singular_value == pytest.approx(min(a), rel=1e-10)
-    else:
-        assert structure.constraint_margin is None
-
-
-def test_spread_and_count():
-    system = PROBLEMS["flexible_pendulum"]().system
-    structure = find_structure(system, spread=[0.0, 0.0, 10.0, 0.001], count=200)
-    deviation = structure.states[1:].std(axis=0)
-    # 200 normal numbers: their deviation is known to 5%.
-    np.testing.assert_allclose(deviation, [0.0, 0.0, 10.0, 0.001], rtol=0.25)
-    assert find_structure(system, count=1).states.shape == (2, 4)
-    with pytest.raises(ModelError, match=r"count.*0"):
-        find_structure(system, count=0)
-    with pytest.raises(ModelError, match=r"seed.*-1"):
-        find_structure(system, seed=-1)
-    for wrong in ([0.1, 0.2], [[0.1]], np.nan):
-        with pytest.raises(ModelError, match="spread"):
-            find_structure(system, spread=wrong)
 
 
 @pytest.mark.slow
@@ -188,12 +157,3 @@ def test_a_force_that_the_control_does_not_act_on_is_not_met_at_once():
     error = violation(resting)
     assert error.assumption == 4
     assert "'tension'" in str(error)
-
-
-def test_small_numbers_are_not_zeros():
-    """A control that acts through 1e-8 beside terms of order 1 does act."""
-    tiny = system_of(2, f=lambda x: [x[1], x[0]], h=lambda x: [1e-8, 1], l=lambda x: x[0])
-    assert degrees(tiny) == ((), (1,))
-    # And through 1e-17, as a similarity transform in floating point leaves behind, it does not.
-    noise = system_of(2, f=lambda x: [x[1], x[0]], h=lambda x: [1e-17, 1], l=lambda x: x[0])
-    assert degrees(noise) == ((), (2,))

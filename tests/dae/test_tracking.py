@@ -5,7 +5,6 @@ from problems import (
     PROBLEMS,
     Problem,
     closed_loop_outputs,
-    double_integrator,
     reference_at,
     wanted_outputs,
 )
@@ -13,14 +12,12 @@ from runs import some
 
 from drake_dae.dae import (
     DaeSystem,
-    FeedbackGains,
     Parameter,
     TrackingLaw,
     gain_coefficients,
     gain_matrices,
     poles,
 )
-from drake_dae.errors import GainError, ModelError
 
 
 def starts(problem: Problem) -> np.ndarray:
@@ -173,33 +170,6 @@ def test_a_singular_a_shows_in_the_pivot():
     for value in (1.0, 1e-3, 1e-7):
         law.control(np.zeros(6), reference, parameters=[value])
         assert law.function.pivot == pytest.approx(np.sin(value) ** 2, rel=0.05)
-
-
-def test_wrong_arguments_are_refused():
-    law = TrackingLaw(PROBLEMS["cart"]().system, poles(-1.0))
-    with pytest.raises(ModelError, match=r"'state'.*3.*2"):
-        law.control([1, 2, 3], [0, 0, 0])
-    with pytest.raises(ModelError, match=r"'reference'.*2.*3"):
-        law.control([1, 2], [0, 0])
-    with pytest.raises(ModelError, match="parameters"):
-        law.control([1, 2], [0, 0, 0], parameters=[1.0])
-    with pytest.raises(ModelError, match=r"'reference'.*2.*3"):
-        law.error_coordinates([1, 2], [0, 0])
-
-
-def test_gains_must_be_those_of_the_system():
-    system = double_integrator(output_signals=["q"])
-    for gains in (
-        FeedbackGains(["q"], [1], [[1.0]]),
-        FeedbackGains(["p"], [2], [[1.0, 1.0]]),
-        FeedbackGains(["q", "p"], [1, 1], np.eye(2)),
-    ):
-        with pytest.raises(GainError, match=r"\bq\b.*\(2,\)"):
-            TrackingLaw(system, gains)
-    law = TrackingLaw(system, FeedbackGains(["q"], [2], [[2.0, 3.0]]))
-    assert law.control([1.0, 1.0], [0.0, 0.0, 0.0]) == pytest.approx([-5.0])
-    with pytest.raises(GainError, match="z0"):
-        TrackingLaw(system, poles({"z0": -1.0}))
 
 
 @pytest.mark.equation(71, 81)

@@ -2,15 +2,10 @@
 
 import numpy as np
 import pytest
-from pydrake.geometry import SceneGraph
 from runs import run_scenario, scenario_validator, untagged
 
 from drake_dae import build_scenario, load_scenario
-from drake_dae.analysis.limits import LimitKind
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.judging import find_feasibility
-from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.typed_yaml import load_yaml
 
 BODY = """<link name="{name}"><inertial><origin xyz="0 0 0"/><mass value="{mass}"/>
@@ -282,15 +277,6 @@ def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_cart_can_be_analyzed(tmp_path):
-    """Nothing fails on the way, and the report names the level of each constraint."""
-    scenario = load_scenario(scenario_file(tmp_path, ROLL, CART))
-    report = find_feasibility(scenario)
-    assert report.analysis.structure.constraint_degrees == (1, 1, 1)
-    assert len(report.of(LimitKind.FORCE)) == 3
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "settings", "words"),
     [
@@ -363,10 +349,3 @@ def test_what_a_robot_file_holds_besides_is_refused_and_not_dropped(file, robot,
         build_scenario(load_scenario(path))
     message = str(caught.value)
     assert [word for word in words if word not in message] == [], message
-
-
-def test_shipped_scenarios_have_only_their_own_constraints():
-    scenario = load_scenario(find_scenario("two_link_wall"))
-    model = scenario_model(scenario, SceneGraph())
-    assert [constraint.name for constraint in model.constraints] == ["wall"]
-    assert scenario.forces is None

@@ -8,9 +8,8 @@ import pytest
 from vendors import write_panda
 
 from drake_dae import load_scenario
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.errors import ScenarioError
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.robot_file.files import described_robot
 from drake_dae.scenario.scenario import save_scenario
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
@@ -63,29 +62,6 @@ def test_a_description_is_the_robot_of_its_file(fake, tmp_path):
     assert model.dae.name == "panda_description"
     save_scenario(scenario, tmp_path / "again.yaml")
     assert load_scenario(tmp_path / "again.yaml") == scenario
-
-
-def test_what_is_wrong_with_a_name_is_reported(fake, tmp_path):
-    with pytest.raises(ScenarioError) as caught:
-        scenario_model(load(tmp_path, "robot.description=panda_descripton"))
-    ((key, text),) = caught.value.problems
-    assert key == "robot.description"
-    assert "'panda_descripton'" in text
-    with pytest.raises(ModelError, match="'xacro_description'"):
-        described_robot("xacro_description")
-
-
-def test_without_a_network_it_says_what_to_do(fake, tmp_path, monkeypatch):
-    def fail(name, *_):
-        if name.endswith(".far"):
-            raise RuntimeError("could not resolve host")
-        return sys.modules[name]
-
-    monkeypatch.setattr("drake_dae.scenario.robot_file.files.import_module", fail)
-    with pytest.raises(ModelError) as caught:
-        described_robot("far")
-    for words in ("could not resolve host", "ROBOT_DESCRIPTIONS_CACHE", "robot.file"):
-        assert words in str(caught.value)
 
 
 def test_without_the_package_it_says_how_to_install_it(tmp_path, monkeypatch):

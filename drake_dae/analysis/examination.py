@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.analysis.examined_states import ExaminedStates, check_consistent
-from drake_dae.analysis.reference_check import check_reference
 from drake_dae.analysis.report import Analysis, Assumption, Finding
+from drake_dae.analysis.tables import count_of
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, check_whole_number
+from drake_dae.arrays import FloatArray, check_whole_number, numbers, unknown_name
 from drake_dae.dae import (
     ConstraintStructure,
     DaeSystem,
+    Manifold,
     RankMargin,
+    Region,
     Stability,
     Structure,
     Violation,
@@ -35,7 +35,7 @@ from drake_dae.dae.structure import (
     examine_constraints,
     examine_outputs,
 )
-from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError
+from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.references import Reference
 
 STATEMENTS = (
@@ -50,12 +50,18 @@ STATEMENTS = (
 COUNT, SEED = 50, 0
 """The number of random states that are examined by default, and the seed of their numbers."""
 
+NEIGHBOURS = 5
+"""How many states are added close to the first given one, which may be a zero of a function."""
+
+Bounds = Mapping[str, tuple[float, float]]
+"""A region: state name -> (lowest, highest)."""
+
 
 @checked(ModelError)
 def analyze(
     system: DaeSystem,
     *,
-    region: Mapping[str, tuple[float, float]] | None = None,
+    region: Bounds | None = None,
     states: ArrayLike | None = None,
     reference: Callable[[float], FloatArray] | None = None,
     times: ArrayLike | None = None,
@@ -102,9 +108,8 @@ def analyze(
     Raises:
         InconsistentStateError: There is no consistent state in the region or around the nominal
             state, or given states are not consistent.
-        ModelError: Arguments make no sense, such as a reference whose derivatives are not those of
-            its values; or the system has a function that is not finite, or a mass matrix that
-            is not symmetric and positive definite.
+        ModelError: Arguments make no sense, or the system has a function that is not finite, or a
+            mass matrix that is not symmetric and positive definite.
     """
     if region is not None and states is not None:
         raise ModelError(f"{system.name}: give a region or states, not both")
@@ -151,7 +156,7 @@ def examine(system: DaeSystem, chosen: ExaminedStates | None = None) -> Analysis
     if chosen.num_given:
         # Degrees are decided also at states around them, margins only at them.
         samples = Samples(around.manifold, given_states)
-        check_consistent(samples.manifold, given_states, samples.states)
+        _check_consistent(samples.manifold, given_states, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
     analysis = _examine(constrained, around, samples, where, search=not chosen.num_given)
     return replace(analysis, region=chosen.region)
@@ -180,8 +185,6 @@ def along(
     if structure is None:
         return analysis
     dynamics = ZeroDynamics(system, structure=structure)
-    with suppress(NonFiniteError), np.errstate(all="ignore"):  # The motion has the time.
-        check_reference(system, structure.layout, reference, times)
     guess = states[0] if start is None else start
     motion = dynamics.motion(reference, times, guess, exogenous=exogenous)
     rest, outputs = states[0], None
@@ -299,3 +302,92 @@ def _independence(structure: Structure, samples: Samples) -> RankMargin | None:
     if not functions.numel():
         return None
     return find_margin(samples, ca.jacobian(functions, structure.system.state))
+
+
+@dataclass(frozen=True, eq=False)
+class ExaminedStates:
+    """The states that an analysis starts from: random ones, or those given and some beside."""
+
+    guesses: FloatArray
+    num_given: int
+    bounds: Bounds
+    region: Region | None
+
+    @classmethod
+    def drawn(
+        cls, system: DaeSystem, bounds: Bounds | None, count: int, random: np.random.Generator
+    ) -> ExaminedStates:
+        nominal = system.nominal_state
+        drawn = nominal + system.spread_around(nominal) * random.standard_normal(
+            (count, nominal.size)
+        )
+        if bounds is None:
+            return cls(np.vstack([nominal, drawn]), 0, {}, None)
+        region = _box(system, bounds)
+        named = np.isfinite(region.low)
+        low, high = region.low[named], region.high[named]
+        drawn[:, named] = random.uniform(low, high, (count, low.size))
+        guesses = np.vstack([np.clip(nominal, region.low, region.high), drawn])
+        return cls(guesses, 0, bounds, region)
+
+    @classmethod
+    def given(
+        cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
+    ) -> ExaminedStates:
+        rows = numbers(f"{system.name}: states", states)
+        shape = (len(rows) if rows.ndim else 0, system.num_states)
+        if rows.shape != shape or not rows.size or not np.all(np.isfinite(rows)):
+            raise ModelError(
+                f"{system.name}: states must be finite numbers of shape (k, {system.num_states}), "
+                f"got {states!r}"
+            )
+        around = system.spread_around(rows[0]) * random.standard_normal((NEIGHBOURS, shape[1]))
+        return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows), {}, None)
+
+    def describe(self, count: int, noun: str) -> str:
+        if self.num_given:
+            return f"{count_of(self.num_given, noun)} as given"
+        region = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
+        left_out = len(self.guesses) - count
+        missing = f"; {left_out} more were outside the domain or off N*" if left_out else ""
+        return f"{count_of(count, noun)} {region}{missing}"
+
+    def describe_region(self) -> str:
+        return ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.bounds.items())
+
+
+def _check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:
+    """Checks that the user's states are consistent and inside the domain of the system."""
+    name = manifold.system.name
+    for number, state in enumerate(states):
+        if not manifold.is_consistent(state):
+            residual = manifold.residual(state)
+            worst = int(np.argmax(np.abs(residual)))
+            raise InconsistentStateError(
+                f"{name}: states[{number}] is not consistent: "
+                f"{manifold.residual_signals[worst].name} = {residual[worst]:.3g}; project it, for "
+                "example with `find_structure(system).manifold.project`",
+                residual,
+            )
+        near = 1e-4 * np.maximum(np.abs(state), np.abs(projected).max(axis=0))
+        if not np.any(np.all(np.abs(projected - state) <= near, axis=1)):
+            raise ModelError(
+                f"{name}: states[{number}] is outside the domain: functions of (1)-(3) are not "
+                "finite there"
+            )
+
+
+def _box(system: DaeSystem, bounds: Bounds) -> Region:
+    low, high = np.full(system.num_states, -np.inf), np.full(system.num_states, np.inf)
+    names = [signal.name for signal in system.state_signals]
+    for name, interval in bounds.items():
+        if name not in names:
+            raise ModelError(f"{system.name}: region: {unknown_name('state', name, names)}")
+        pair = numbers(f"{system.name}: region: the bounds of '{name}'", interval)
+        if pair[0] > pair[1]:
+            raise ModelError(
+                f"{system.name}: region: '{name}' needs the lowest and the highest value, got "
+                f"{interval!r}"
+            )
+        low[names.index(name)], high[names.index(name)] = pair
+    return Region(low, high)
