@@ -41,6 +41,7 @@ from .dae import sampling_error as sampling_error
 from .dae import share_forces as share_forces
 from .dae import with_disturbance as with_disturbance
 from .diagrams.closed_loop import ClosedLoop as ClosedLoop
+from .diagrams.record import Record as Record
 from .diagrams.settings import LoopSettings as LoopSettings
 from .diagrams.wiring import make_closed_loop as make_closed_loop
 from .diagrams.wiring import wire_loop as wire_loop
@@ -103,8 +104,10 @@ from .running.bench.page import write_page as write_page
 from .running.export.export import export_code as export_code
 from .running.export.steps.controller import export_controller as export_controller
 from .running.export.wasm.wasm import export_wasm as export_wasm
+from .running.record_writer import RecordWriter as RecordWriter
 from .running.rollout.problems import start_values as start_values
 from .running.rollout.rollout import rollout as rollout
+from .running.simulate import simulate as simulate
 from .scenario.build import build_scenario as build_scenario
 from .scenario.commanded import build_commanded as build_commanded
 from .scenario.files import load_scenario as load_scenario
@@ -113,9 +116,6 @@ from .scenario.new import new_scenario as new_scenario
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .scene.view import start_meshcat as start_meshcat
-from .simulation.records.record import Record as Record
-from .simulation.records.record_writer import RecordWriter as RecordWriter
-from .simulation.simulate import simulate as simulate
 from .studies.study import Study as Study
 from .studies.sweep import sweep as sweep
 from .studies.variations import grid_variations as grid_variations

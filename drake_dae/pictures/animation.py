@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.pictures.friction import DrawnFrictionCone, friction_cones, slips
 from drake_dae.pictures.moments import RunEvent, event_kinds, events_of, sorted_events
@@ -25,6 +26,8 @@ from drake_dae.pictures.run_motion import (
     run_view,
 )
 from drake_dae.robots import Constraint, ConstraintWrenches, axes_along
+from drake_dae.running.limits import robot_limits
+from drake_dae.running.phases import PhaseSpan, phase_spans
 from drake_dae.scene.arrows import (
     FORCE_COLOR,
     LEAST_SCALE,
@@ -49,9 +52,6 @@ from drake_dae.scene.view import (
     start_unwatched_meshcat,
     view_of_links,
 )
-from drake_dae.simulation.limits import robot_limits
-from drake_dae.simulation.records.phases import PhaseSpan, phase_spans
-from drake_dae.simulation.records.record import Record
 
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
 _CONE = Rgba(0.95, 0.6, 0.15, 0.35)

@@ -34,6 +34,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.pictures.film_marks import FilmMarks
 from drake_dae.pictures.friction import slips
@@ -48,13 +49,12 @@ from drake_dae.pictures.run_motion import (
     run_view,
 )
 from drake_dae.robots import own_values
+from drake_dae.running.limits import robot_limits
+from drake_dae.running.phases import phase_spans, phases_at
 from drake_dae.scene.floor import floor_below
 from drake_dae.scene.framing import ViewAngles
 from drake_dae.scene.surroundings import surroundings
 from drake_dae.scene.view import ARROW, PIECE
-from drake_dae.simulation.limits import robot_limits
-from drake_dae.simulation.records.phases import phase_spans, phases_at
-from drake_dae.simulation.records.record import Record
 
 if TYPE_CHECKING:  # Loaded with the first film.
     from matplotlib.axes import Axes

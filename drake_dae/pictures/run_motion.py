@@ -10,12 +10,12 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import InconsistentStateError
 from drake_dae.robots import ConstraintWrenches, RobotModel, Wrenches, own_values, tangents
 from drake_dae.scene.framing import ViewAngles, direction_of, framed
 from drake_dae.scene.surroundings import scene_points
 from drake_dae.scene.view import FRAME_RATE
-from drake_dae.simulation.records.record import Record
 from drake_dae.systems.plants.contract import Plant
 
 STILL = 1e-4

@@ -6,6 +6,7 @@ from matplotlib.colors import to_hex
 
 from drake_dae import Record
 from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Recorded
 from drake_dae.pictures.plots import (
     PLOTS,
     plot_controls,
@@ -16,8 +17,7 @@ from drake_dae.pictures.plots import (
     save_plots,
 )
 from drake_dae.pictures.run_motion import ContactPath
-from drake_dae.simulation.records.phases import phase_spans, phases_at
-from drake_dae.simulation.records.record import Recorded
+from drake_dae.running.phases import phase_spans, phases_at
 
 TIME = np.linspace(0.0, 2.0, 41)
 

@@ -31,7 +31,6 @@ FLOORS = (
     ("systems",),
     ("scene",),
     ("compiler",),
-    ("simulation",),
     ("diagrams",),
     ("running",),
     ("pictures",),

@@ -9,7 +9,7 @@ import numpy as np
 from drake_dae.analysis.limits import LimitKind, SignalRange
 from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.dae import Signal
-from drake_dae.simulation.records.record import Record
+from drake_dae.diagrams.record import Record
 from drake_dae.systems.control.contract import PhaseChange
 
 SHARE = 0.01

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.simulation.records.record import Record
+from drake_dae.diagrams.record import Record
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from runs import scenario
 
 from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
 from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.running import simulate as module
+from drake_dae.running.interruption import ENDING_SIGNALS
+from drake_dae.running.simulate import check_config, check_duration, simulate
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation import simulate as module
-from drake_dae.simulation.records.interruption import ENDING_SIGNALS
-from drake_dae.simulation.simulate import check_config, check_duration, simulate
 from drake_dae.systems.control.sampling import ControlHold, Sampling
 
 

@@ -10,12 +10,12 @@ from runs import some
 from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
 from drake_dae.arrays import show_state
 from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record, Recorded
 from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
+from drake_dae.running.divergence import DivergenceWatch
+from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
-from drake_dae.simulation.divergence import DivergenceWatch
-from drake_dae.simulation.records.record import Record, Recorded
-from drake_dae.simulation.simulate import simulate
 from tests.support.runs import scenario
 
 

@@ -15,11 +15,11 @@ from pydrake.systems.primitives import VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, numbers
 from drake_dae.dae import Signal
+from drake_dae.diagrams.record_columns import Recorded as Recorded
+from drake_dae.diagrams.record_columns import label, read_csv, write_csv
+from drake_dae.diagrams.versions import versions
 from drake_dae.errors import ModelError
 from drake_dae.files import MOST_RECORDED, check_file, open_file
-from drake_dae.simulation.records.columns import Recorded as Recorded
-from drake_dae.simulation.records.columns import label, read_csv, write_csv
-from drake_dae.simulation.records.versions import versions
 
 
 def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:

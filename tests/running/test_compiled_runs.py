@@ -15,9 +15,9 @@ from runs import first_quick, scenario, some
 
 from drake_dae import DaePlant, DaeSystem, RobotPlant, build_scenario, simulate
 from drake_dae.errors import NonFiniteError, SimulationError
-from drake_dae.simulation import compiled_run
-from drake_dae.simulation import simulate as simulation
-from drake_dae.simulation.compiled_run import CompiledRun
+from drake_dae.running import compiled_run
+from drake_dae.running import simulate as simulation
+from drake_dae.running.compiled_run import CompiledRun
 
 NOISE = "sensors.force={sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
-from runs import run_scenario, scenario
+from runs import run_scenario, same_records, scenario
 
 from drake_dae import (
     NormalForm,
@@ -21,9 +21,9 @@ from drake_dae import (
 )
 from drake_dae.arrays import listed
 from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation.records.record import Recorded
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +42,6 @@ def small():
             "constraint_force": Recorded(np.zeros((3, 0)), ()),
         },
     )
-
-
-def same(one, other):
-    np.testing.assert_array_equal(one.time, other.time)
-    assert set(one.signals) == set(other.signals)
-    for name, recorded in one.signals.items():
-        np.testing.assert_array_equal(recorded.values, other[name])
-        assert recorded.signals == other.signals[name].signals
 
 
 def test_every_signal_with_name_and_unit(run):
@@ -125,7 +117,7 @@ def test_rows_before_a_change_of_parameters_keep_the_old_ones():
             np.testing.assert_array_equal(record[signal][row], value)
     # What is asked for later is the same, whatever was changed since.
     loop.controller.set_gains(law, poles(-2.0))
-    same(loop.record(context), record)
+    same_records(loop.record(context), record)
     later = loop.record(context, 0.2)
     np.testing.assert_array_equal(later.time, record.time[record.time > 0.2])
     np.testing.assert_array_equal(later["control"], record["control"][record.time > 0.2])
@@ -142,7 +134,7 @@ def test_the_last_row_is_after_the_projection(run):
 def test_saved_and_loaded(run, tmp_path):
     for name, record in {"run": run[2], "small": small()}.items():
         record.save(tmp_path / f"{name}.npz")
-        same(Record.load(tmp_path / f"{name}.npz"), record)
+        same_records(Record.load(tmp_path / f"{name}.npz"), record)
 
 
 def test_numpy_alone_reads_it(tmp_path):

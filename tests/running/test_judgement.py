@@ -7,8 +7,8 @@ import pytest
 
 from drake_dae import Record, Signal
 from drake_dae.analysis.limits import LimitKind, SignalRange
-from drake_dae.simulation.judgement import FindingKind, Outcome, judge, late_rms
-from drake_dae.simulation.records.record import Recorded
+from drake_dae.diagrams.record import Recorded
+from drake_dae.running.judgement import FindingKind, Outcome, judge, late_rms
 from drake_dae.systems.control.contract import PhaseChange
 
 TIMES = np.linspace(0.0, 10.0, 1001)

@@ -29,10 +29,10 @@ from tqdm import tqdm
 from drake_dae.arguments import checked
 from drake_dae.blocks.traced_system import check_context
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, SimulationError
-from drake_dae.simulation.compiled_run import NO_EVENTS, CompiledRun
-from drake_dae.simulation.diagnosis import RunDiagnosis
-from drake_dae.simulation.divergence import DiagramWatch
-from drake_dae.simulation.records.interruption import Interruption, ending_signals
+from drake_dae.running.compiled_run import NO_EVENTS, CompiledRun
+from drake_dae.running.diagnosis import RunDiagnosis
+from drake_dae.running.divergence import DiagramWatch
+from drake_dae.running.interruption import Interruption, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines without a terminal, in s."""

@@ -7,10 +7,10 @@ from pydrake.systems.framework import Context, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record, computed_record, recorded_values
 from drake_dae.errors import SimulationError
-from drake_dae.simulation.diagnosis import blocks_of
-from drake_dae.simulation.judgement import unit_sizes
-from drake_dae.simulation.records.record import Record, computed_record, recorded_values
+from drake_dae.running.diagnosis import blocks_of
+from drake_dae.running.judgement import unit_sizes
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
 

@@ -13,9 +13,9 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief
+from drake_dae.diagrams.record import Record
+from drake_dae.diagrams.versions import versions
 from drake_dae.errors import ModelError
-from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.records.versions import versions
 from drake_dae.trace.given import result_of
 
 PERIOD = 1.0

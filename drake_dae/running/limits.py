@@ -8,9 +8,9 @@ import numpy as np
 from drake_dae.analysis.limits import LimitKind, SignalLimits, SignalRange
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.robots import FrictionCone, RobotModel
-from drake_dae.simulation.records.record import Record
 
 
 def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> SignalLimits:

@@ -6,12 +6,11 @@ import os
 
 import numpy as np
 import pytest
-from runs import scenario
-from test_record import same
+from runs import same_records, scenario
 
 from drake_dae import Record, RecordWriter, build_scenario, simulate
 from drake_dae.errors import ModelError
-from drake_dae.simulation.records import record_writer
+from drake_dae.running import record_writer
 
 
 @pytest.fixture
@@ -52,11 +51,11 @@ def test_it_can_be_read_after_every_step(always, chosen, tmp_path):
     def read(writer, loop, context):
         now = loop.record(context)
         if now.time.size > 1:
-            same(Record.load(path), rows(now, -1))
+            same_records(Record.load(path), rows(now, -1))
             seen.append(now.time.size)
 
     record = run(chosen, path, read)
-    same(Record.load(path), record)
+    same_records(Record.load(path), record)
     count = record.time.size
     assert seen == [*range(2, count + 1), count]
 
@@ -69,7 +68,7 @@ def test_wherever_the_file_ends(chosen, tmp_path):
     width = (len(data) - start) // record.time.size
     for end in np.random.default_rng(0).integers(start, len(data), 20):
         path.write_bytes(data[:end])
-        same(Record.load(path), rows(record, (end - start) // width))
+        same_records(Record.load(path), rows(record, (end - start) // width))
         # Blocks that were given out but never synced before the machine lost its power.
         path.write_bytes(data[:end] + bytes(3 * width))
         kept = Record.load(path)
@@ -132,4 +131,4 @@ def test_a_disk_that_is_full_for_a_while(always, chosen, tmp_path, monkeypatch):
         record = run(chosen, path)
     assert len(warned) == 1
     assert len(calls) > 9
-    same(Record.load(path), record)
+    same_records(Record.load(path), record)

@@ -11,7 +11,8 @@ import numpy as np
 from drake_dae.analysis.limits import LimitKind, SignalRange
 from drake_dae.analysis.tables import Table
 from drake_dae.dae import Signal
-from drake_dae.simulation.judgement import (
+from drake_dae.diagrams.record import Record
+from drake_dae.running.judgement import (
     ROUND_OFF,
     FindingKind,
     Judgement,
@@ -19,8 +20,7 @@ from drake_dae.simulation.judgement import (
     qualities,
     record_sizes,
 )
-from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.simulate import RunStatistics
+from drake_dae.running.simulate import RunStatistics
 from drake_dae.systems.control.contract import PhaseChange
 
 WIDTH = 100

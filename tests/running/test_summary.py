@@ -8,12 +8,12 @@ from arms import arm
 
 from drake_dae import Record, Signal
 from drake_dae.analysis.limits import LimitKind, SignalRange
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
-from drake_dae.simulation.judgement import judge
-from drake_dae.simulation.limits import ranges_of, robot_limits
-from drake_dae.simulation.records.record import Recorded
-from drake_dae.simulation.simulate import RunStatistics
-from drake_dae.simulation.summary import RunSummary, figures_of
+from drake_dae.running.judgement import judge
+from drake_dae.running.limits import ranges_of, robot_limits
+from drake_dae.running.simulate import RunStatistics
+from drake_dae.running.summary import RunSummary, figures_of
 
 OUTPUTS = [("tool.z", "m"), ("axis.y", "")]
 PREDICTED = np.array([[0.05, 0.0], [-0.0625, 0.0], [0.00125, 0.0]])
