@@ -105,8 +105,8 @@ from .running.export.export import export_code as export_code
 from .running.export.steps.controller import export_controller as export_controller
 from .running.export.wasm.wasm import export_wasm as export_wasm
 from .running.record_writer import RecordWriter as RecordWriter
-from .running.rollout.problems import start_values as start_values
-from .running.rollout.rollout import rollout as rollout
+from .running.rollout import rollout as rollout
+from .running.rollout import start_values as start_values
 from .running.simulate import simulate as simulate
 from .scenario.build import build_scenario as build_scenario
 from .scenario.commanded import build_commanded as build_commanded

@@ -27,11 +27,9 @@ class _Ended(Exception):
         self.ending = ending
 
 
-def run_interpreted(
-    functions: StepFunctions, problem: RunProblem, settings: StepSettings
-) -> Run:
+def run_interpreted(functions: StepFunctions, problem: RunProblem, settings: StepSettings) -> Run:
     """Makes a run until its end, or to where it cannot go on."""
-    run = _Interpreted(functions, problem, settings)
+    run = InterpretedRun(functions, problem, settings)
     ending = RunEnding.DONE
     try:
         run.steps_to_end()
@@ -51,7 +49,7 @@ def run_interpreted(
     )
 
 
-class _Interpreted:
+class InterpretedRun:
     """A run under way; attributes as of `Run`."""
 
     def __init__(
@@ -122,7 +120,10 @@ class _Interpreted:
         """Makes the updates of one kind that are due, all at once."""
         held, noise = self.held.copy(), self.problem.noise[self.event]
         for number, rate in enumerate(self.functions.rates):
-            if rate.is_unrestricted == is_unrestricted and self.problem.due[self.event] >> number & 1:
+            if (
+                rate.is_unrestricted == is_unrestricted
+                and self.problem.due[self.event] >> number & 1
+            ):
                 given = self.time, self.state, self.held, self.problem.parameters, noise
                 held[rate.places] = rate.function(*given).full()[:, 0]
                 if not np.isfinite(held[rate.places]).all():

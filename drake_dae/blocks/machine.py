@@ -258,7 +258,11 @@ class _Call:
         }
 
     def batch(
-        self, first: int, count: int, trial: FloatArray | None = None, next_: FloatArray | None = None
+        self,
+        first: int,
+        count: int,
+        trial: FloatArray | None = None,
+        next_: FloatArray | None = None,
     ) -> _Batch:
         """The arguments of some of the runs."""
         problems, settings = self._problems, self._settings

@@ -72,9 +72,7 @@ class StepFunctions:
             after, length = state + ca.DM(self.scale) * step, ca.norm_2(step)
         self.newton = self._function("newton", [after, length])
         ends = np.cumsum([0, *(each.symbol.numel() for each in block.held.values())])
-        places = {
-            name: range(ends[i], ends[i + 1]) for i, name in enumerate(block.held)
-        }
+        places = {name: range(ends[i], ends[i + 1]) for i, name in enumerate(block.held)}
         self.rates = [
             Rate(
                 *rate,

@@ -26,7 +26,7 @@ from drake_dae.errors import (
     SimulationError,
 )
 from drake_dae.running.limits import ranges_of, robot_limits
-from drake_dae.running.rollout.program import program_of
+from drake_dae.running.rollout import program_of
 from drake_dae.running.simulate import simulate
 from drake_dae.running.summary import figures_of
 from drake_dae.scenario.build import build_completed
