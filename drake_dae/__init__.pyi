@@ -110,9 +110,9 @@ from .running.rollout import start_values as start_values
 from .running.simulate import simulate as simulate
 from .scenario.build import build_scenario as build_scenario
 from .scenario.commanded import build_commanded as build_commanded
-from .scenario.files import load_scenario as load_scenario
 from .scenario.model import complete_scenario as complete_scenario
 from .scenario.new import new_scenario as new_scenario
+from .scenario.scenario import load_scenario as load_scenario
 from .scenario.scenario import scenario_schema as scenario_schema
 from .scenario.shipped import shipped_model as shipped_model
 from .scene.view import start_meshcat as start_meshcat

@@ -34,7 +34,7 @@ from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError
 from drake_dae.pictures.run_motion import ShownLoop
 from drake_dae.robots import Constraint, Links, Surface
-from drake_dae.scenario.robot_file.links import add_robot
+from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.studies.runs import Outcome, RunResult

@@ -16,7 +16,7 @@ from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.run_pictures import save_run_plots
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
-from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.scenario import load_scenario
 
 
 def _plot_options(parser: Parser) -> None:

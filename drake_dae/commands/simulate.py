@@ -29,9 +29,8 @@ from drake_dae.running.record_writer import RecordWriter
 from drake_dae.running.simulate import RunStatistics, simulate
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.judging import judge_run
-from drake_dae.scenario.scenario import Scenario, scenario_data
+from drake_dae.scenario.scenario import Scenario, load_scenario, save_scenario, scenario_data
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scene.view import start_meshcat

@@ -12,7 +12,7 @@ from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.links.kinematics import Kinematics
 from drake_dae.robots.links.links import Links
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 class ForceOutput(ABC):

@@ -14,7 +14,7 @@ from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import position_index
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.trace.given import numpy_explained, result_of
+from drake_dae.trace.expressions import result_of
 
 
 class PositionOutput(ABC):
@@ -196,8 +196,7 @@ class ExpressionOutput(PositionOutput):
     outputs: Sequence[Signal]
 
     def expression(self, links: Links) -> ca.SX:
-        with numpy_explained("the function of an ExpressionOutput"):
-            given = result_of("function", self.function, links)
+        given = result_of("function", self.function, links)
         value = ca.vec(as_expression("an ExpressionOutput", "its function", given))
         if value.numel() != len(self.outputs):
             raise ModelError(

@@ -16,7 +16,7 @@ from drake_dae.arrays import brief
 from drake_dae.diagrams.record import Record
 from drake_dae.diagrams.versions import versions
 from drake_dae.errors import ModelError
-from drake_dae.trace.given import result_of
+from drake_dae.trace.expressions import result_of
 
 PERIOD = 1.0
 """The time between two appends, in s."""

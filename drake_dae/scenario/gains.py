@@ -23,10 +23,10 @@ from drake_dae.dae.tracking.model_of_law import damping_gains
 from drake_dae.errors import ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, velocities_are_rates
+from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.parts import parts as parts
-from drake_dae.scenario.parts.task import ScenarioTask
+from drake_dae.scenario.form import at
+from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import opening_contact
 from drake_dae.systems.task.automaton import SMOOTH, fading

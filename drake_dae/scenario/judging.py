@@ -33,11 +33,11 @@ from drake_dae.running.limits import limited_values, robot_limits
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import tracking_law
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
-from drake_dae.scenario.robot_file.links import RobotLinks
+from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import check_task
 from drake_dae.systems.control.contract import PhaseChange

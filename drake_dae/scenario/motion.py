@@ -12,7 +12,7 @@ from drake_dae.references.by_name import assign, in_order
 from drake_dae.references.reference import stack_references
 from drake_dae.robots import RobotModel, links_behind
 from drake_dae.running.limits import robot_limits
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_state
 

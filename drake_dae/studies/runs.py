@@ -30,10 +30,9 @@ from drake_dae.running.rollout import program_of
 from drake_dae.running.simulate import simulate
 from drake_dae.running.summary import figures_of
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.files import varied_data
-from drake_dae.scenario.parts.parts import Matrices
+from drake_dae.scenario.parts import Matrices
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
-from drake_dae.scenario.scenario import Scenario, read_scenario
+from drake_dae.scenario.scenario import Scenario, read_scenario, varied_data
 from drake_dae.scenario.start import start_scenario
 from drake_dae.studies.variations import Variation
 

@@ -11,9 +11,9 @@ from runs import run_scenario, scenario
 from drake_dae import complete_scenario, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.model import scenario_model
+from drake_dae.scenario.scenario import save_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction
 

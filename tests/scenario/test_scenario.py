@@ -38,11 +38,10 @@ from drake_dae import (
     load_scenario,
 )
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.files import save_scenario
-from drake_dae.scenario.parts import parts as forms
-from drake_dae.scenario.parts import written
+from drake_dae.scenario import parts as forms
+from drake_dae.scenario import parts as written
 from drake_dae.scenario.robot_file.robot import Pose, Robot
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction
 

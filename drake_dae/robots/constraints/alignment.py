@@ -17,7 +17,7 @@ from drake_dae.robots.surfaces.surface import (
     unit_vector,
     with_parameters,
 )
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 @checked(ModelError)

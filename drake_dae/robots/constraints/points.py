@@ -16,7 +16,7 @@ from drake_dae.robots.constraints.friction import Friction, friction_parameters
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 @checked(ModelError)

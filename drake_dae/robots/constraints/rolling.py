@@ -14,7 +14,7 @@ from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 @checked(ModelError)

@@ -23,7 +23,7 @@ from drake_dae.robots.surfaces.surface import (
     triple,
     unit_vector,
 )
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 _SOLID_LENGTH = 100.0
 """The length of the solid of a cylinder, in m: its ends are out of the reach of a robot."""

@@ -33,7 +33,7 @@ from drake_dae import (
 from drake_dae.diagrams.record import Record
 from drake_dae.diagrams.recorded import log_steps
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.robot_file.links import add_robot
+from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.studies.runs import Outcome
 from drake_dae.systems.plants.contract import Plant

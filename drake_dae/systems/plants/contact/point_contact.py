@@ -6,7 +6,7 @@ import casadi as ca
 
 from drake_dae.errors import ModelError
 from drake_dae.robots import Constraint, RobotModel, Touch
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 TURNS = 4
 """The number of iterations for the deepest point of a ball, if a distance is exact only on the

@@ -12,24 +12,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import brief, numbers, unknown_name, vector
-from drake_dae.dae.system.contacts import UnilateralInput
-from drake_dae.dae.system.signals import (
-    Parameter,
-    Signal,
-    is_symbol,
-    parameter_slice,
-    parameter_symbol,
-)
+from drake_dae.arrays import brief, number, numbers, unknown_name, vector
+from drake_dae.dae.contacts import UnilateralInput
+from drake_dae.dae.signals import Parameter, Signal, is_symbol, parameter_slice, parameter_symbol
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import check_choice
-from drake_dae.trace.given import numpy_explained
-from drake_dae.trace.smoothness import find_flaw
+from drake_dae.trace.expressions import find_flaw
 
 
-def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Checks the fields of a system and returns them converted."""
-    name, state = arguments["name"], arguments["state"]
+def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Checks the fields of a system and returns those that change, converted."""
+    name, state = given["name"], given["state"]
     if not isinstance(name, str):
         raise ModelError(f"the name of a system must be text, got {name!r}")
     if not (is_symbol(state) and state.numel()):
@@ -38,32 +31,31 @@ def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
             f"for example casadi.SX.sym('x', 4); got {type(state).__name__}"
         )
     state = ca.vec(state)
-    check_choice(name, arguments["compiled"])
+    check_choice(name, given["compiled"])
     for key in ("least_margin", "negligible"):
-        number = numbers(f"{name}: {key}", arguments[key])
-        if number.ndim or not 1e-15 <= number < 1.0:
+        if not 1e-15 <= number(f"{name}: {key}", given[key]) < 1.0:
             raise ModelError(
                 f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
-                f"{brief(arguments[key])}"
+                f"{brief(given[key])}"
             )
     for key, kind in (("contacts", UnilateralInput), ("parameters", Parameter)):
-        items = arguments[key]
+        items = given[key]
         if not isinstance(items, (list, tuple)) or not all(isinstance(i, kind) for i in items):
             raise ModelError(
                 f"{name}: {key} must be a list of {kind.__name__}s, got {brief(items)}"
             )
-    parameters = tuple(arguments["parameters"])
+    parameters = tuple(given["parameters"])
     _check_unique(name, "parameter", [p.name for p in parameters])
-    for contact in arguments["contacts"]:
+    for contact in given["contacts"]:
         if contact.friction is not None:
             parameter_slice(name, parameters, contact.friction)
-    functions = {key: arguments[key] for key in ("f", "g", "h", "k", "l", "m")}
-    mass = arguments["mass_matrix"]
-    functions["mass_matrix"] = ca.SX.eye(state.numel()) if mass is None else mass
-    metric, free = arguments["control_metric"], arguments["free_control"]
+    functions = {key: given[key] for key in ("f", "g", "h", "k", "l", "m", "mass_matrix")}
+    if functions["mass_matrix"] is None:
+        functions["mass_matrix"] = ca.SX.eye(state.numel())
+    metric, free = given["control_metric"], given["free_control"]
     functions |= {} if metric is None else {"control_metric": metric}
     functions |= {} if free is None else {"free_control": free}
-    expressions = _functions(name, functions, state, parameter_symbol(parameters))
+    expressions = _expressions(name, functions, state, parameter_symbol(parameters))
     fields = {"state": state, "parameters": parameters, **expressions}
     n, m = state.numel(), expressions["k"].numel()
     p, q = expressions["h"].shape[1], expressions["l"].numel()
@@ -74,12 +66,12 @@ def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
         ("control_signals", p, "u"),
         ("output_signals", q, "z"),
     ):
-        named = arguments[key] or [f"{letter}{i}" for i in range(count)]
-        fields[key] = signals = as_signals(f"{name}: {key}", named)
+        named = given[key] or [f"{letter}{i}" for i in range(count)]
+        fields[key] = signals = _as_signals(f"{name}: {key}", named)
         if len(signals) != count:
             raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
         _check_unique(name, key, [signal.name for signal in signals])
-    nominal, scale = arguments["nominal_state"], arguments["state_scale"]
+    nominal, scale = given["nominal_state"], given["state_scale"]
     start = np.zeros(n) if nominal is None else nominal
     fields["nominal_state"] = vector(f"{name}: nominal_state", start, n)
     fields["nominal_state"].setflags(write=False)
@@ -102,7 +94,7 @@ def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return fields
 
 
-def called_functions(
+def fields_of_functions(
     state: Sequence[Signal | str] | int,
     functions: Mapping[str, Any],
     parameters: Mapping[str, ArrayLike],
@@ -122,7 +114,7 @@ def called_functions(
             f"parameter names must be Python identifiers, for use as p.name, got {bad}"
         )
     names = [f"x{i}" for i in range(state)] if isinstance(state, int) else state
-    named = as_signals(f"{owner}: the states", names)
+    named = _as_signals(f"{owner}: the states", names)
     if not named:
         raise ModelError(f"{owner}: a system needs at least one state")
     x = ca.vertcat(*[ca.SX.sym(signal.name) for signal in named])
@@ -132,7 +124,7 @@ def called_functions(
     arguments: list[Any] = [x]
     if defined:
         arguments.append(SimpleNamespace(**{p.name: p.symbol for p in defined}))
-    values = {key: _call(owner, key, function, arguments) for key, function in functions.items()}
+    values = {key: _called(owner, key, function, arguments) for key, function in functions.items()}
     if values["h"].shape[0] == 1 and x.numel() != 1:
         values["h"] = values["h"].T
     return {"state": x, **values, "parameters": defined, "state_signals": named, **labels}
@@ -156,7 +148,7 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
         ) from error
 
 
-def _functions(
+def _expressions(
     owner: str, functions: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
     """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them."""
@@ -175,12 +167,10 @@ def _functions(
         if value.shape != shape and value.shape == shape[::-1] and 1 in shape:
             value = value.T
         if value.shape != shape:
-            if value.numel() == 0 and m and key in "gm":
-                why = f"k is given, so g and m are needed; {key} is missing, with shape {shape}"
-                raise ModelError(f"{owner}: {why}")
+            missing = " (k is given, so g and m are needed)" if value.numel() == 0 else ""
             raise ModelError(
                 f"{owner}: {key} has shape {value.shape}, expected {shape} for n = {n} states, "
-                f"m = {m} constraints, p = {p} controls, {q} controlled outputs"
+                f"m = {m} constraints, p = {p} controls, {q} controlled outputs{missing}"
             )
         unknown = [s.name() for s in ca.symvar(value) if not ca.depends_on(allowed, s)]
         if unknown:
@@ -189,25 +179,23 @@ def _functions(
                 "state nor a parameter; pass it in 'parameters' or put its number in"
             )
         values[key] = ca.sparsify(value)  # Zeros of an array are structural, too.
-    if find_flaw(ca.veccat(*values.values()), state, parameters) is not None:
+    if find_flaw(ca.veccat(*values.values()), state, parameters):
         for key, value in values.items():
             for row, column in zip(*value.sparsity().get_triplet(), strict=True):
-                if flaw := find_flaw(value[row, column], state, parameters):
+                if flaw := find_flaw(value[row, column], state, parameters, "the state"):
                     raise ModelError(
-                        f"{owner}: {key}, entry [{row}, {column}] of shape {value.shape}, "
-                        f"{flaw.describe('the state')}"
+                        f"{owner}: {key}, entry [{row}, {column}] of shape {value.shape}, {flaw}"
                     )
     return values
 
 
 def _check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
-    """Checks that no name occurs twice."""
     double = sorted({name for name in names if names.count(name) > 1})
     if double:
         raise ModelError(f"{owner}: {kind} names must be unique, twice: {', '.join(double)}")
 
 
-def as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
+def _as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
     """Converts a list of signals, or of names of signals without unit, to signals."""
     items = [signals] if isinstance(signals, str) or not isinstance(signals, Sequence) else signals
     bad = [item for item in items if not isinstance(item, (Signal, str))]
@@ -216,7 +204,7 @@ def as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
     return tuple(Signal(item) if isinstance(item, str) else item for item in items)
 
 
-def _call(
+def _called(
     owner: str, letter: str, function: Callable[..., Any] | None, arguments: list[Any]
 ) -> ca.SX:
     """Calls a user's function with symbols and returns its expression; empty without a function."""
@@ -227,14 +215,13 @@ def _call(
             f"{owner}: {letter} must be a function of the state, got "
             f"{type(function).__name__}; `DaeSystem(...)` takes expressions"
         )
-    with numpy_explained(f"{owner}: function {letter}"):
-        try:
-            value = function(*arguments)
-        except Exception as error:
-            raise ModelError(
-                f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
-                f"states: {_explained(error, function, arguments)}"
-            ) from error
+    try:
+        value = function(*arguments)
+    except Exception as error:
+        raise ModelError(
+            f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
+            f"states: {_explained(error, function, arguments)}"
+        ) from error
     if value is None:
         raise ModelError(f"{owner}: function {letter} returned nothing")
     return as_expression(owner, letter, value)
@@ -258,7 +245,4 @@ def _explained(error: Exception, function: Callable[..., Any], arguments: Sequen
         )
     if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
         return f"no parameter '{error.name}'; there are {', '.join(vars(error.obj))}"
-    text = text.removeprefix("...").split(": ", 1)[-1] if text.startswith(".../casadi") else text
-    if isinstance(error, NotImplementedError):
-        text += ". Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"
-    return text
+    return f"{text}. Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"

@@ -12,18 +12,9 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, vector
-from drake_dae.dae.system.contacts import Contacts, UnilateralInput
-from drake_dae.dae.system.fields import called_functions, checked_fields
-from drake_dae.dae.system.signals import (
-    Exogenous,
-    Parameter,
-    Signal,
-    bounded,
-    moving,
-    parameter_slice,
-    parameter_symbol,
-    valued,
-)
+from drake_dae.dae.contacts import Contacts, UnilateralInput
+from drake_dae.dae.fields import checked_fields, fields_of_functions
+from drake_dae.dae.signals import Exogenous, Parameter, Signal, parameter_slice, parameter_symbol
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import Factors, PositiveDefiniteFactorization
@@ -81,7 +72,7 @@ class DaeSystem:
         compiled: Machine code from the first call (True), never, or when it pays ("auto").
         least_margin: A(x) or B(x) is singular where its smallest singular value, scaled, is below.
         negligible: Entries below this, relative to their row or column, are zero in degrees.
-        contacts: Constraint inputs that only push, if one has friction: see `system.contacts`.
+        contacts: Constraint inputs that only push, if one has friction: see `contacts`.
         dry: The names of parameters that are coefficients of Coulomb friction in f.
 
     Raises:
@@ -164,7 +155,7 @@ class DaeSystem:
         """
         functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
         names = [item.name for item in fields(cls)]
-        system = cls(**called_functions(state, functions, parameters or {}, labels, names))
+        system = cls(**fields_of_functions(state, functions, parameters or {}, labels, names))
         system = system.with_exogenous(exogenous) if exogenous else system
         return system.with_bounds(bounds) if bounds else system
 
@@ -196,22 +187,22 @@ class DaeSystem:
 
     @cached_property
     def num_states(self) -> int:
-        """n, the number of states."""
+        """n"""
         return int(self.state.numel())
 
     @cached_property
     def num_constraints(self) -> int:
-        """m, the number of constraints."""
+        """m"""
         return int(self.k.numel())
 
     @cached_property
     def num_controls(self) -> int:
-        """p, the number of controls."""
+        """p"""
         return int(self.h.shape[1])
 
     @cached_property
     def num_outputs(self) -> int:
-        """The number of controlled outputs. The law (28) needs as many outputs as controls."""
+        """q; the law (28) needs as many outputs as controls."""
         return int(self.l.numel())
 
     @property
@@ -257,9 +248,7 @@ class DaeSystem:
     @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
         """Returns the same system with some parameters as exogenous signals."""
-        for name in names:
-            self.parameter_slice(name)
-        return replace(self, parameters=moving(self.parameters, names))
+        return self._with_parameters({name: {"exogenous": True} for name in names})
 
     @checked(ModelError)
     def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
@@ -273,21 +262,22 @@ class DaeSystem:
             bounds: Name -> (low, high), each a number or one for each entry; the default lies
                 between them. Equal bounds fix the parameter; as an exogenous signal it is constant.
         """
-        return self._with_parameters(bounded, bounds)
+        return self._with_parameters({name: {"bounds": each} for name, each in bounds.items()})
 
     @checked(ModelError)
     def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
         """Returns the same system with other defaults of some parameters."""
-        return self._with_parameters(valued, values)
+        return self._with_parameters({name: {"value": value} for name, value in values.items()})
 
-    def _with_parameters(
-        self, changed: Callable[[Parameter, Any], Parameter], values: Mapping[str, Any]
-    ) -> "DaeSystem":
-        for name in values:
+    def _with_parameters(self, changes: Mapping[str, dict[str, Any]]) -> "DaeSystem":
+        for name in changes:
             self.parameter_slice(name)
-        parameters = [
-            changed(p, values[p.name]) if p.name in values else p for p in self.parameters
-        ]
+        parameters = []
+        for p in self.parameters:
+            change = dict(changes.get(p.name, {}))
+            if "value" in change:
+                change["value"] = p.entries(change["value"])
+            parameters.append(replace(p, **change) if change else p)
         return replace(self, parameters=tuple(parameters))
 
     @property
@@ -312,12 +302,7 @@ class DaeSystem:
             return self.state_scale
         return np.maximum(np.abs(self.nominal_state), 1.0)
 
-    @property
-    def nominal_spread(self) -> FloatArray:
-        """The default standard deviation of random states around the nominal one, shape (n,)."""
-        return self.usual_spread(self.nominal_state)
-
-    def usual_spread(self, state: ArrayLike) -> FloatArray:
+    def spread_around(self, state: ArrayLike) -> FloatArray:
         """Returns the default standard deviation of random states around a state, shape (n,).
 
         It is 0.1 of the scale, a hundredth of a value above 10 scales, and a tenth of one below
@@ -355,7 +340,7 @@ class DaeSystem:
         symbols = [self.state, *unknowns, self.parameter_symbol]
         function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
         random, p = np.random.default_rng(0), self.parameter_values
-        deviation = self.nominal_spread
+        deviation = self.spread_around(self.nominal_state)
         finite = 0
         for spread in (0.0, 0.1, 0.1):
             x = self.nominal_state + deviation * random.standard_normal(self.num_states)
@@ -399,17 +384,17 @@ class DaeSystem:
             )
         parameters = np.empty((*values.shape[:-1], self._defaults.size))
         parameters[...] = self._defaults
-        sizes = {p.name: p.value.size for p in other.parameters}
+        sizes, rates = {p.name: p.value.size for p in other.parameters}, other.exogenous.rates()
         for p in self.parameters:
-            if sizes.get(p.name) == p.value.size:
-                place = self.parameter_slice(p.name)
-                parameters[..., place] = values[..., other.parameter_slice(p.name)]
-        own, rates = {p.name: p.value.size for p in self.parameters}, other.exogenous.rates()
-        for name, to in self.exogenous.rates().items():
-            if name in rates and sizes[name] == own[name]:
-                count = min(to.stop - to.start, rates[name].stop - rates[name].start)
-                first = rates[name].start
-                parameters[..., to.start : to.start + count] = values[..., first : first + count]
+            if sizes.get(p.name) != p.value.size:
+                continue
+            place = self.parameter_slice(p.name)
+            parameters[..., place] = values[..., other.parameter_slice(p.name)]
+            if p.exogenous and p.name in rates:
+                to, source = self.exogenous.rates()[p.name], rates[p.name]
+                count = min(to.stop - to.start, source.stop - source.start)
+                moved = values[..., source.start : source.start + count]
+                parameters[..., to.start : to.start + count] = moved
         return parameters
 
     def state_vector(self, state: ArrayLike) -> FloatArray:
@@ -417,5 +402,5 @@ class DaeSystem:
         return vector(f"{self.name}: a state", state, self.num_states)
 
     def parameter_slice(self, name: str) -> slice:
-        """Returns the slice of a parameter in the parameter vector."""
+        """Returns the place of a parameter in the parameter vector."""
         return parameter_slice(self.name, self.parameters, name)

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 
 FAR = 1e9
