@@ -2,7 +2,6 @@
 
 from math import ceil
 
-import casadi as ca
 import numpy as np
 from scipy.integrate import DOP853
 
@@ -61,20 +60,21 @@ class InterpretedRun:
         self.events, self.event, self.steps, self.is_on = problem.events, 0, 0, False
         self.next, self.trial_time, self.trial = np.nan, np.inf, np.full(1, np.nan)
 
-    def value(self, function: ca.Function, time: float, state: FloatArray) -> FloatArray:
+    def value(self, name: str, time: float, state: FloatArray) -> FloatArray:
         """The first result of a function, now; notes the earliest trial without a value."""
-        value: FloatArray = function(time, state, self.held, self.problem.parameters).full()[:, 0]
+        function = self.functions.buffered[name]
+        value = function(time, state, self.held, self.problem.parameters)[0].copy()
         is_trial = time < self.trial_time and np.isfinite(state).all()
         if is_trial and not np.isfinite(value).all():
             self.trial_time, self.trial = time, np.array(state)
         return value
 
     def rate(self, time: float, state: FloatArray) -> FloatArray:
-        return self.value(self.functions.rate, time, state)
+        return self.value("rate", time, state)
 
     def write(self, time: float, state: FloatArray) -> None:
         """Adds a row of the record."""
-        row = self.value(self.functions.row, time, state)
+        row = self.value("row", time, state)
         if not np.isfinite(row).all():
             raise _Ended(RunEnding.INVALID)
         self.rows.append(row)
@@ -84,11 +84,11 @@ class InterpretedRun:
         found = state
         for attempt in range(8 if self.functions.projects else 0):
             held, parameters = self.held, self.problem.parameters
-            moved, left = self.functions.newton(time, found, held, parameters)
-            found = moved.full()[:, 0]
-            if float(left) <= REACHED:
+            moved, left = self.functions.buffered["newton"](time, found, held, parameters)
+            found = moved.copy()
+            if left[0] <= REACHED:
                 return found, True
-            if attempt and not float(left) <= NEAR:
+            if attempt and not left[0] <= NEAR:
                 break
         return state, not self.functions.projects
 
@@ -125,7 +125,7 @@ class InterpretedRun:
                 and self.problem.due[self.event] >> number & 1
             ):
                 given = self.time, self.state, self.held, self.problem.parameters, noise
-                held[rate.places] = rate.function(*given).full()[:, 0]
+                (held[rate.places],) = self.functions.buffered[f"update_{number}"](*given)
                 if not np.isfinite(held[rate.places]).all():
                     raise _Ended(RunEnding.INVALID)
         self.held = held

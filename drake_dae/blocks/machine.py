@@ -224,8 +224,10 @@ def run_several(
             together.next[0] = STOPPED
             raise
     together.stepper = alone
+    failed = [i for i, run in enumerate(together.runs) if run.ending != RunEnding.DONE]
     with ThreadPoolExecutor(num_cores()) as pool:
-        return list(pool.map(together.alone, range(count)))
+        continued = dict(zip(failed, pool.map(together.alone, failed), strict=True))
+    return [continued.get(i) or together.ended(i) for i in range(count)]
 
 
 class _Call:
@@ -236,9 +238,9 @@ class _Call:
         count, functions = len(problems.state), stepper.functions
         self._states, self._held = problems.state.copy(), problems.held.copy()
         self._rows = np.empty((count, problems.times.size, functions.row.numel_out(0)))
-        self._runs = (_Run * count)()
+        self.runs = (_Run * count)()
         start = float(problems.times[0])
-        for run in self._runs:
+        for run in self.runs:
             run.time = run.start = run.mark = start
             run.trial = np.inf
             run.ending = RunEnding.PAUSED
@@ -262,7 +264,7 @@ class _Call:
         first: int,
         count: int,
         trial: FloatArray | None = None,
-        next_: FloatArray | None = None,
+        next_: np.ndarray | None = None,
     ) -> _Batch:
         """The arguments of some of the runs."""
         problems, settings = self._problems, self._settings
@@ -286,16 +288,15 @@ class _Call:
             longest=settings.longest,
             relative=settings.relative,
             stages=0 if settings.tableau is None else settings.tableau.b.size,
-            runs=ctypes.addressof(self._runs) + first * ctypes.sizeof(_Run),
+            runs=ctypes.addressof(self.runs) + first * ctypes.sizeof(_Run),
             **{name: array.ctypes.data for name, array in arrays.items()},
         )
 
     def alone(self, i: int) -> Run:
         """Makes one run, or goes on with it, until its end, or to where it cannot go on."""
-        at, state, held, rows = self._runs[i], self._states[i], self._held[i], self._rows[i]
+        at, state, held, rows = self.runs[i], self._states[i], self._held[i], self._rows[i]
         trial, functions = np.full_like(state, np.nan), self.stepper.functions
-        if at.ending != RunEnding.DONE:
-            at.ending, budget = RunEnding.PAUSED, FIRST
+        at.ending, budget = RunEnding.PAUSED, FIRST
         next_ = np.zeros(1, dtype=np.longlong)
         batch = self.batch(i, 1, trial, next_)
         while at.ending == RunEnding.PAUSED and not self._settings.look(lambda: rows[: at.row]):
@@ -311,18 +312,14 @@ class _Call:
                 except InconsistentStateError:
                     break
                 at.on, at.ending = 1, RunEnding.PAUSED
-        return Run(
-            rows[: at.row],
-            RunEnding(at.ending),
-            at.time,
-            state,
-            held,
-            at.steps,
-            at.before,
-            at.next,
-            at.trial,
-            trial,
-        )
+        return self.ended(i, trial)
+
+    def ended(self, i: int, trial: FloatArray | None = None) -> Run:
+        """The result of a run."""
+        at, rows = self.runs[i], self._rows[i]
+        states = self._states[i], self._held[i]
+        numbers = at.steps, at.before, at.next, at.trial
+        return Run(rows[: at.row], RunEnding(at.ending), at.time, *states, *numbers, trial)
 
 
 def _step(table: FloatArray) -> int:

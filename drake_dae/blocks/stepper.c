@@ -235,19 +235,15 @@ static void update(Lanes *l, mask wanted) {
 
 /* reached = x + step * weighted sum of rates; most weights of a high order are zero. */
 static void weigh(real step, int count, const double *b, const real *x, real (*k)[SIZE], real *reached) {
-  real weights[16];
-  const real *used[16];
-  int i, j, number = 0;
-  for (j = 0; j < count; j++) {
+  real sum[SIZE];
+  int i, j;
+  for (i = 0; i < SIZE; i++) sum[i] = K(b[0]) * k[0][i];
+  for (j = 1; j < count; j++) {
+    const real weight = K(b[j]);
     if (b[j] == 0.0) continue;
-    weights[number] = step * K(b[j]);
-    used[number++] = k[j];
+    for (i = 0; i < SIZE; i++) sum[i] += weight * k[j][i];
   }
-  for (i = 0; i < SIZE; i++) {
-    real sum = x[i];
-    for (j = 0; j < number; j++) sum += weights[j] * used[j][i];
-    reached[i] = sum;
-  }
+  for (i = 0; i < SIZE; i++) reached[i] = x[i] + step * sum[i];
 }
 
 static real weighted(const real *vector, const real *unit) {

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
+from threading import local
 from typing import NamedTuple, Self
 
 import casadi as ca
@@ -37,6 +38,34 @@ class Rate(NamedTuple):
     is_unrestricted: bool
     places: list[int]
     function: ca.Function
+
+
+class Buffered:
+    """A CasADi function on arrays, without conversions; arrays of its own for each thread."""
+
+    def __init__(self, function: ca.Function) -> None:
+        self._function, self._local = function, local()
+
+    def _bind(self) -> None:
+        function, mine = self._function, self._local
+        mine.arrays = [np.zeros(function.numel_in(i)) for i in range(function.n_in())]
+        mine.results = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+        mine.buffer, mine.evaluate = function.buffer()
+        for i, array in enumerate(mine.arrays):
+            mine.buffer.set_arg(i, array.data)
+        for i, array in enumerate(mine.results):
+            mine.buffer.set_res(i, array.data)
+
+    def __call__(self, *arguments: FloatArray | float) -> list[FloatArray]:
+        """Returns the results, which the next call in this thread overwrites."""
+        if not hasattr(self._local, "arrays"):
+            self._bind()
+        mine = self._local
+        for array, value in zip(mine.arrays, arguments, strict=True):
+            array[...] = value
+        mine.evaluate()
+        results: list[FloatArray] = mine.results
+        return results
 
 
 class StepFunctions:
@@ -95,6 +124,11 @@ class StepFunctions:
         """All functions by name; "update_0", ... in the order of `rates`."""
         updates = {f"update_{i}": rate.function for i, rate in enumerate(self.rates)}
         return {"rate": self.rate, "row": self.row, "newton": self.newton, **updates}
+
+    @cached_property
+    def buffered(self) -> dict[str, Buffered]:
+        """All functions, to be called on arrays."""
+        return {name: Buffered(function) for name, function in self.functions.items()}
 
     @property
     def num_operations(self) -> int:

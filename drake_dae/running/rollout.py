@@ -590,13 +590,17 @@ class RolloutProgram:
 
     def _check_starts(self, problems: RunProblem) -> None:
         """Refuses starts that are off N*."""
-        context, time = self.context.Clone(), float(problems.times[0])
-        for plant in (s for s in self.composed.states if isinstance(s, DaePlant)):
-            local = plant.GetMyContextFromRoot(context)
+        context, time, parts = self.context.Clone(), float(problems.times[0]), self.composed
+        for plant in (s for s in parts.states if isinstance(s, DaePlant)):
+            local, part = plant.GetMyContextFromRoot(context), parts.states[plant]
+            own = parts.parameters.get(plant, slice(0, 0))
             for i in range(len(problems.state)):
                 one = problems.run(i)
-                self.put(context, time, one.state, one.held, one.parameters)
-                plant.check_start(plant.state(local), plant.current_parameters(local))
+                values = one.parameters[own]
+                if plant.exogenous_places:
+                    self.put(context, time, one.state, one.held, one.parameters)
+                    values = plant.current_parameters(local)
+                plant.check_start(one.state[part], values)
 
     def _without_inputs(self) -> Block:
         """The block with values of unwired inputs as parameters, and what Drake computes as held.

@@ -24,7 +24,6 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import Computations
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.errors import ModelError
@@ -47,7 +46,6 @@ from drake_dae.systems.plants.contact.disturbance_forces import (
     AppliedDisturbances,
     DisturbanceForce,
 )
-from drake_dae.systems.plants.contact.traced_contact import traced_contact
 from drake_dae.systems.plants.contract import Plant
 
 
@@ -250,18 +248,7 @@ class ContactPlant(Diagram, Plant):
         Raises:
             ModelError: The shape is wrong.
         """
-        self._put(context, self.dae.state_vector(state))
-
-    def _put(self, context: Context, values: FloatArray) -> None:
-        """Sets x, the first of some values, and changed masses."""
         multibody_context = self.GetMutableSubsystemContext(self.multibody, context)
-        self.multibody.SetPositionsAndVelocities(multibody_context, values[: self.dae.num_states])
+        values = self.dae.state_vector(state)
+        self.multibody.SetPositionsAndVelocities(multibody_context, values)
         set_masses(multibody_context, self._masses)
-
-    def traced(self) -> Computations:
-        return traced_contact(self, self._forces, self._held, self._put, self._values)
-
-    def _held(self, context: Context) -> FloatArray:
-        """(q, v), and the contact forces."""
-        forces = self.GetOutputPort("contact_force").Eval(context)
-        return np.concatenate([self.state(context), forces])
