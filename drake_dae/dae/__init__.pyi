@@ -1,5 +1,7 @@
 """The names of the room, each with its home, in the order of the paper."""
 
+from .assumptions import Violation as Violation
+from .assumptions import ViolationKind as ViolationKind
 from .beyond.advised_gains import AdvisedGains as AdvisedGains
 from .beyond.advised_gains import SensedContact as SensedContact
 from .beyond.advised_gains import advised_gains as advised_gains
@@ -26,27 +28,25 @@ from .linearization import Linearization as Linearization
 from .linearization import LinearModel as LinearModel
 from .linearization import linearize as linearize
 from .linearization import linearize_loop as linearize_loop
-from .manifold.manifold import Manifold as Manifold
+from .manifold import Manifold as Manifold
+from .margins import ContactMargin as ContactMargin
+from .margins import RankMargin as RankMargin
 from .normal_form import NormalForm as NormalForm
+from .redundancy import drop_constraints as drop_constraints
+from .redundancy import share_forces as share_forces
+from .samples import Region as Region
 from .signals import DerivativeLayout as DerivativeLayout
 from .signals import Indices as Indices
 from .signals import Parameter as Parameter
 from .signals import Signal as Signal
 from .signals import outputs_named as outputs_named
 from .signals import signals as signals
-from .states.contact_margin import ContactMargin as ContactMargin
-from .states.margins import RankMargin as RankMargin
-from .states.region import Region as Region
-from .structure.assumptions import Violation as Violation
-from .structure.assumptions import ViolationKind as ViolationKind
-from .structure.constrained import ConstraintStructure as ConstraintStructure
-from .structure.constrained import constraint_structure_of as constraint_structure_of
-from .structure.constrained import find_constraint_structure as find_constraint_structure
-from .structure.redundancy import drop_constraints as drop_constraints
-from .structure.redundancy import share_forces as share_forces
-from .structure.structure import Structure as Structure
-from .structure.structure import find_structure as find_structure
-from .structure.structure import why_no_law as why_no_law
+from .structure import ConstraintStructure as ConstraintStructure
+from .structure import Structure as Structure
+from .structure import constraint_structure_of as constraint_structure_of
+from .structure import find_constraint_structure as find_constraint_structure
+from .structure import find_structure as find_structure
+from .structure import why_no_law as why_no_law
 from .system import DaeSystem as DaeSystem
 from .tracking.gains import FeedbackGains as FeedbackGains
 from .tracking.gains import GainDesign as GainDesign

@@ -9,10 +9,10 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, show, vector
+from drake_dae.dae.margins import RankMargin, find_margin
+from drake_dae.dae.samples import Samples
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.states.margins import RankMargin, find_margin
-from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.structure.structure import Structure, structure_of
+from drake_dae.dae.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.expressions import find_flaw

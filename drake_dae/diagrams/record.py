@@ -76,11 +76,7 @@ class Record:
                 raise ModelError(f"'{name}' of a record has shape {shape}, but {count} names")
 
     def __getitem__(self, name: str) -> FloatArray:
-        """The values of a signal, shape (k, size).
-
-        Raises:
-            ModelError: The record has no such signal.
-        """
+        """The values of a signal, shape (k, size)."""
         if name not in self.signals:
             raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
         return self.signals[name].values
@@ -293,11 +289,7 @@ def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
 
 
 def _optional_module(module: str, user: str) -> Any:
-    """Imports a package of the extra `data`.
-
-    Raises:
-        ModelError: It is not installed.
-    """
+    """Imports a package of the extra `data`."""
     try:
         return import_module(module)
     except ImportError:

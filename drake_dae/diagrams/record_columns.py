@@ -45,13 +45,7 @@ def label(signal: Signal) -> str:
 
 
 def write_csv(path: str | Path, time: FloatArray, signals: Mapping[str, Recorded]) -> None:
-    """Writes the columns "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
-
-    Args:
-        path: The file.
-        time: The times in s, shape (k,).
-        signals: The signals by name.
-    """
+    """Writes the columns "time [s]" and "<signal>.<name> [<unit>]", with all digits."""
     columns = [f"{name}.{label(s)}" for name, course in signals.items() for s in course.signals]
     rows = np.column_stack([time, *(course.values for course in signals.values())])
     with open(path, "w", newline="", encoding="utf-8") as file:
@@ -61,18 +55,7 @@ def write_csv(path: str | Path, time: FloatArray, signals: Mapping[str, Recorded
 
 
 def read_csv(path: str | Path, columns: Mapping[str, str] | None) -> Table:
-    """Reads what `write_csv` writes, or the log of a robot.
-
-    Args:
-        path: The file.
-        columns: A column of the file -> its name in a record, "time" or "<signal>.<name>", with or
-            without a unit in brackets; other columns are left out. None if the file has these names
-            itself.
-
-    Raises:
-        ModelError: The file cannot be read, it lacks a column or has two of one name, or some entry
-            is not a number.
-    """
+    """Reads what `write_csv` writes, or the log of a robot."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file)

@@ -24,13 +24,7 @@ def log_signals(
     controller: Controller,
     named: Named,
 ) -> VectorLogSink:
-    """Exports all signals, and logs them as one vector.
-
-    Args:
-        builder: The builder of the diagram.
-        plant, controller: The blocks.
-        named: The signals.
-    """
+    """Exports all signals, and logs them as one vector."""
     for name, (port, _) in named.items():
         builder.ExportOutput(port, name)
     for name in controller.shown:
@@ -44,7 +38,7 @@ def signals_of_plant(
     plant: Plant,
     moving: ReferenceGenerator | None,
     reference: ReferenceGenerator | None,
-    law: TrackingLaw,
+    law: TrackingLaw | None,
     control: OutputPort,
 ) -> Named:
     """The signals of every plant and its inputs that a record contains."""
@@ -54,7 +48,7 @@ def signals_of_plant(
         named["exogenous"] = (moving.get_output_port(), signals)
     for name, signals in plant.port_signals.items():
         named[name] = (plant.GetOutputPort(name), signals)
-    if reference is not None:
+    if reference is not None and law is not None:
         named["reference"] = (reference.GetOutputPort("reference"), law.reference_signals)
     return {**named, "control": (control, dae.control_signals)}
 
@@ -96,11 +90,6 @@ def log_steps(builder: DiagramBuilder, ports: Sequence[OutputPort], plant: Plant
 
     For a discrete plant the log is periodic, since after the last step of a run the state of the
     plant belongs to a time that the run has not reached.
-
-    Args:
-        builder: The builder of the diagram.
-        ports: The ports.
-        plant: The plant.
     """
     stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
     stacked.set_name("logged_signals")

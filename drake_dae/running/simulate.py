@@ -251,11 +251,7 @@ def _warn_of_many_steps(duration: float, longest: tuple[str, float]) -> None:
 
 
 def check_duration(duration: float) -> None:
-    """Checks that a duration is positive.
-
-    Raises:
-        ModelError: The duration is not positive.
-    """
+    """Checks that a duration is positive."""
     if not (isfinite(duration) and duration > 0.0):
         raise ModelError(f"a duration must be positive, got {duration} s")
 
@@ -282,11 +278,7 @@ def _has_error_control(scheme: str) -> bool:
 
 
 def check_config(config: SimulatorConfig) -> None:
-    """Checks for settings that Drake accepts but that hang, fail late, or are ignored.
-
-    Raises:
-        ModelError: A setting is not valid; the message names it and valid ones.
-    """
+    """Checks for settings that Drake accepts but that hang, fail late, or are ignored."""
     scheme = config.integration_scheme
     schemes = _schemes()
     if scheme not in schemes:

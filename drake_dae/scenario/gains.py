@@ -28,7 +28,7 @@ from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.task_controller import opening_contact
+from drake_dae.scenario.start import opening_contact
 from drake_dae.systems.task.automaton import SMOOTH, fading
 from drake_dae.systems.task.phases import Approach, Press
 

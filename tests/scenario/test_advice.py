@@ -9,11 +9,7 @@ from arms import numbers
 from pydrake.systems.analysis import Simulator
 from runs import scenario
 
-from drake_dae import (
-    build_scenario,
-    contact_gains,
-    load_scenario,
-)
+from drake_dae import build_scenario, contact_gains, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import parts as parts

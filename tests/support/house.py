@@ -26,11 +26,12 @@ FLOORS = (
     ("trace",),
     ("dae",),
     ("references",),
-    ("analysis", "robots"),
+    ("robots",),
     ("blocks",),
     ("systems",),
     ("scene",),
     ("diagrams",),
+    ("analysis",),
     ("running",),
     ("pictures",),
     ("scenario",),
@@ -43,7 +44,7 @@ FLOORS = (
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 # The mathematics can be read, tested and used without Drake.
-WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references", "analysis")
+WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references")
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
@@ -51,10 +52,16 @@ PAPER = (
     "contacts",
     "fields",
     "system",
+    "settling",
     "manifold",
     "derivatives",
     "elimination",
-    "states",
+    "samples",
+    "margins",
+    "family",
+    "assumptions",
+    "redundancy",
+    "relative_degrees",
     "structure",
     "normal_form",
     "tracking",

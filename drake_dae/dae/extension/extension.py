@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
 from drake_dae.dae.signals import DerivativeLayout, Signal
-from drake_dae.dae.structure.structure import Structure, structure_of
+from drake_dae.dae.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking.deflection import Deflection
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign

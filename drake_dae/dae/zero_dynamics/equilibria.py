@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold.manifold import coordinates
+from drake_dae.dae.manifold import coordinates
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.dae.zero_dynamics.stability import ROUNDED, balanced_matrix
 from drake_dae.errors import InconsistentStateError

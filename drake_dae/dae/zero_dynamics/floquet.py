@@ -14,7 +14,7 @@ import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, vector
-from drake_dae.dae.manifold.manifold import tangent
+from drake_dae.dae.manifold import tangent
 from drake_dae.dae.zero_dynamics.pinned_motion import GROWN, PinnedMotion, TimeFunction
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedSet
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict, eigenvalues_of

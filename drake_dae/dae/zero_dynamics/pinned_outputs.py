@@ -15,8 +15,8 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold.settling import CONSISTENT
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.settling import CONSISTENT
+from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps

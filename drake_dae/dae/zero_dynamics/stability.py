@@ -7,8 +7,8 @@ import numpy as np
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold.manifold import coordinates
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.manifold import coordinates
+from drake_dae.dae.structure import Structure
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedSet
 
 LINEARIZED = 1e-11

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from runs import scenario, some
 
-from drake_dae import build_scenario, rollout, start_values
+from drake_dae import build_scenario, rollout
 from drake_dae.blocks import machine
 from drake_dae.blocks.emitter import emitted
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import MachineCodeWarning, ModelError
 from drake_dae.running import rollout as module
+from drake_dae.running import start_values
 from drake_dae.running.rollout import program_of
 from drake_dae.trace.compiled import library
 

@@ -18,12 +18,12 @@ from drake_dae import (
     PointOnSurface,
     Sphere,
     build_scenario,
-    complete_scenario,
     load_scenario,
     simulate,
 )
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import Touch
+from drake_dae.scenario import complete_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.parts import Start, TiltFromNormalForm
 from drake_dae.scenario.postures import Postures, tool_axis

@@ -6,7 +6,7 @@ import pytest
 from book.keys import forms, keys_page
 from runs import scenario_validator, untagged
 
-from drake_dae import scenario_schema
+from drake_dae.scenario import scenario_schema
 from drake_dae.scenario.shipped import shipped_scenarios
 from drake_dae.scenario.typed_yaml import load_yaml
 

@@ -46,14 +46,10 @@ from runs import some
 
 from drake_dae import (
     Approach,
-    CommandedReferences,
     CompliantPlant,
     DaePlant,
-    DisturbanceObserver,
     ExpressionReference,
     ForceSensor,
-    Observing,
-    PointMaterial,
     Press,
     ReferenceGenerator,
     Release,
@@ -66,10 +62,11 @@ from drake_dae import (
     TrackingController,
     TrackingLaw,
     poles,
-    with_disturbance,
 )
+from drake_dae.dae import with_disturbance
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout import RolloutProgram
+from drake_dae.systems import CommandedReferences, DisturbanceObserver, Observing, PointMaterial
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
