@@ -185,7 +185,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "size of StateSensor": lambda: 4,
     "components": lambda: "xy",
     "duration": lambda: 0.01,
-    "law of DisturbanceObserver": observed_law,
     "law of StateEstimator": observed_law,
     "gains of AdvisedGains": lambda: dd.contact_gains(1e5, 0.03, 1e-3),
     "observing of StateEstimator": lambda: Observing(10.0, state_rate=40.0),

@@ -6,11 +6,11 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
 
 from drake_dae.dae import Signal, TrackingLaw
-from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.observing.estimator import StateEstimator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
@@ -58,7 +58,7 @@ def signals_of_parts(
     controller: Controller,
     measured: MeasuredState | None,
     limits: ControlLimits | None,
-    observer: Observer | None,
+    observer: StateEstimator | None,
     sensor: ForceSensor | None,
 ) -> Named:
     """The further signals of controller, parts and plant that a record contains."""
@@ -80,7 +80,7 @@ def signals_of_parts(
     return named | further_signals(plant)
 
 
-def further_signals(block: Plant | Controller | Observer | ReferenceGenerator) -> Named:
+def further_signals(block: Plant | Controller | StateEstimator | ReferenceGenerator) -> Named:
     """The further signals of a block."""
     return {name: (block.GetOutputPort(name), s) for name, s in block.further_signals.items()}
 

@@ -19,7 +19,7 @@ from drake_dae.dae import (
     contact_gains,
 )
 from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR
-from drake_dae.dae.tracking.model_of_law import damping_gains
+from drake_dae.dae.law_model import damping_gains
 from drake_dae.errors import ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, velocities_are_rates

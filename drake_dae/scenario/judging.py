@@ -28,7 +28,7 @@ from drake_dae.diagrams.record import Record
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
-from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind
+from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind, own_values
 from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
@@ -304,7 +304,12 @@ def judge_run(
         behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
     is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
     remedies = _slower(loop, model, limits, record) if is_paced else []
-    notes = [constraint.remark for constraint in model.constraints]
+    notes = []
+    for constraint in model.constraints:
+        values = own_values(constraint, model.dae, model.dae.parameter_values)
+        surface = constraint.surface_at(values)
+        if surface is not None and surface.remark:
+            notes.append(f"{constraint.name}: {surface.remark}")
     notes += [_beyond_edge(constraint, model, record) for constraint in model.constraints]
     notes += _remarks([scenario.references, scenario.exogenous, scenario.task])
     notes += _early_touches(changes)
@@ -347,8 +352,9 @@ def _slower(loop: ClosedLoop, model: RobotModel, limits: SignalLimits, record: R
 
 def _beyond_edge(constraint: Constraint, model: RobotModel, record: Record) -> str:
     """When a point is beyond the edge of its surface's data first; "" if it is not."""
-    extent, dae = constraint.extent, model.dae
-    if extent is None:
+    dae = model.dae
+    surface = constraint.surface_at(own_values(constraint, dae, dae.parameter_values))
+    if surface is None or (extent := surface.extent) is None:
         return ""
     coordinates = constraint.coordinates(model.links)
     if any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):

@@ -128,7 +128,7 @@ class Postures:
         slopes = ca.jacobian(equations, links.q)
         self._slopes = TracedFunction("slopes of postures", inputs, {"slopes": slopes})
         self._count = residual.numel()
-        drives = ca.SX(ca.DM(links.actuation_matrix)), LoopState.of(bound, links).motors
+        drives = ca.SX(ca.DM(links.actuation_matrix)), LoopState(bound, links).motors
         outputs = {
             "rows": rows,
             "gradients": ca.mtimes(slopes[self._count :, :], links.velocity_map),

@@ -17,7 +17,7 @@ from problems.zero_systems import (
 )
 from scipy.integrate import solve_ivp
 
-import drake_dae.dae.zero_dynamics.pinned_motion as module
+import drake_dae.dae.pinned_motion as module
 from drake_dae.dae import DaeSystem, EndCause
 from drake_dae.errors import NonFiniteError
 

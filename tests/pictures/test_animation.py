@@ -32,9 +32,8 @@ from drake_dae import (
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.pictures.motion import contact_paths, follow, frame_times
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.robots import ConstraintWrenches, tangents
 from drake_dae.robots.surfaces import surfaces
-from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.scene.surroundings import diagonal, scene_points
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]

@@ -11,8 +11,8 @@ from runs import scenario
 
 from drake_dae import Record, build_scenario, load_scenario, sweep
 from drake_dae.cli import main
+from drake_dae.diagrams.record import phase_spans
 from drake_dae.errors import ScenarioError
-from drake_dae.running.phases import phase_spans
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario

@@ -36,7 +36,7 @@ class ContactGains:
         position_rate: p, the distance of the poles of position outputs from 0.
         force_gain: The gain of the integral of the force's error.
         constraint_damping: The poles of the constraint's rate; 0 for none.
-        observer_rate: k_o of the `DisturbanceObserver`.
+        observer_rate: k_o of the `StateEstimator`.
         observer_force_rate: The rate k_n of this observer in the directions of the constraint's
             reaction.
         friction_rate: The rate at which the observer identifies friction.

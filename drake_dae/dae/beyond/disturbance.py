@@ -33,7 +33,7 @@ def with_disturbance(
 
     where S holds the rows of some states: for a robot its velocities, so that d is a generalized
     force. A law for this system compensates d and the named coefficients of friction, which come
-    through the port `exogenous` of its controller; see `DisturbanceObserver`. With d = 0 it is the
+    through the port `exogenous` of its controller; see `StateEstimator`. With d = 0 it is the
     law of the original system.
 
     Args:

@@ -199,7 +199,7 @@ Update = Callable[[FloatArray, FloatArray, FloatArray], Rows]
 def _observed(
     rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
 ) -> tuple[Known, Update]:
-    """A `DisturbanceObserver`: the estimates that the law reads, and its next state."""
+    """With exact velocities: the estimates that the law reads, and the next state."""
     gain = -np.expm1(-rates.observer_rate * period)
 
     def estimates(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
@@ -215,7 +215,7 @@ def _observed(
 def _estimated(
     rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
 ) -> tuple[Known, Update]:
-    """A `StateEstimator`: the same; q, w and a are its prediction."""
+    """With a state_rate: the same; q, w and a are the prediction."""
     ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
     assert rates.state_rate is not None
     observer = _filter(rates.state_rate, rates.observer_rate, period, ratio)

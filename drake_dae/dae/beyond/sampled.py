@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, number, numbers, positive, vector
+from drake_dae.dae.law_model import acting_late
 from drake_dae.dae.linearization import ComplexArray, Linearization, linearize, linearize_loop
-from drake_dae.dae.tracking.model_of_law import acting_late
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 
 _SAME = 1e-9

@@ -159,32 +159,24 @@ class PinnedSet:
     def state(self, guess: FloatArray) -> FloatArray:
         """Returns a state near a guess, to round-off, or raises InconsistentStateError."""
         system = self.outputs.system
-        name, outputs = system.name, self.describe()
         state, converged = self.project(guess)
         if converged:
             return state
         residual = self.residual(state)
-        if not np.all(np.isfinite(residual)):
-            raise InconsistentStateError(
-                f"{name}: {outputs} have no value near the given state; start inside the domain "
-                "of the system",
-                residual,
-            )
-        # The remaining distances, if these are small.
         length = np.linalg.norm(self.gradients(state) * system.scale, axis=1)
         missed = np.abs(residual) / np.where(length > 0.0, length, 1.0)
         worst = int(np.argmax(missed))
-        if missed[worst] <= CONSISTENT:
-            raise InconsistentStateError(
-                f"{name}: {outputs} lead to x = {show(state)}, where A(x) or B(x) is singular",
-                residual,
+        if not np.all(np.isfinite(residual)):
+            why = "have no value near the given state; start inside the domain of the system"
+        elif missed[worst] <= CONSISTENT:
+            why = f"lead to x = {show(state)}, where A(x) or B(x) is singular"
+        else:
+            why = (
+                f"are not reached near the given state: {self.outputs.residual_signals[worst].name}"
+                f" stays off by {residual[worst]:.3g}. Request outputs within reach, or start "
+                "closer to a state with these outputs"
             )
-        raise InconsistentStateError(
-            f"{name}: {outputs} are not reached near the given state: "
-            f"{self.outputs.residual_signals[worst].name} stays off by {residual[worst]:.3g}. "
-            "Request outputs within reach, or start closer to a state with these outputs",
-            residual,
-        )
+        raise InconsistentStateError(f"{system.name}: {self.describe()} {why}", residual)
 
     def project(self, start: FloatArray) -> tuple[FloatArray, bool]:
         """Returns the closest state to a start, and whether Newton's method converged."""
@@ -201,11 +193,8 @@ class PinnedSet:
 
     def describe(self) -> str:
         """Returns the outputs as text."""
-        signals, values = (
-            self.outputs.system.output_signals,
-            self.outputs.layout.values(self.reference),
-        )
-        pairs = zip(signals, values, strict=True)
+        values = self.outputs.layout.values(self.reference)
+        pairs = zip(self.outputs.system.output_signals, values, strict=True)
         return "the outputs " + ", ".join(f"{signal.name} = {v:.6g}" for signal, v in pairs)
 
     def residual(self, state: FloatArray) -> FloatArray:

@@ -14,10 +14,10 @@ import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, vector
+from drake_dae.dae.equilibria import ComplexArray, Verdict, eigenvalues_of
 from drake_dae.dae.manifold import tangent
-from drake_dae.dae.zero_dynamics.pinned_motion import GROWN, PinnedMotion, TimeFunction
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedSet
-from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict, eigenvalues_of
+from drake_dae.dae.pinned_motion import GROWN, PinnedMotion, TimeFunction
+from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedSet
 from drake_dae.errors import ModelError
 from drake_dae.trace.expressions import result_of
 

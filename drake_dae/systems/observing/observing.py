@@ -10,7 +10,7 @@ from drake_dae.errors import ModelError
 @checked(ModelError)
 @dataclass(frozen=True)
 class Observing:
-    """The rates of a `DisturbanceObserver` or `StateEstimator`, and its thresholds for friction.
+    """The rates of a `StateEstimator`, and its thresholds for friction.
 
     Attributes:
         rate: k_o in 1/s, the rate of disturbances along the free directions.

@@ -1,10 +1,9 @@
-"""The frames of a MultibodyPlant, by name, on the links that carry them."""
+"""The frames of a MultibodyPlant, by name, on the links that carry them; outlines of bodies."""
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,47 +20,20 @@ from pydrake.multibody.tree import (
     default_model_instance,
 )
 
-from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.joints import ElementaryJoints, constant_pose, elementary_joints
+from drake_dae.robots.links.joints import constant_pose
+from drake_dae.robots.links.links import Outline
 from drake_dae.robots.links.tree import TreeLink, link_poses
 
 MOST_CORNERS = 200
 """The largest number of points of a mesh."""
 
 
-class Outline(NamedTuple):
-    """Points of a link in one of its frames, m, shape (k, 3), and a radius around them in m."""
-
-    name: str
-    frame: Any
-    points: FloatArray = np.zeros((1, 3))
-    radius: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class OneJoint:
-    """A joint with one position.
-
-    Attributes:
-        child, parent: Names of its bodies' frames.
-        frame: Its frame on the child.
-        elementary: Its elementary joints; directions are the same in its frames on both bodies.
-    """
-
-    child: str
-    parent: str
-    frame: Frame
-    elementary: ElementaryJoints
-
-
 class PlantFrames:
-    """The frames of a plant, each fixed to a link of its tree.
+    """The frames of a finalized plant, each fixed to a link of its tree.
 
-    Args:
-        plant: A finalized plant.
-        links: Its tree, parents before children; the world is link 0.
-        bodies: Index of a body -> its link, and its constant pose in that link.
+    `bodies` is the index of a body -> its link, and its constant pose in that link.
     """
 
     def __init__(
@@ -70,9 +42,7 @@ class PlantFrames:
         links: Sequence[TreeLink],
         bodies: dict[int, tuple[int, RigidTransform]],
     ) -> None:
-        self._plant = plant
-        self._links = links
-        self._bodies = bodies
+        self.plant, self._links, self._bodies = plant, links, bodies
         self._poses: dict[int, tuple[ca.SX, ca.SX]] = {}
 
     def find(self, frame: str | Frame) -> Frame:
@@ -81,8 +51,8 @@ class PlantFrames:
         Raises:
             ModelError: No frame, or more than one, has that name; or it belongs to another plant.
         """
-        resolved = frame_named(self._plant, frame) if isinstance(frame, str) else frame
-        if resolved.GetParentPlant() is not self._plant:
+        resolved = frame_named(self.plant, frame) if isinstance(frame, str) else frame
+        if resolved.GetParentPlant() is not self.plant:
             raise ModelError(f"frame '{resolved.name()}' belongs to another plant")
         return resolved
 
@@ -105,33 +75,12 @@ class PlantFrames:
         """R_WL, shape (3, 3), and p_WL in m, shape (3, 1), of every link."""
         return link_poses(self._links)
 
-    def joint_at(self, position: int) -> "OneJoint | None":
-        """The joint whose only position has an index in q; None if it has several."""
-        plant = self._plant
-        for index in plant.GetJointIndices():
-            joint = plant.get_joint(index)
-            if joint.num_positions() == 1 and joint.position_start() == position:
-                return OneJoint(
-                    frame_name(plant, joint.child_body().body_frame()),
-                    frame_name(plant, joint.parent_body().body_frame()),
-                    joint.frame_on_child(),
-                    elementary_joints(plant, joint),
-                )
-        return None
-
 
 def body_with_frame(plant: MultibodyPlant, name: str) -> tuple[RigidBody, RigidTransform]:
-    """A body for a constraint of Drake, and the pose of a frame in it.
+    """A body of a plant that is not finalized, for a constraint of Drake, and a frame's pose in it.
 
     Drake 1.51 ends the process at a constraint with the world, but not at one with a body that is
     welded to the world. So a frame of the world is put on such a body, which is added.
-
-    Args:
-        plant: A plant that is not finalized.
-        name: The name of the frame.
-
-    Raises:
-        ModelError: No frame, or more than one, has that name.
     """
     frame = frame_named(plant, name)
     body, pose = frame.body(), frame.GetFixedPoseInBodyFrame()
@@ -164,29 +113,13 @@ def frame_named(plant: MultibodyPlant, name: str) -> Frame:
 
 
 def position_of(pose: tuple[ca.SX, ca.SX], point: ArrayLike) -> ca.SX:
-    """p_W in m of a point that is fixed in a frame with this pose, shape (3, 1).
-
-    Raises:
-        ModelError: The point is not three finite numbers.
-    """
+    """p_W in m of a point that is fixed in a frame with this pose, shape (3, 1)."""
     rotation, origin = pose
-    return origin + rotation @ ca.SX(check_point(point))
-
-
-def check_point(point: ArrayLike) -> FloatArray:
-    """The coordinates of a point, shape (3,).
-
-    Raises:
-        ModelError: It is not three finite numbers.
-    """
-    offset = numbers("a point", point)
-    if offset.shape != (3,) or not np.all(np.isfinite(offset)):
-        raise ModelError(f"a point has 3 finite coordinates, got {point!r}")
-    return offset
+    return origin + rotation @ ca.SX(vector("a point", point, 3))
 
 
 def frame_name(plant: MultibodyPlant, frame: Frame) -> str:
-    """The name by which `PlantFrames` finds a frame."""
+    """The name by which `frame_named` finds a frame."""
     if frame is plant.world_frame():
         return "world"
     frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
@@ -235,9 +168,8 @@ def _corners(shape: object) -> tuple[FloatArray, float]:
         case Sphere():
             return np.zeros((1, 3)), shape.radius()
         case Capsule():
-            return np.linspace(
-                [0.0, 0.0, -0.5], [0.0, 0.0, 0.5], 9
-            ) * shape.length(), shape.radius()
+            end = np.array([0.0, 0.0, 0.5]) * shape.length()
+            return np.linspace(-end, end, 9), shape.radius()
         case Cylinder():
             turns = np.pi * np.arange(16) / 8
             ring = shape.radius() * np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])

@@ -14,20 +14,22 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, show, vector
-from drake_dae.dae.structure import Structure, structure_of
-from drake_dae.dae.system import DaeSystem
-from drake_dae.dae.zero_dynamics.equilibria import AT_REST, ISOLATED, Equilibria
-from drake_dae.dae.zero_dynamics.floquet import PeriodicMotions, StabilityAlong
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion, TimeFunction, follow
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedSet
-from drake_dae.dae.zero_dynamics.stability import (
+from drake_dae.dae.equilibria import (
+    AT_REST,
+    ISOLATED,
     ComplexArray,
+    Equilibria,
     Stability,
     Verdict,
     judge,
     linearized_eigenvalues,
     without_dynamics,
 )
+from drake_dae.dae.floquet import PeriodicMotions, StabilityAlong
+from drake_dae.dae.pinned_motion import PinnedMotion, TimeFunction, follow
+from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedSet
+from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 
 
@@ -35,11 +37,8 @@ class Exogenous(Protocol):
     """A `Reference` of an exogenous signal."""
 
     @property
-    def size(self) -> int:
-        """The number of its signals."""
-
-    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]:
-        """Returns the function of the time with the signals and their derivatives."""
+    def size(self) -> int: ...
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]: ...
 
 
 @checked(ModelError)

@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # SciPy loads its large parts when they are used.
 
 from drake_dae.arrays import FloatArray, numbers, show
-from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
+from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.expressions import result_of
 
@@ -69,7 +69,16 @@ class MotionEnd:
 
 @dataclass(frozen=True, eq=False)
 class PinnedMotion:
-    """The motion with the outputs on a reference, until the last time or until it ends."""
+    """The motion with the outputs on a reference, until the last time or until it ends.
+
+    Attributes:
+        times: The times in s, shape (k,).
+        states, controls, constraint_inputs, parameters: x, u, v and the values of all parameters,
+            shapes (k, n), (k, p), (k, m), ...
+        constraint_margins, control_margins: The smallest singular values of A(x) and B(x), shape
+            (k,).
+        ending: Why it ends before the last time; None if it does not.
+    """
 
     times: FloatArray
     states: FloatArray
@@ -79,6 +88,14 @@ class PinnedMotion:
     constraint_margins: FloatArray
     control_margins: FloatArray
     ending: MotionEnd | None
+
+
+class _Ended(Exception):
+    """Raised where a motion ends."""
+
+    def __init__(self, *values: object) -> None:
+        self.ending = MotionEnd(*values)  # type: ignore[arg-type]
+        super().__init__(self.ending.text)
 
 
 def follow(
@@ -116,14 +133,6 @@ def follow(
     )
 
 
-class _Ended(Exception):
-    """Raised where a motion ends."""
-
-    def __init__(self, *values: object) -> None:
-        self.ending = MotionEnd(*values)  # type: ignore[arg-type]
-        super().__init__(self.ending.text)
-
-
 class _Follower:
     """Follows a reference from point to point; raises _Ended where the motion ends."""
 
@@ -136,9 +145,8 @@ class _Follower:
         guess: FloatArray,
     ) -> None:
         self._pinned, self._reference, self._parameters = pinned, reference, parameters
-        self._times, self._time = times, times[0]
+        self._system, self._times, self._time = pinned.system, times, times[0]
         self._remaining = MOST_STEPS + len(times)
-        self._name = pinned.system.name
         first, when = self._at(self._time), f"t = {self._time:.6g} s"
         try:
             start = first.state(guess)
@@ -146,11 +154,8 @@ class _Follower:
             raise _Ended(EndCause.NO_START, self._time, f"{error} ({when})") from error
         self._last = first.point(start)
         if first.flaw(self._last):
-            text = (
-                f"{self._name}: at the start, {when}, x = {show(start)}, A(x) or B(x) is singular, "
-                "or the domain of the system ends"
-            )
-            raise _Ended(EndCause.SINGULAR_START, self._time, text, start)
+            text = f"at the start, {when}, x = {show(start)}: {EndCause.SINGULAR_START.value}"
+            raise self._stop(EndCause.SINGULAR_START, text)
         self._largest = self._last.margins
 
     def points(self) -> Iterator[PinnedPoint]:
@@ -180,7 +185,7 @@ class _Follower:
 
     def _integrate(self) -> Iterator[PinnedPoint]:
         """Continues with zero dynamics, by an implicit integrator, since they may be stiff."""
-        scale = self._pinned.system.scale
+        scale = self._system.scale
         bound = GROWN * max(1.0, float(np.max(np.abs(self._last.state) / scale)))
         integrator = None
         for end in self._times[1:]:
@@ -193,7 +198,7 @@ class _Follower:
                     raise self._end(0.1 * interval)
                 worst = int(np.argmax(np.abs(integrator.y) / scale))
                 if abs(integrator.y[worst]) > bound * scale[worst]:
-                    name = self._pinned.system.state_signals[worst].name
+                    name = self._system.state_signals[worst].name
                     value = f"{name} = {integrator.y[worst]:.3g} at t = {integrator.t:.6g} s"
                     raise self._stop(EndCause.UNBOUNDED, f"{EndCause.UNBOUNDED.value}: {value}")
                 if self._reach(integrator.t, integrator.y):
@@ -207,9 +212,6 @@ class _Follower:
     def _integrator(self, end: float, step: float | None = None) -> "scipy.integrate.Radau":
         """An integrator of x' = f* + h* u from the last point."""
 
-        def rate(time: float, state: FloatArray) -> FloatArray:
-            return self._at(time).rate(state)
-
         def slopes(time: float, state: FloatArray) -> FloatArray:
             matrix = self._at(time).slopes(state)
             if not np.all(np.isfinite(matrix)):
@@ -217,32 +219,31 @@ class _Follower:
             return matrix
 
         return scipy.integrate.Radau(
-            rate,
+            lambda time, state: self._at(time).rate(state),
             self._time,
             self._last.state,
             end,
             rtol=TOLERANCE,
-            atol=0.01 * TOLERANCE * self._pinned.system.scale,
+            atol=0.01 * TOLERANCE * self._system.scale,
             jac=slopes,
             first_step=step,
         )
 
     def _at(self, time: float) -> PinnedSet:
-        """Returns Z(R) at a time; the motion ends where R is not finite."""
-        layout = self._pinned.layout
+        """Z(R) at a time; the motion ends where R is not finite."""
+        layout, cause = self._pinned.layout, EndCause.REFERENCE_NOT_FINITE
         try:
             value = result_of("reference", self._reference, time)
             goal = numbers(f"reference({time:g})", value).reshape(-1)
         except NonFiniteError as error:
-            raise _Ended(EndCause.REFERENCE_NOT_FINITE, time, str(error)) from error
+            raise _Ended(cause, time, str(error)) from error
         if goal.size != layout.reference_size:
             raise ModelError(
-                f"{self._name}: the reference must have size {layout.reference_size} (each output "
-                f"and its derivatives up to its degree {layout.degrees}), got {goal.size}"
+                f"{self._system.name}: the reference must have size {layout.reference_size} (each "
+                f"output and its derivatives up to its degree {layout.degrees}), got {goal.size}"
             )
         if not np.all(np.isfinite(goal)):
-            text = f"{self._name}: the reference is not finite at t = {time:.6g} s"
-            raise _Ended(EndCause.REFERENCE_NOT_FINITE, time, text)
+            raise _Ended(cause, time, f"{self._system.name}: {cause.value} at t = {time:.6g} s")
         return self._pinned.at(goal, self._parameters(time))
 
     def _reach(self, time: float, state: FloatArray) -> bool:
@@ -250,11 +251,11 @@ class _Follower:
         last = self._last
         self._remaining -= 1
         if self._remaining < 0:
-            text = f"after {MOST_STEPS} steps the motion is at t = {self._time:.6g} s: it is too"
-            raise self._stop(EndCause.TOO_FAST, f"{text} fast to be followed")
+            text = f"after {MOST_STEPS} steps, at t = {self._time:.6g} s: {EndCause.TOO_FAST.value}"
+            raise self._stop(EndCause.TOO_FAST, text)
         pinned = self._at(time)
         projected, converged = pinned.project(state)
-        near = JUMP * np.maximum(self._pinned.system.scale, np.abs(last.state)) + np.abs(
+        near = JUMP * np.maximum(self._system.scale, np.abs(last.state)) + np.abs(
             state - last.state
         )
         if not converged or np.any(np.abs(projected - state) > near):
@@ -271,8 +272,8 @@ class _Follower:
             raise self._end(0.1 * interval)
 
     def _end(self, ahead: float) -> _Ended:
-        """Returns why the motion ends at the last point, also by the reference `ahead` seconds."""
-        last, system = self._last, self._pinned.system
+        """Why the motion ends at the last point, also by the reference `ahead` seconds."""
+        last, system, when = self._last, self._system, f"at t = {self._time:.6g} s"
         shares = [
             now / largest if largest < np.inf else 1.0
             for now, largest in zip(last.margins, self._largest, strict=True)
@@ -286,23 +287,17 @@ class _Follower:
             size = np.maximum(1.0, np.abs(last.state) / system.scale)
             rates = np.abs(last.rate) / system.scale * elapsed / size
             worst = int(np.argmax(rates))
+            cause, where = EndCause.NO_WAY_ON, f"{when}, x = {show(last.state)}"
             if rates[worst] > GROWN:
-                rate = f"{system.state_signals[worst].name}' = {last.rate[worst]:.3g}"
-                text = f"{EndCause.UNBOUNDED.value}, within a finite time: {rate} at t = "
-                return self._stop(EndCause.UNBOUNDED, f"{text}{self._time:.6g} s")
-            return self._stop(
-                EndCause.NO_WAY_ON,
-                f"no state that continues the motion is found beyond t = {self._time:.6g} s, x = "
-                f"{show(last.state)}: the reference jumps, or the domain of the system ends",
-            )
+                cause = EndCause.UNBOUNDED
+                where = f"{system.state_signals[worst].name}' = {last.rate[worst]:.3g} {when}"
+            return self._stop(cause, f"{cause.value}: {where}")
         ahead = min(ahead, self._times[-1] - self._time)
         pinned = self._at(self._time + ahead)
         guesses = last.state, last.state + ahead * last.rate
         beyond = any(pinned.project(guess)[1] for guess in guesses)
-        matrix, when = "AB"[which], f"at t = {self._time:.6g} s"
-        singular = (
-            f"{matrix}(x) becomes singular, smallest singular value {last.margins[which]:.2g}"
-        )
+        matrix, margin = "AB"[which], f"{last.margins[which]:.2g}"
+        singular = f"{matrix}(x) becomes singular, smallest singular value {margin}"
         if beyond:
             text = f"{when} {singular}: {EndCause.SINGULAR.value}"
             return self._stop(EndCause.SINGULAR, text, matrix)
@@ -310,5 +305,5 @@ class _Follower:
         return self._stop(EndCause.OUT_OF_REACH, text, matrix)
 
     def _stop(self, cause: EndCause, text: str, matrix: str = "") -> _Ended:
-        """Returns the end of the motion at the last point."""
-        return _Ended(cause, self._time, f"{self._name}: {text}", self._last.state, matrix)
+        """The end of the motion at the last point."""
+        return _Ended(cause, self._time, f"{self._system.name}: {text}", self._last.state, matrix)

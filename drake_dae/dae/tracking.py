@@ -10,14 +10,12 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
+from drake_dae.dae.gains import FeedbackGains, GainDesign
+from drake_dae.dae.law_model import damped
+from drake_dae.dae.law_terms import Deflection, ForceMeasurement, IntegralAction
 from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
-from drake_dae.dae.tracking.deflection import Deflection
-from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
-from drake_dae.dae.tracking.integral import IntegralAction
-from drake_dae.dae.tracking.measured_force import ForceMeasurement
-from drake_dae.dae.tracking.model_of_law import damped
 from drake_dae.errors import GainError, ModelError
 from drake_dae.trace.expressions import result_of
 from drake_dae.trace.functions import TracedFunction
@@ -181,8 +179,7 @@ class TrackingLaw:
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
         """Checks gains, or designs them, for the outputs of this law."""
         names = tuple(signal.name for signal in self.system.output_signals)
-        degrees = self.integral.all_degrees
-        designed = gains
+        degrees, designed = self.integral.all_degrees, gains
         if not isinstance(designed, FeedbackGains):
             designed = result_of("gains", designed, names, degrees, error=GainError)
         if not isinstance(designed, FeedbackGains):
