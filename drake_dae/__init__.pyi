@@ -105,11 +105,9 @@ from .scene import start_meshcat as start_meshcat
 from .analysis.analyze import analyze as analyze
 from .running.simulate import simulate as simulate
 from .running.rollout import rollout as rollout
-from .running import (
-    export_controller as export_controller,
-    write_page as write_page,
-)
+from .running import export_controller as export_controller
 from .pictures import (
+    write_page as write_page,
     plot_runs as plot_runs,
     make_animation as make_animation,
 )

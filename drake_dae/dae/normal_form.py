@@ -179,12 +179,13 @@ class NormalForm:
                 stride /= 2.0
             else:
                 missing = target - self._at(x, p)[0]
+                worst = int(np.argmax(np.abs(missing)))
                 raise InconsistentStateError(
-                    f"{self.system.name}: no way from the guess to the given coordinates: the "
-                    f"search ended at x = {show(x)}, after {reached:.3g} of the way. Start from a "
-                    "guess that is nearer. If the coordinates become dependent there, A(x) of "
-                    "Assumption (2) or B(x) of (16) loses its rank (Theorem 2.1), or xi does not "
-                    "complete the chains any more",
+                    f"{self.system.name}: no way from the guess to the given coordinates: "
+                    f"{self.coordinate_signals[worst].name} does not reach {target[worst]:.6g}; "
+                    f"the search ended at x = {show(x)}. Start from a guess that is nearer. If the "
+                    "coordinates become dependent there, A(x) of Assumption (2) or B(x) of (16) "
+                    "loses its rank (Theorem 2.1), or xi does not complete the chains any more",
                     missing,
                 )
         return x
@@ -244,11 +245,7 @@ def _checked_completion(
     flaw = find_flaw(xi, system.state, system.parameter_symbol, "the state")
     if flaw:
         raise ModelError(f"{system.name}: the completion {flaw}")
-    named = [
-        (signal for j, signal in enumerate(system.state_signals) if ca.is_equal(e, system.state[j]))
-        for e in ca.vertsplit(xi)
-    ]
-    signals = tuple(next(same, Signal(f"xi{i}")) for i, same in enumerate(named))
+    signals = tuple(_signal_of(entry, f"xi{i}", system) for i, entry in enumerate(ca.vertsplit(xi)))
     gradient = ca.jacobian(ca.vertcat(chains, xi), system.state)
     margin = find_margin(samples, gradient)
     if not margin.is_singular:
@@ -271,6 +268,14 @@ def _checked_completion(
         f"completion at x = {show(margin.state)}; choose a function whose differential is not in "
         "their span at this state and around it"
     )
+
+
+def _signal_of(expression: ca.SX, name: str, system: DaeSystem) -> Signal:
+    """The signal of the state that an expression is, or one of a given name."""
+    for signal, state in zip(system.state_signals, ca.vertsplit(system.state), strict=True):
+        if ca.is_equal(expression, state):
+            return signal
+    return Signal(name)
 
 
 def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:

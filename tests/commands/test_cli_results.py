@@ -225,7 +225,7 @@ def test_all_commands_start_at_the_same_state(name, tmp_path, monkeypatch):
         found["export"] = own.get_continuous_state_vector().CopyToVector()
         return []
 
-    monkeypatch.setattr(written, "export_code", kept)
+    monkeypatch.setattr(written, "export_loop", kept)
     settings = ["--set=start={}", "--set=duration=0.01", *BARE]
     assert main(["export", name, *settings, f"--out={tmp_path / 'code'}"]) == 0
     assert main(["simulate", name, *settings, f"--out={tmp_path / 'run'}"]) == 0

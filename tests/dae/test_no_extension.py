@@ -75,22 +75,6 @@ def test_at_rest_another_nominal_control_is_asked_for(make, count):
     assert error.state[make().num_states] == 0.0
 
 
-def test_a_constraint_that_binds_the_control_forever():
-    """No constraint input ever acts on x0' = u, whatever stands before u."""
-    system = DaeSystem.from_functions(
-        2,
-        f=lambda x: [0, 0],
-        g=lambda x: [0, 1],
-        h=lambda x: [1, 0],
-        k=lambda x: x[0],
-        l=lambda x: x[1],
-        m=lambda x: 0,
-    )
-    error = violation(system)
-    assert error.assumption == 2
-    assert "'y0'" in str(error)
-
-
 def test_a_rank_that_changes_from_state_to_state():
     """B = [[1, 0, 0], [1, 0, 0], [1, x3^60, 0]] has rank 2 or, to the eye, 1 around x3 = 1."""
     system = DaeSystem.from_functions(

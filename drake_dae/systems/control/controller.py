@@ -182,6 +182,7 @@ def law_block(law: TrackingLaw, limits: FloatArray, sample_period: float) -> Blo
             "control": system.control_signals,
             "tracking_error": system.output_signals,
             "integral": signals,
+            "parameters": law.parameter_signals,
         },
     )
     if not signals:

@@ -209,6 +209,7 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
             "constraint_force": system.force_signals,
             "constraint_residual": manifold.residual_signals,
             "controlled_output": system.output_signals,
+            "parameters": system.parameter_signals,
         },
     )
 

@@ -7,9 +7,8 @@ from runs import first_quick, mostly_compiled, run_scenario, scenario, some
 
 from drake_dae import build_scenario, rollout
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.running import drake_stepped, start_values
+from drake_dae.running import drake_stepped, export_loop, start_values
 from drake_dae.running.drake_stepped import DrakeSteps
-from drake_dae.running.export.parts import parts_of
 from drake_dae.running.rollout import program_of
 from drake_dae.scenario.rolled import roll_scenario, rollout_times
 
@@ -108,16 +107,16 @@ def test_a_continuous_state_beside_it_is_refused(robot, setting):
         start_values(loop, context)
 
 
-def test_any_diagram_with_such_a_plant_rolls_out_and_is_not_exported():
+def test_any_diagram_with_such_a_plant_rolls_out_and_is_not_exported(tmp_path):
     found = chosen("a law that acts late, at another period", 0.02)
     loop, context = build_scenario(found)
     times = rollout_times(found, loop.plant.time_step)
     (expected,) = rollout(loop, *start_values(loop, context), times)
     (rolled,) = rollout(loop.diagram, *start_values(loop.diagram, context), times)
     assert_allclose(rolled.record["state"], expected.record["state"], rtol=0, atol=0)
-    with pytest.raises(ModelError, match="export"):
-        parts_of(loop.diagram)
-    assert parts_of(loop).compiled is None
+    for refused in (loop, loop.diagram):
+        with pytest.raises(ModelError, match="CompliantPlant"):
+            export_loop(refused, context, "arm", tmp_path)
 
 
 @pytest.mark.slow
