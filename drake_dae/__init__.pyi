@@ -104,7 +104,7 @@ from .diagrams import (
 from .scene import start_meshcat as start_meshcat
 from .analysis import analyze as analyze
 from .running.simulate import simulate as simulate
-from .running.rollout.rollout import rollout as rollout
+from .running.rollout import rollout as rollout
 from .running import export_controller as export_controller
 from .pictures import (
     write_page as write_page,

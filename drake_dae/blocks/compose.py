@@ -74,6 +74,14 @@ def leaf_inputs(system: System, index: int) -> list[Port]:
     return [leaf for inner, port in found for leaf in leaf_inputs(inner, int(port))]
 
 
+def laws_of(systems: Iterable[System]) -> dict[TracedSystem, TracedSystem]:
+    """Plant -> the law whose model it is."""
+    traced = [system for system in systems if isinstance(system, TracedSystem)]
+    laws = {id(system.equations): system for system in traced if system.is_law}
+    plants = [s for s in traced if not s.is_law and id(s.equations) in laws]
+    return {plant: laws[id(plant.equations)] for plant in plants}
+
+
 @dataclass(frozen=True, eq=False)
 class Composed:
     """A part of a diagram as one block.
@@ -190,6 +198,7 @@ def compose(
         held,
         stacked(column),
         start,
+        walk.defaults,
         projection=_projection(states, dynamics),
         scale=np.concatenate([np.zeros(0), *scales]),
         requirements=tuple(r for s in systems for r in dynamics[s].requirements),
@@ -222,6 +231,7 @@ class _Walk:
         self.inputs: dict[str, ca.SX] = {}
         self.cuts: dict[str, Port] = {}
         self.fixed: dict[str, Port] = {}
+        self.defaults: dict[str, ca.SX] = {}
         self.blocks: dict[System, Block | None] = {}
         self.own: dict[System, dict[str, ca.SX]] = {}  # Source -> symbols of this leaf.
         self.values: dict[Port, ca.SX] = {}
@@ -250,15 +260,11 @@ class _Walk:
 
     def _find_twins(self) -> dict[System, System]:
         """Plant -> the law whose model it is, with equal parameters: they share their symbols."""
-        systems = [s for s in self.leaves.systems if isinstance(s, TracedSystem)]
-        laws = {id(s.equations): s for s in systems if s.is_law}
         twins = {}
-        for plant in systems:
-            law = laws.get(id(plant.equations))
-            if law is not None and not plant.is_law:
-                own = self.parameters_of(plant)
-                if np.array_equal(own, self.parameters_of(law)[: own.size]):
-                    twins[plant] = law
+        for plant, law in laws_of(self.leaves.systems).items():
+            own = self.parameters_of(plant)
+            if np.array_equal(own, self.parameters_of(law)[: own.size]):
+                twins[plant] = law
         return twins
 
     def block(self, system: System) -> Block | None:
@@ -336,13 +342,16 @@ class _Walk:
         if place in self.leaves.sources:
             return self.port(self.leaves.sources[place])
         assert block is not None
-        if not port.HasValue(self.local(system)) and name in block.defaults:
-            return self.expressions(system, [block.defaults[name]])[0]
-        if place in self.exported or port.HasValue(self.local(system)):
+        has_value, has_default = port.HasValue(self.local(system)), name in block.defaults
+        if place in self.exported or has_value:
             label = self.exported.get(place, f"{self.name(system)}.{name}")
             if label not in self.inputs:
                 self._new_input(self.fixed, label, place, port.size())
+                if has_default and not has_value:
+                    self.defaults[label] = self.expressions(system, [block.defaults[name]])[0]
             return self.inputs[label]
+        if has_default:
+            return self.expressions(system, [block.defaults[name]])[0]
         if not port.size():
             return NOTHING
         raise ModelError(

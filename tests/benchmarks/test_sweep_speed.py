@@ -8,7 +8,7 @@ import pytest
 from runs import scenario
 
 from drake_dae import sweep
-from drake_dae.running.rollout.run import num_cores
+from drake_dae.blocks.machine import num_cores
 from drake_dae.studies import make_variations
 
 

@@ -12,9 +12,9 @@ import pytest
 from runs import some
 
 from drake_dae import Record, load_scenario
+from drake_dae.blocks.machine import num_cores
 from drake_dae.cli import main
 from drake_dae.commands import written
-from drake_dae.running.rollout.run import num_cores
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.scenario import read_scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios

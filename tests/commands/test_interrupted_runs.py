@@ -14,10 +14,10 @@ import pytest
 from runs import scenario, some
 
 from drake_dae import Record, simulate
+from drake_dae.blocks.interpreted import InterpretedRun
 from drake_dae.cli import main
 from drake_dae.commands.folder import FILES, PART
 from drake_dae.running.interruption import ENDING_SIGNALS
-from drake_dae.running.rollout.stepping.course import RunStepper
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
 
@@ -183,7 +183,7 @@ def test_a_killed_rollout_leaves_its_record_so_far(tmp_path, compiled):
 @pytest.mark.usefixtures("signals_of_a_shell")
 def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys):
     """Ctrl-C after some steps of the integrator: the record goes up to there."""
-    accept = RunStepper.accept
+    accept = InterpretedRun.accept
 
     def and_interrupt(self, *arguments):
         accept(self, *arguments)
@@ -193,7 +193,7 @@ def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys)
     words = ["simulate", "two_link_wall", "--rollout", "--set=compiled=false", "--set=duration=10"]
     words += [f"--set={setting}" for setting in BARE]
     assert main([*words, "--out", str(tmp_path / "whole")]) == 0
-    monkeypatch.setattr(RunStepper, "accept", and_interrupt)
+    monkeypatch.setattr(InterpretedRun, "accept", and_interrupt)
     assert main([*words, "--out", str(tmp_path / "part")]) == 128 + signal.SIGINT
     assert "interrupted" in capsys.readouterr().out
     whole, part = (Record.load(tmp_path / name / "record.npz") for name in ("whole", "part"))

@@ -1,7 +1,6 @@
 """Any DaeSystem as a LeafSystem."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -139,9 +138,6 @@ class DaePlant(ParameterizedSystem, Plant):
     def _constraint_input(self) -> ca.SX:
         derivatives = self.structure.derivatives
         return derivatives.expand(derivatives.constraint_input)  # (25)
-
-    def _shares(self) -> dict[str, Any]:
-        return {"model": self.dae, "check_start": self.check_start}
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))

@@ -1,6 +1,7 @@
-/* real: the numbers of several runs side by side in a vector register.
+/* real: a number, or those of LANES runs side by side in a vector register.
    mask: for each of them, all bits if something holds, else none. */
 
+#ifndef LANES
 #if defined(__AVX512F__)
 #define LANES 8
 #elif defined(__AVX__)
@@ -8,16 +9,36 @@
 #else
 #define LANES 2
 #endif
-
-#if defined(__GNUC__) && !defined(__clang__)
-/* The order in which GCC then puts operations takes 7 per cent less time. */
-#pragma GCC optimize("schedule-insns", "sched-pressure")
 #endif
 
 #include <math.h>
 #include <string.h>
-#define APART __attribute__((noinline))
 #define IN_LINE static inline
+
+#if LANES == 1
+typedef double real;
+typedef long long mask;
+#define AT(vector, lane) (vector)
+#define K(number) (number)
+#define LESS(a, b) (-(mask)((a) < (b)))
+#define NOT_MORE(a, b) (-(mask)((a) <= (b)))
+#define SAME(a, b) (-(mask)((a) == (b)))
+#define CHOOSE(condition, a, b) ((condition) ? (a) : (b))
+#define CHOOSE_MASK(condition, a, b) CHOOSE(condition, a, b)
+IN_LINE int any(mask condition) { return condition != 0; }
+IN_LINE mask none(void) { return 0; }
+IN_LINE real square_root(real x) { return sqrt(x); }
+IN_LINE real magnitude(real x) { return fabs(x); }
+IN_LINE real least(real a, real b) { return fmin(a, b); }
+IN_LINE real most(real a, real b) { return fmax(a, b); }
+IN_LINE mask is_number(real x) { return -(mask)(isfinite(x) != 0); }
+#else
+#define APART __attribute__((noinline))
+#define AT(vector, lane) ((vector)[lane])
+#if defined(__GNUC__) && !defined(__clang__)
+/* The order in which GCC then puts operations takes 7 per cent less time. */
+#pragma GCC optimize("schedule-insns", "sched-pressure")
+#endif
 
 typedef double real __attribute__((vector_size(8 * LANES)));
 typedef long long mask __attribute__((vector_size(8 * LANES)));
@@ -32,6 +53,7 @@ typedef long long mask __attribute__((vector_size(8 * LANES)));
 #define NOT_MORE(a, b) ((mask)((a) <= (b)))
 #define SAME(a, b) ((mask)((a) == (b)))
 #define CHOOSE(condition, a, b) ((real)(((mask)(a) & (condition)) | ((mask)(b) & ~(condition))))
+#define CHOOSE_MASK(condition, a, b) (((a) & (condition)) | ((b) & ~(condition)))
 #define ONE_IF(condition) ((real)((mask)K(1.0) & (condition)))
 #if LANES == 8
 #include <immintrin.h>
@@ -152,3 +174,4 @@ IN_LINE mask is_number(real x) { return SAME(x - x, K(0.0)); }
 IN_LINE real sign(real x) {
   return CHOOSE(LESS(K(0.0), x), K(1.0), CHOOSE(LESS(x, K(0.0)), K(-1.0), x));
 }
+#endif
