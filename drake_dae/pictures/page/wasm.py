@@ -10,11 +10,7 @@ from drake_dae.trace.compiler import compile_webassembly
 
 
 def check_compiler() -> None:
-    """Refuses a page where there is no compiler of WebAssembly.
-
-    Raises:
-        MachineCodeError: zig is not installed.
-    """
+    """Refuses a page where there is no compiler of WebAssembly."""
     if find_spec("ziglang") is None:
         raise MachineCodeError(
             "a page is compiled to WebAssembly by zig, which is not installed: pip install ziglang"
@@ -22,16 +18,10 @@ def check_compiler() -> None:
 
 
 def compiled_loop(source: Path) -> bytes:
-    """A loop in C, of `write_loop`, as WebAssembly that imports nothing.
-
-    The first call on a machine compiles zig's C library as well, which takes half a minute.
-
-    Raises:
-        MachineCodeError: zig fails.
-    """
+    """A loop in C, of `write_loop`, as WebAssembly that imports nothing."""
     source.write_text(in_pieces(source.read_text("utf-8")), "utf-8")
     target = source.with_suffix(".wasm")
-    compile_webassembly([source], target)
+    compile_webassembly(source, target)
     return target.read_bytes()
 
 
