@@ -11,9 +11,8 @@ STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 
 def compile_c(folder, sources, target, *flags: str, compiler: str = "cc") -> str:
     """Compiles as strictly as can be, and links; returns the path of what it made."""
-    strict = STRICT if compiler == "cc" else ["-Wall", "-Wextra", "-Werror"]
     given = [str(folder / source) for source in sources]
-    words = [compiler, *strict, "-ffp-contract=off", *(flags or ("-O1",)), *given]
+    words = [compiler, *STRICT, "-ffp-contract=off", *(flags or ("-O1",)), *given]
     done = subprocess.run(
         [*words, "-o", str(folder / target), "-lm"], capture_output=True, text=True, check=False
     )
