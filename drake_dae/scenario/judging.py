@@ -1,8 +1,7 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, is_dataclass
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -52,7 +51,6 @@ from drake_dae.scenario.model import (
 )
 from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.control.contract import PhaseChange
 from drake_dae.trace.functions import TracedFunction
 
 SAMPLES, MOST_SAMPLES = 1001, 20_000
@@ -70,10 +68,6 @@ BREAK = 0.01
 
 WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
 """The remedy for a link behind a surface."""
-
-AT_ONCE, AWAY = 0.1, 1e-3
-"""A touch within this time of the start of its phase, in s, and as far before the surface, in m, is
-none: a tool does not come that far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,15 +105,10 @@ class Feasibility:
         )
 
     @property
-    def wrong_sides(self) -> tuple[str, ...]:
-        """The problems with links behind a surface."""
-        return tuple(f"{link}: {WRONG_SIDE}" for link in self.behind)
-
-    @property
     def problems(self) -> tuple[str, ...]:
         """The problems, one text each; empty if there are none."""
         found = [*self.analysis.problems, *(str(r.excess) for r in self.ranges if r.excess)]
-        found += [*self.wrong_sides, *filter(None, [self.gains])]
+        found += [*(f"{link}: {WRONG_SIDE}" for link in self.behind), *filter(None, [self.gains])]
         if self.slowing is not None:
             found.append(f"most of all {self.slowing.excess}; {self.slowing.remedy}")
         return tuple(found)
@@ -319,7 +308,6 @@ def judge_run(
             notes.append(f"{constraint.name}: {surface.remark}")
     notes += [_beyond_edge(constraint, model, record) for constraint in model.constraints]
     notes += _remarks([scenario.references, scenario.exogenous, scenario.task])
-    notes += _early_touches(changes)
     ended = failure
     if statistics is not None:
         ended = ended or "interrupted" * (statistics.interrupted is not None)
@@ -390,19 +378,6 @@ def _remarks(value: Any) -> Iterator[str]:
     elif is_dataclass(value):
         for field in fields(value):
             yield from _remarks(getattr(value, field.name))
-
-
-def _early_touches(changes: Sequence[PhaseChange]) -> Iterator[str]:
-    """Touches that a task felt as soon as a phase began, away from the surface."""
-    for before, after in pairwise(changes):
-        lasted, away = after.time - before.time, after.distance
-        touched = after.in_contact > before.in_contact
-        if touched and not after.failed and lasted < AT_ONCE and away > AWAY:
-            yield (
-                f"{before.phase} felt {after.force:.3g} N {1e3 * lasted:.3g} ms after its start, "
-                f"{1e3 * away:.3g} mm before the surface of the model: a bias of the force sensor "
-                "feels like a touch; task.tare_time finds it"
-            )
 
 
 def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:

@@ -9,7 +9,7 @@ from problems import (
     PROBLEMS,
     system_of,
 )
-from problems.found import NO, OPEN, YES, findings
+from problems.found import NO, YES, findings
 from runs import some
 
 from drake_dae.analysis import analyze
@@ -72,31 +72,6 @@ def test_zero_dynamics_that_are_unstable_are_a_problem():
     assert "eigenvalues 1 1/s" in str(analysis)
 
 
-@pytest.mark.slow
-def test_1_a_degree_that_is_not_defined():
-    fields = {
-        "f": lambda x: [0, 0, 0],
-        "h": lambda x: [1, 0, 0],
-        "k": lambda x: x[1] - 1,
-        "l": lambda x: x[0],
-        "m": lambda x: 0,
-    }
-    analysis = analyze(system_of(3, g=lambda x: [0, x[0], 0], **fields))
-    assert findings(analysis) == [NO, OPEN, OPEN, OPEN, OPEN]
-    assert (analysis.constraint_degrees, analysis.index, analysis.structure) == (None, None, None)
-    (problem,) = analysis.problems
-    assert problem.startswith("Assumption (1): ")
-    assert "index ?, N* of dimension ?, zero dynamics of dimension ?" in str(analysis)
-    # Beside the nominal state only, and without a change of sign.
-    beside = system_of(3, g=lambda x: [0, (x[0] - 0.03) ** 2, 0], state_scale=np.ones(3), **fields)
-    find_structure(beside)
-    analysis = analyze(beside)
-    assert findings(analysis) == [NO, OPEN, YES, YES, YES]
-    assert analysis.assumptions[0].margin.state[0] == pytest.approx(0.03, abs=1e-3)
-    assert analysis.constraint_degrees == (1,)
-    assert analysis.structure is not None
-
-
 def nearly_singular(gap: float) -> DaeSystem:
     """B = [[1, 1], [1, 1 + gap + (x2 - 0.3)^2]], whose determinant does not change its sign."""
     return system_of(
@@ -130,32 +105,3 @@ def test_the_least_margin_in_a_region():
         # Flat at the least: 5% of the width away from it costs 1% of the 0.05 there.
         assert margin.singular_value == pytest.approx(least, rel=0.01)
         assert margin.state[2] == pytest.approx(best, abs=0.05)
-
-
-def stretching() -> DaeSystem:
-    """Two massless links of 1 m with unit inertias at their joints, the tip on a rail at (s, 0)."""
-    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
-    phi = ca.vertcat(ca.cos(q[0]) + ca.cos(q[0] + q[1]) - q[2], ca.sin(q[0]) + ca.sin(q[0] + q[1]))
-    jacobian = ca.jacobian(phi, q)
-    return DaeSystem(
-        state=ca.vertcat(q, v),
-        f=ca.vertcat(v, ca.SX.zeros(3)),
-        g=ca.vertcat(ca.SX(3, 2), jacobian.T),
-        h=ca.vertcat(ca.SX(3, 1), ca.SX([0, 0, 1])),
-        k=phi,
-        l=q[2],
-        m=ca.SX(1, 2),
-        nominal_state=[0.9, -1.8, 1.2, 0.0, 0.0, 0.0],
-        name="stretching arm",
-    )
-
-
-@pytest.mark.slow
-def test_an_arm_that_stretches_out():
-    """On N* x1 = -2 x0 and s = 2 cos x0, so s is stationary at x0 = 0 and B vanishes there."""
-    analysis = analyze(stretching(), region={"x1": (-2.5, 0.5)})
-    assert findings(analysis)[:3] == [YES] * 3
-    assert NO in findings(analysis)
-    violated = next(a for a in analysis.assumptions if a.finding is NO)
-    np.testing.assert_allclose(violated.margin.state[:3], [0.0, 0.0, 2.0], atol=2e-3)
-    assert findings(analyze(stretching(), region={"x1": (-2.5, -1.0)})) == [YES] * 5

@@ -91,34 +91,6 @@ def test_what_gravity_needs_at_rest_no_slower_motion_helps():
     assert f"by gravity alone it has {gravity:.4g} N m" in found.reason
 
 
-def test_a_force_that_would_pull_on_a_hump():
-    """N = m (g cos a - R a'^2) on a hump of radius R, at the angle a from its top."""
-    radius, amplitude, frequency, mass = 0.5, 0.8, 8.0, 2.0
-    x, force = ca.SX.sym("x", 4), ca.SX.sym("force")
-    system = DaeSystem(
-        state=x,
-        f=ca.vertcat(x[2:], 0, -9.81),
-        g=ca.vertcat(0, 0, x[:2]) / (radius * mass),
-        h=ca.vertcat(0, 0, x[1], -x[0]) / (radius * mass),
-        k=ca.norm_2(x[:2]) - radius,
-        l=ca.atan2(x[0], x[1]),
-        m=ca.SX(1, 1),
-        nominal_state=np.array([0.1, 0.49, 0.0, 0.0]),
-    )
-    symbols, bounds = (ca.SX.sym("u"), force), np.array([[0.0], [np.inf]])
-    kinds = [LimitKind.FORCE]
-    limits = SignalLimits(system, [Signal("force", "N")], kinds, force, bounds, symbols)
-    references = [SinusoidReference(0.0, amplitude, frequency)]
-    found, _ = judged(find_structure(system), limits, references, [0.0, radius, 0.0, 0.0])
-    angle = amplitude * np.sin(frequency * TIMES)
-    centrifugal = radius * (amplitude * frequency * np.cos(frequency * TIMES)) ** 2
-    normal = mass * (9.81 * np.cos(angle) - centrifugal)
-    assert_allclose(found.excess.value, normal.min(), rtol=1e-9)
-    slower = np.sqrt((9.81 * np.cos(angle) / centrifugal).min())
-    assert slower < 0.8
-    assert_allclose(found.rate, slower, rtol=CLOSE)
-
-
 LINK = """<link name="{name}"><inertial><mass value="{mass}"/>
 <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
 <joint name="{name}" type="prismatic"><parent link="{parent}"/><child link="{name}"/>

@@ -40,20 +40,6 @@ def test_given_states():
     assert analysis.where == "4 consistent states as given"
 
 
-def test_a_zero_at_the_given_state_alone_is_no_degree():
-    """Ball and beam: the control acts on derivative 3 of the position, but not at rest."""
-    beam = DaeSystem.from_functions(
-        ["r", "vr", "th", "w"],
-        f=lambda x: [x[1], x[0] * x[3] ** 2 - 9.81 * ca.sin(x[2]), x[3], 0],
-        h=lambda x: [0, 0, 0, 1],
-        l=lambda x: [x[0]],
-    )
-    analysis = analyze(beam, states=[[0.0, 0.0, 0.0, 0.0]])
-    assert findings(analysis)[3] == NO
-    assert "derivative 3" in analysis.assumptions[3].reason
-    assert analysis.output_degrees is None
-
-
 def test_a_region_is_covered_whatever_the_constraints_move():
     """A point on a circle: B = -y vanishes at (-1, 0) and (1, 0)."""
     circle = DaeSystem.from_functions(
@@ -69,25 +55,6 @@ def test_a_region_is_covered_whatever_the_constraints_move():
     analysis = analyze(circle, region={"x": (-1.1, 1.1)})
     assert np.ptp(analysis.states[:, 0]) > 1.8
     assert NO in findings(analysis)
-
-
-def test_redundant_constraints_have_no_index():
-    """k = (x - 1, 2 x - 2): the dimension of N* is 2, and not n - r_1 - r_2 = 0."""
-    system = DaeSystem.from_functions(
-        ["x", "y", "vx", "vy"],
-        f=lambda s: [s[2], s[3], 0, 0],
-        g=lambda s: [[0, 0], [0, 0], [1, 2], [0, 0]],
-        h=lambda s: [0, 0, 0, 1],
-        k=lambda s: [s[0] - 1, 2 * s[0] - 2],
-        l=lambda s: [s[1]],
-        m=lambda s: [[0, 0]],
-        nominal_state=[1, 0, 0, 0],
-    )
-    analysis = analyze(system)
-    assert findings(analysis)[1] == NO
-    assert analysis.constraint_degrees == (2, 2)
-    assert (analysis.index, analysis.manifold_dimension) == (None, None)
-    assert "index ?, N* of dimension ?" in str(analysis)
 
 
 def circle() -> Manifold:

@@ -11,22 +11,17 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 from numpy.testing import assert_allclose
-from runs import some
 
 from drake_dae import (
     ConstantReference,
     DaeSystem,
     SinusoidReference,
     TrackingLaw,
-    build_scenario,
-    load_scenario,
     poles,
-    simulate,
 )
 from drake_dae.dae import contact_damping
 from drake_dae.errors import AdviceWarning, ModelError
 from drake_dae.references import stack_references
-from drake_dae.scenario.shipped import find_scenario
 
 STIFFNESS, MASS = 1e4, 2.0
 
@@ -106,44 +101,6 @@ def test_a_force_that_changes_is_followed_with_the_error_derived():
     gain = (STIFFNESS / MASS) / (STIFFNESS / MASS + 1j * speed * c - speed**2) - 1.0
     exact = 5.0 * np.imag(gain * np.exp(1j * speed * times[late]))
     assert_allclose(error, exact, atol=2e-5)
-
-
-@pytest.mark.parametrize(
-    "name",
-    some(
-        [
-            "two_link_wall",
-            pytest.param("seven_joint_wall", marks=pytest.mark.slow),
-            pytest.param("two_link_flexible", marks=pytest.mark.slow),
-            pytest.param("two_link_hydraulics", marks=pytest.mark.slow),
-            pytest.param("seven_joint_moving_plate", marks=pytest.mark.slow),
-            pytest.param("cart_wall", marks=pytest.mark.slow),
-        ]
-    ),
-)
-def test_on_an_ideal_plant_nothing_changes_but_round_off(name):
-    """The plant stays on N* to 1e-15 at each step, which c = 100 / s makes 1e-12 of what it gets.
-
-    Inside of a step the stages leave N* by the integrator's error. So steps are short.
-    """
-    records = []
-    for settings in ([], ["law.constraint_damping={all: [-100.0]}"]):
-        scenario = load_scenario(
-            find_scenario(name),
-            [
-                "duration=0.2",
-                "integrator={integration_scheme: runge_kutta5, max_step_size: 1e-3, "
-                "use_error_control: false}",
-                *settings,
-            ],
-        )
-        loop, context = build_scenario(scenario)
-        simulate(loop.diagram, context, 0.2, scenario.integrator)
-        records.append(loop.record(context))
-    for signal in ("controlled_output", "control", "state"):
-        one, other = (record[signal] for record in records)
-        scale = np.abs(one).max(axis=0) + 1e-3 * np.abs(one).max()
-        assert np.abs((one - other) / scale).max() < 1e-9
 
 
 # Advice.

@@ -66,36 +66,6 @@ def with_inertia(arm: DaeSystem, **fields) -> DaeSystem:
     )
 
 
-def test_a_robot_with_a_mass_matrix():
-    problem = PROBLEMS["two_link_arm"]()
-    system = with_inertia(problem.system)
-    explicit = system.explicit
-    assert explicit.explicit is explicit
-    assert system.explicit is explicit
-    numbers = TracedFunction(
-        "fields",
-        {"x": system.state},
-        {
-            "found": ca.horzcat(explicit.f, explicit.g, explicit.h),
-            "by_hand": ca.horzcat(problem.system.f, problem.system.g, problem.system.h),
-        },
-    )
-    structure = find_structure(system)
-    law = TracedFunction(
-        "law", {"x": system.state}, {"a": structure.drift, "b": structure.control_matrix}
-    )
-    random = np.random.default_rng(0)
-    for _ in range(3):
-        state = problem.consistent(random)
-        # The inertia matrix has a condition of 10, its inverse is taken twice.
-        np.testing.assert_allclose(*numbers(state), rtol=1e-12, atol=1e-12)
-        drift, control_matrix = law(state)
-        np.testing.assert_allclose(drift, problem.known(state).drift, rtol=1e-11)
-        np.testing.assert_allclose(
-            control_matrix, problem.known(state).control_matrix, rtol=1e-11, atol=1e-12
-        )
-
-
 def test_the_implicit_form_may_be_given_in_fewer_operations():
     arm = PROBLEMS["two_link_arm"]().system
     plain = with_inertia(arm)

@@ -95,22 +95,6 @@ def test_no_equilibrium_is_reported():
     np.testing.assert_allclose(still.eigenvalues, [0.0, 0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("rate", "nominal"),
-    [(lambda x: -(x**2), 0.1), (lambda x: ca.cos(x) - 1, 0.3), (lambda x: 0 * x, 0.2)],
-)
-def test_an_equilibrium_that_is_found_slowly_decides_nothing(rate, nominal):
-    """Its eigenvalue is 0, and Newton's method ends where it is only near 0."""
-    system = DaeSystem.from_functions(
-        ["y", "xi"],
-        f=lambda x: [0, rate(x[1])],
-        h=lambda x: [1, 0],
-        l=lambda x: [x[0]],
-        nominal_state=[0.0, nominal],
-    )
-    assert ZeroDynamics(system).stability().verdict is Verdict.UNDECIDED
-
-
 def test_a_clock_among_the_states_is_reported():
     """A force beside c' = 1, held through a matrix whose round-off was divided by: z1 = 3e13."""
     system = DaeSystem.from_functions(

@@ -80,8 +80,6 @@ def test_mixed_controls_by_hand():
     assert extension.system.nominal_state[3] == pytest.approx(3.0, rel=1e-15)
 
 
-# Turned at random, they have sums that cancel to nothing much above round-off.
-@pytest.mark.filterwarnings("ignore::drake_dae.errors.NegligibleWarning")
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", some(range(12), of=4))
 def test_hidden_integrators_are_found(seed):

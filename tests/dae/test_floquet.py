@@ -163,25 +163,6 @@ def test_multipliers_with_a_constraint():
     assert found.verdict is Verdict.UNSTABLE
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("rate", "size"), [(3.3, 0.3), (2.0, 0.0)])
-def test_a_limit_cycle_without_the_period_of_the_reference_is_not_called_stable(rate, size):
-    """The oscillator of FitzHugh and Nagumo, weakly driven; near it only its focus repeats.
-
-    The multipliers at the focus, without a drive, are exp(P l) with its eigenvalues l.
-    """
-    system = oscillator(
-        lambda s, w, z: 3.0 * (1 - s**2) * w - s + 0.9 + z,
-        start=(2.0, 0.0),
-    )
-    found = along(system, sinusoid(rate, size), 2 * np.pi / rate, count=241)
-    assert found.verdict is not Verdict.STABLE
-    if found.multipliers.size and not size:
-        slopes = np.array([[0.0, 1.0], [-1.0, 3.0 * (1 - 0.9**2)]])
-        expected = np.exp(2 * np.pi / rate * np.linalg.eigvals(slopes))
-        np.testing.assert_allclose(by_size(found.multipliers), by_size(expected), rtol=1e-5)
-
-
 def test_multipliers_on_the_unit_circle_do_not_decide():
     """s'' = -s + z at rate 2: an oscillator without damping, multipliers exp(+- i pi)."""
     found = along(oscillator(lambda s, w, z: -2.0 * s + z), sinusoid(2.0), np.pi)

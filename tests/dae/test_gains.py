@@ -29,15 +29,6 @@ def test_the_error_dynamics_have_the_chosen_poles(chosen):
     np.testing.assert_allclose(gains.matrix[0, ::-1], np.poly(chosen)[1:].real, rtol=1e-14)
 
 
-def test_coefficients_stand_lowest_derivative_first():
-    gains = gain_coefficients([6.0, 5.0])(["a", "b"], [2, 2])
-    np.testing.assert_array_equal(gains.matrix, [[6, 5, 0, 0], [0, 0, 6, 5]])
-    # s^2 + 5 s + 6 = (s + 2)(s + 3).
-    np.testing.assert_allclose(sorted_poles(gains.poles), [-3, -3, -2, -2], rtol=1e-14)
-    single = gain_coefficients({"a": [3.0], "c": 4.0})(["a", "b", "c"], [1, 0, 1])
-    np.testing.assert_array_equal(single.matrix, [[3, 0], [0, 0], [0, 4]])
-
-
 LAMBDA_1 = np.array([[30.0, 4.0, 1.0], [-5.0, 25.0, 2.0], [3.0, 1.0, 20.0]])
 LAMBDA_2 = np.array([[11.0, 2.0, 0.0], [1.0, 10.0, -2.0], [0.5, 1.0, 9.0]])
 

@@ -4,9 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems import PROBLEMS, Problem, pendulum, system_of
-from runs import scenario
 
-from drake_dae import build_scenario
 from drake_dae.dae import DaeSystem, Manifold, Signal, find_constraint_structure, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError
 
@@ -129,27 +127,6 @@ def test_a_given_start_is_settled_level_by_level():
     )
     assert np.abs(manifold.project(wrong)[:2] - wrong[:2]).max() > 1e-10
     assert np.max(np.abs(manifold.residual(found))) < 1e-13
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["two_arms", "four_bar"])
-def test_the_gradient_in_fewer_operations_is_the_gradient(name):
-    """Also off the manifold. Two arms have less than half of the operations."""
-    loop, _ = build_scenario(scenario(name))
-    manifold = loop.plant.structure.manifold
-    short, whole = manifold.short_gradient, manifold.gradient
-    assert short is not whole
-    state, system = manifold.system.state, manifold.system
-    inputs = [state, system.parameter_symbol]
-    functions = [ca.Function("C", inputs, [ca.cse(each)]) for each in (short, whole)]
-    counts = [each.n_instructions() for each in functions]
-    assert counts[0] < {"two_arms": 0.5, "four_bar": 1.0}[name] * counts[1]
-    random = np.random.default_rng(2)
-    for _ in range(5):
-        x = system.nominal_state + 0.3 * random.standard_normal(system.num_states)
-        found, wanted = (each(x, system.parameter_values).full() for each in functions)
-        # Sums of some ten products of order 1.
-        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-13)
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-15, 1e-9, 1e-6])

@@ -7,7 +7,6 @@ from problems import (
     PROBLEMS,
     changed,
     hidden_normal_form,
-    in_other_units,
 )
 from problems.found import degrees, untidy_one, violation
 from runs import some
@@ -72,40 +71,6 @@ def with_mass_matrix(system: DaeSystem, mass: ca.SX) -> DaeSystem:
         h=ca.mtimes(mass, system.h),
         mass_matrix=mass,
     )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(5), of=5))
-@pytest.mark.parametrize("problem", some(PROBLEMS, of=3), indirect=True)
-def test_units_do_not_matter(problem, seed):
-    """Every state, input and output in its own unit, from 1e-4 to 1e4 of the original one.
-
-    A dense mass matrix fills all zeros with round-off.
-    """
-    random = np.random.default_rng(seed)
-    # The nearest consistent state depends on the units: start from a consistent one.
-    system = changed(problem.system, nominal_state=problem.consistent(random))
-    counts = (
-        system.num_states,
-        system.num_constraints,
-        system.num_controls,
-        system.num_constraints,
-        system.num_controls,
-    )
-    factors = [10 ** random.uniform(-4, 4, count) for count in counts]
-    other = in_other_units(system, *factors)
-    bend = 2 + ca.sin(other.state[0] * factors[0][0])
-    dense = with_mass_matrix(
-        other,
-        bend * (positive_definite(random, system.num_states) * np.outer(factors[0], factors[0])),
-    )
-    for one in (other, dense):
-        structure = find_structure(one, spread=0.01 / factors[0])
-        assert structure.constraint_degrees == problem.constraint_degrees
-        assert structure.output_degrees == problem.output_degrees
-    # The same matrix except for scaling; the equilibration is not quite unique.
-    relative = find_structure(system, spread=0.01).control_margin.relative
-    assert structure.control_margin.relative == pytest.approx(relative, rel=0.9)
 
 
 @pytest.mark.slow

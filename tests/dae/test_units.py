@@ -62,14 +62,3 @@ def test_twenty_four_systems_of_units_have_one_answer(name):
         assert found == expected
         # The held outputs are those at a nominal state that sizes, known to 1e-6, helped to find.
         np.testing.assert_allclose(values, known, rtol=1e-5, atol=1e-7)
-
-
-def test_a_scale_that_is_not_given_is_that_of_the_nominal_state_or_one():
-    system = DaeSystem.from_functions(
-        3,
-        f=lambda x: [x[1], 0, -x[2]],
-        h=lambda x: [0, 1, 0],
-        l=lambda x: x[0],
-        nominal_state=[0.0, -300.0, 1e-5],
-    )
-    np.testing.assert_array_equal(system.scale, [1.0, 300.0, 1.0])

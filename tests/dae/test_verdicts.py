@@ -90,33 +90,6 @@ def test_what_only_falls_is_no_equilibrium(name, others):
     assert dynamics.stability().verdict is not Verdict.STABLE
 
 
-DEGENERATE = {
-    "cubic": (lambda a: -(a**3), []),
-    "fifth": (lambda a: -(a**5), []),
-    "square": (lambda a: -(a**2), []),
-    "elsewhere": (lambda a: -((a - 0.3) ** 3), []),
-    "one of each kind": (lambda a: -(a**3) * (a - 2), [2.0]),
-    "uneven": (lambda a: -(a**3) + 0.1 * a**4, [10.0]),
-}
-"""Rates, and where they are zero with a slope."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", some(DEGENERATE, of=3))
-@pytest.mark.parametrize("others", [0, pytest.param(1, marks=pytest.mark.thorough)])
-def test_a_zero_without_a_slope_is_no_equilibrium(name, others):
-    rate, places = DEGENERATE[name]
-    more = [lambda *_: [], lambda a, b, z: [-b]][others]
-    dynamics = ZeroDynamics(beside(lambda *x: [rate(x[0]), *more(*x)], 1 + others))
-    random = np.random.default_rng(0)
-    guesses = np.zeros((25, 2 + others))
-    guesses[:, 1:] = random.uniform(-3.0, 12.0 if name == "uneven" else 3.0, (25, 1 + others))
-    found = dynamics.equilibria(guesses, outputs=[0.0])
-    np.testing.assert_allclose(np.sort(found[:, 1]), places, rtol=0, atol=1e-6)
-    # From near the other zero.
-    assert dynamics.stability([0.0, *[0.01] * (1 + others)]).verdict is Verdict.UNDECIDED
-
-
 DEFECTIVE = {
     "two": [[-0.1, 1.0], [0.0, -0.1]],
     "two of 1e-3": [[-1e-3, 1.0], [0.0, -1e-3]],
@@ -142,19 +115,3 @@ def test_a_defective_matrix_is_decided(name, sign):
     )
     told = ZeroDynamics(system).stability()
     assert told.verdict is (Verdict.STABLE if sign > 0.0 else Verdict.UNSTABLE)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("small", [-1e-3, 1e-3])
-def test_eigenvalues_eleven_orders_apart_are_decided(small):
-    """Triangular: s1' = -1e8 s1 + 3e4 s2, s2' = small s2."""
-    system = DaeSystem.from_functions(
-        3,
-        f=lambda x: [0, -1e8 * x[1] + 3e4 * x[2], small * x[2]],
-        h=lambda x: [1, 2, 3],
-        l=lambda x: x[0],
-    )
-    found = ZeroDynamics(system).stability()
-    values = sorted(found.eigenvalues.real)
-    np.testing.assert_allclose(values, [-1e8, small], rtol=1e-9)
-    assert found.verdict is (Verdict.STABLE if small < 0 else Verdict.UNSTABLE)

@@ -13,10 +13,7 @@ from problems import (
 )
 from problems.found import degrees, untidy_one, violation
 
-from drake_dae.dae import ViolationKind, find_structure
-from drake_dae.dae.structure import examine_structure
-from drake_dae.errors import AssumptionError
-from drake_dae.trace.functions import TracedFunction
+from drake_dae.dae import ViolationKind
 
 
 def test_1_a_degree_that_is_not_defined_at_the_nominal_state():
@@ -69,22 +66,6 @@ def test_2_a_rank_that_is_lost_between_the_sampled_states():
     )
     assert error.assumption == 2
     assert error.state[4] == pytest.approx(0.02, abs=1e-6)
-
-
-def test_2_more_constraints_than_states():
-    error = violation(
-        system_of(
-            1,
-            f=lambda x: 0,
-            g=lambda x: [[1, 1]],
-            h=lambda x: 1,
-            k=lambda x: [x[0], x[0] + 1],
-            l=lambda x: x[0],
-            m=lambda x: [[0, 0]],
-        )
-    )
-    assert error.assumption == 2
-    assert error.violation.cause is ViolationKind.COUNT
 
 
 @pytest.mark.parametrize(
@@ -151,26 +132,3 @@ def test_5_outputs_that_repeat():
         error = violation(changed(system, l=ca.vertcat(*one_more[:3], output), m=no_force))
         assert error.assumption == 5
         assert error.violation.names == ("q4",)
-
-
-def test_the_structure_of_a_singular_b_is_complete():
-    """A unicycle whose position is the output: the rate of its heading acts on neither."""
-    unicycle = system_of(
-        3,
-        f=lambda x: [0, 0, 0],
-        h=lambda x: [[ca.cos(x[2]), 0], [ca.sin(x[2]), 0], [0, 1]],
-        l=lambda x: x[:2],
-        nominal_state=[0.0, 0.0, 0.7],
-    )
-    structure, violation = examine_structure(unicycle)
-    assert violation.assumption == 5
-    assert structure.output_degrees == (1, 1)
-    b = TracedFunction("B", {"x": unicycle.state}, {"b": structure.control_matrix})([0, 0, 0.7])[0]
-    np.testing.assert_allclose(b, [[np.cos(0.7), 0.0], [np.sin(0.7), 0.0]], rtol=1e-15)
-    margin = structure.control_margin
-    assert margin.is_singular
-    assert margin.vanishing_row is None
-    np.testing.assert_array_equal(margin.state, violation.state)
-    with pytest.raises(AssumptionError, match=r"B\(x\)") as caught:
-        find_structure(unicycle)
-    assert caught.value.violation.names == tuple(signal.name for signal in unicycle.output_signals)

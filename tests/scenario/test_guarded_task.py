@@ -147,15 +147,3 @@ def test_the_shipped_task_tells_its_story(tmp_path, capsys):
     limit = float(text.split("A touch at 0.03 m/s is expected to stay below ")[1].split(" N")[0])
     # The expectation is made where the law has the wall, 8 mm before.
     assert_allclose(limit, expected, rtol=0.02)
-
-
-@pytest.mark.slow
-def test_a_bias_that_feels_like_a_touch_is_told_with_its_remedy(file, tmp_path, capsys):
-    """3 N of bias end a move that feels for 2 N, in the air; with the bias found it touches."""
-    biased = "sensors.force={sample_period: 0.001, bias: 3}"
-    settings = (biased, TOLERANT)
-    _, _, text = told(file, tmp_path, capsys, *settings)
-    assert "task.tare_time" in text
-    code, found, text = told(file, tmp_path, capsys, *settings, "task.tare_time=0.1")
-    assert (code, found["phases"][-1]["phase"]) == (0, "done")
-    assert "feels like a touch" not in text

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pydrake.systems.analysis import Simulator
 from runs import run_scenario, some
 
 from drake_dae import Record, build_scenario, load_scenario
@@ -89,47 +88,6 @@ def test_an_observer_makes_a_task_robust_to_friction(file, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "settings",
-    some(
-        [
-            [],
-            [
-                # With the seeds 0 and 2 the first friction after the touch amplifies round-off.
-                "sensors.encoders={position_noise: 1.0e-5, velocity_noise: 0.01, seed: 1}",
-                "estimator={rate: 60, state_rate: 200, identify: [wall.friction]}",
-            ],
-            ["saturation=true", "plant.payloads=[{frame: tool, mass: 0.5}]"],
-            [
-                BIASED,
-                "sensors.force.noise_deviation=0",
-                "task.tare_time=0.0001",
-                "plant.friction=0",  # Or it sticks, with an error of the force.
-            ],
-            [
-                BIASED,
-                "task.tare_time=0.1",
-                "sensors.encoders={position_noise: 1.0e-5}",
-                "estimator={rate: 60, state_rate: 200, identify: [wall.friction]}",
-            ],
-        ],
-        of=3,
-        first=1,
-    ),
-    ids=["observer", "estimator", "limits and a payload", "one sample", "bias and estimator"],
-)
-def test_a_rollout_is_drakes_run(file, tmp_path, settings):
-    """To 1e-9 rad: single steps agree to round-off, which the loop does not amplify here."""
-    found = rolled(file, tmp_path, "duration=0.6", *settings)
-    _, _, wanted = run_scenario(load_scenario(file, ["duration=0.6", *settings]))
-    assert_allclose(found.time, wanted.time[: found.time.size], rtol=0, atol=1e-12)
-    rows = found.time.size
-    assert_allclose(found["state"], wanted["state"][:rows], rtol=0, atol=1e-9)
-    assert np.array_equal(found["phase"], wanted["phase"][:rows])
-    assert found["phase"][-1, 2] == 1.0  # It moves.
-
-
-@pytest.mark.slow
 def test_a_disturbance_is_seen_whether_the_contact_is_open_or_closed(file, tmp_path):
     """A payload of 0.5 kg at rest: the generalized force J^T m g, by the virtual work of a mass at
     the tool of a planar arm with links of 1 m."""
@@ -187,23 +145,6 @@ def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys, rol
     assert found["phase"][found.time < 0.8][-1, 2] == 1.0  # It is done.
     assert np.all(found["constraint_force"][found.time > 1.0] == 0.0)
     assert np.max(np.abs(found["state"][-1, 2:])) < 0.05
-
-
-@pytest.mark.slow
-def test_integrals_of_a_task_wait_for_limited_drives(file):
-    """By the input port of the controller; before the touch they wait for the other law."""
-    chosen = load_scenario(file, ["estimator=null", "law.integral=[tool.z, wall.force]"])
-    loop, context = build_scenario(chosen)
-    own, found = loop.controller.GetMyMutableContextFromRoot(context), []
-    simulator = Simulator(loop.diagram, context)
-    for end, is_limited in ((0.2, 0.0), (0.6, 0.0), (0.7, 1.0), (0.8, 0.0)):
-        loop.controller.GetInputPort("hold").FixValue(own, [is_limited])
-        simulator.AdvanceTo(end)
-        found.append(loop.controller.GetOutputPort("integral").Eval(own).copy())
-    assert not found[0].any()
-    assert found[1].all()
-    assert_allclose(found[2], found[1], rtol=0, atol=0)
-    assert (found[3] != found[2]).all()
 
 
 @pytest.mark.slow

@@ -168,57 +168,6 @@ def test_settings_reach_names_with_dots_in_lists():
     assert phase.references == {"tool.z": 0.4}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("form", "surface"),
-    [
-        ("!Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}", Plane((1.2, 0, 0), (-1, 0, 0))),
-        (
-            "!Sphere {center: [1.4, 0, 0.3], radius: 0.3, axis: [0, 1, 0]}",
-            Sphere((1.4, 0, 0.3), 0.3, (0, 1, 0)),
-        ),
-        (
-            "!Cylinder {point: [1, 0, 0.3], axis: [0, 1, 0], radius: 0.4, inside: true}",
-            Cylinder((1, 0, 0.3), (0, 1, 0), 0.4, True),
-        ),
-        (
-            "!Ellipsoid {center: [1.5, 0, 0.3], semi_axes: [0.4, 0.5, 0.6]}",
-            Ellipsoid((1.5, 0, 0.3), (0.4, 0.5, 0.6)),
-        ),
-        (
-            "!Torus {center: [1.6, 0, 0.3], axis: [0, 1, 0], major_radius: 0.4, minor_radius: 0.1}",
-            Torus((1.6, 0, 0.3), (0, 1, 0), 0.4, 0.1),
-        ),
-    ],
-)
-def test_surfaces(form, surface):
-    still = "references={tool.z: 0.3, wall.force: 20}"
-    scenario = two_link(f"constraints.0.surface={form}", still, "duration=0.2")
-    loop, record, distance = run(scenario)
-    assert loop.plant.model.constraints[0].surface == surface
-    # The accuracy is 1e-8 in a step.
-    assert np.max(distance) < 1e-6
-    np.testing.assert_allclose(record["constraint_force"], 20.0, atol=1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("form", "poles"),
-    [
-        ("!Poles {all: [-3, -5]}", [-5, -3]),
-        ("!Poles {outputs: {tool.z: [-2]}}", [-2, -2]),
-        ("!Coefficients {all: [25, 6]}", [-3 - 4j, -3 + 4j]),
-        ("!Coefficients {outputs: {tool.z: [15, 8]}}", [-5, -3]),
-        ("!Matrices {groups: [[[[15]], [[8]]]]}", [-5, -3]),
-    ],
-)
-def test_gains(form, poles):
-    loop, _ = build_scenario(two_link(f"law.gains={form}"))
-    # A double pole is found to the root of the round-off.
-    found = np.sort_complex(loop.controller.law.gains.poles)
-    np.testing.assert_allclose(found, poles, atol=1e-6)
-
-
 def test_outputs():
     """The outputs of seven_joint_wall in other words."""
     settings = [
@@ -244,13 +193,6 @@ def test_a_run_begins_at_its_start_time_with_the_errors_there():
     assert record["tracking_error"][0, 0] == pytest.approx(0.05, abs=1e-9)
     # The accuracy is 1e-8 in a step.
     assert np.max(distance) < 1e-6
-
-
-def test_a_start_is_at_rest():
-    loop, context = build_scenario(two_link("integrator.start_time=3"))
-    assert context.get_time() == 3.0
-    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    np.testing.assert_array_equal(state[2:], 0.0)
 
 
 @pytest.mark.slow

@@ -220,8 +220,10 @@ class EstimatorSample:
         after = self._estimated() if estimates else self._observed()
         if estimates:
             sample = ca.floor(TIME / period + _SAME)
-            given = {name: getattr(after, name) for name in ("control", "measured_force")}
-            first = Memory(**{**vars(self.memory), **given, "state": self._measured})
+            # The state before the first sample is zero, where a contact may have no direction.
+            given = {"state": self._measured, "control": self.inputs["control"]}
+            given |= {"measured_force": self._measured_force} if self.measures else {}
+            first = Memory(**{**vars(self.memory), **given})
             begun = ca.if_else(self.memory.sample >= 0, after.column, first.column)
             fresh = ca.vertcat(sample, begun[1:])
             column = ca.if_else(ca.eq(self.memory.sample, sample), self.memory.column, fresh)

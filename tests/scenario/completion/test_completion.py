@@ -75,35 +75,6 @@ def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "held"),
-    [
-        ("fixed", ["tool.z_axis.y", "tool.z_axis.z"]),
-        ("free", []),
-    ],
-)
-def test_the_tool_axis_may_be_fixed_or_free(kind, held):
-    found = names(complete_scenario(left_out(tool_axis=kind)))
-    assert found[:2] == ["tool.y", "tool.z"]
-    assert [name for name in found[2:] if "joint" not in name] == held
-    assert len(found) == 6
-
-
-def test_outputs_given_in_part_are_kept_and_come_first():
-    part = left_out(
-        outputs=[JointPositions(["joint1"]), PointCoordinates("tool", "z")],
-        references={"joint1": 0.1, "tool.z": 0.6, "wall.force": FORCE},
-    )
-    whole = complete_scenario(part)
-    completed, found = whole.scenario, names(whole)
-    assert found[:5] == ["joint1", "tool.z", "tool.y", "wall.tilt_x", "wall.tilt_y"]
-    assert found[5] in ("joint5", "joint7", "joint3")
-    assert completed.start.positions["joint1"] == 0.1
-    assert list(completed.references) == [*part.references, *found[2:]]
-    assert {name: completed.references[name] for name in part.references} == part.references
-
-
-@pytest.mark.slow
 def test_what_references_name_becomes_an_output_and_follows_them():
     """A circle of the tool is along the surface; a joint that is named is steered."""
     circle = CircleReference([0.0, 0.6], 0.1, period=5.0)

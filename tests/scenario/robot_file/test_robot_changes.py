@@ -152,40 +152,6 @@ def test_accelerations_are_those_of_a_robot_whose_file_says_the_same(text, expec
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
 
 
-def test_what_leads_a_locked_joint_is_locked_as_well(tmp_path):
-    """q_2 = -0.5 q_1 + 0.1 = 0.3 has q_1 = -0.4, and q_3 = 2 q_2."""
-    mimics = ['<mimic joint="j1" multiplier="-0.5" offset="0.1"/>']
-    mimics += ['<mimic joint="j2" multiplier="2"/>', '<mimic joint="j5"/>']
-    text = robot(
-        "tree",
-        *(link(f"b{k}", 1.0) for k in range(7)),
-        joint("j1", "b0", "b1", "0 1 0"),
-        joint("j2", "b1", "b2", "0 1 0", rest=mimics[0]),
-        joint("j3", "b2", "b3", "0 1 0", rest=mimics[1]),
-        joint("j4", "b0", "b4", "0 1 0", rest=mimics[2]),
-        joint("j5", "b0", "b5", "0 1 0"),
-        joint("j6", "b0", "b6", "1 0 0"),
-    )
-    (tmp_path / "tree.urdf").write_text(text)
-    path = tmp_path / "tree.yaml"
-    path.write_text(
-        "robot: {file: tree.urdf, base: {weld: b0}, locked: {j2: 0.3}, actuators: all}\n"
-        "outputs: [!JointPositions {joints: [j5, j6]}]\nforces: []\n"
-        "references: {j5: 0, j6: 0}"
-    )
-    model = scenario_model(load_scenario(path))
-    assert [signal.name for signal in model.links.position_signals] == ["j4", "j5", "j6"]
-    assert [signal.name for signal in model.links.actuator_signals] == ["j5", "j6"]
-    assert [constraint.name for constraint in model.constraints] == ["j4_coupler"]
-    for number, angle in ((1, -0.4), (2, 0.3), (3, 0.6)):
-        weld = model.links.plant.GetJointByName(f"j{number}").X_FM()
-        np.testing.assert_allclose(
-            RollPitchYaw(weld.rotation()).vector(), [0, angle, 0], atol=1e-15
-        )
-    with pytest.raises(ScenarioError, match="j1 = 5 rad"):
-        scenario_model(load_scenario(path, ["robot.locked.j2=-2.4"]))
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.geometry import Role, SceneGraph
-from vendors import write_panda, write_ur5
+from vendors import write_ur5
 
 from drake_dae.errors import GeometryWarning, ModelError
 from drake_dae.scenario.robot_file.reading import read_robot
@@ -22,19 +22,6 @@ def count(scene_graph: SceneGraph, role: Role) -> int:
 
 def read(file: Path, scene_graph: SceneGraph, **more: object):
     return read_robot(Robot(str(file), **more), scene_graph)[0]
-
-
-def test_collision_meshes_are_left_out_by_name_and_the_rest_stays(tmp_path: Path):
-    scene_graph = SceneGraph()
-    with pytest.warns(GeometryWarning) as told:
-        plant = read(write_panda(tmp_path), scene_graph)
-    (message,) = (str(warning.message) for warning in told)
-    assert all(f"'panda_link{k}.stl'" in message for k in range(8))
-    assert "2 more" in message
-    assert "\n" not in message
-    assert (plant.num_joints(), plant.num_constraints()) == (10, 1)
-    assert count(scene_graph, Role.kProximity) == 0
-    assert count(scene_graph, Role.kIllustration) == 11
 
 
 @pytest.mark.parametrize(

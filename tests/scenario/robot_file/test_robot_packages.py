@@ -72,14 +72,6 @@ def test_a_package_in_ros_package_path_is_found(tmp_path: Path, monkeypatch):
     assert joints(tmp_path, file) == 7
 
 
-def test_a_package_in_ament_prefix_path_is_found(tmp_path: Path, monkeypatch):
-    file = away(tmp_path)
-    (tmp_path / "share").mkdir()
-    (tmp_path / "workspace" / "panda").rename(tmp_path / "share" / "panda_description")
-    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/none:{tmp_path}")
-    assert drawn(tmp_path, file) == 11
-
-
 def test_directives_name_packages_by_files_in_packages(tmp_path: Path, monkeypatch):
     write_panda(tmp_path)
     cell = tmp_path / "cell"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.geometry import Role, SceneGraph
+from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -13,7 +13,6 @@ from pydrake.multibody.tree import RotationalInertia
 from scipy.optimize import minimize
 from vendors import joint, link, robot
 
-from drake_dae import load_scenario
 from drake_dae.errors import ModelError, RobotFileWarning, ScenarioError
 from drake_dae.scenario.robot_file.changes import change_robot
 from drake_dae.scenario.robot_file.mending import nearest_inertia
@@ -226,55 +225,6 @@ def test_an_impossible_inertia_is_named_and_the_nearest_taken(name, entries, is_
 
 # What a URDF means.
 
-GREY = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
-BOX = "<visual><geometry><box size='1 1 1'/></geometry>{}</visual></link>"
-
-
-def colours(folder: Path, *materials: str, top: str = "") -> list[float]:
-    """The first component of the colours of links with materials, in their order."""
-    links = [link(f"l{k}", 1).replace("</link>", BOX.format(m)) for k, m in enumerate(materials)]
-    joints = [joint(f"j{k}", "l0", f"l{k}", "0 0 1") for k in range(1, len(materials))]
-    file = written(folder, robot("r", *links, *joints, top))
-    scene_graph = SceneGraph()
-    plant = plant_of(file, scene_graph, base=RobotPlacement("l0"))
-    inspector = scene_graph.model_inspector()
-    found = []
-    for k in range(len(materials)):
-        frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName(f"l{k}").index())
-        (geometry,) = inspector.GetGeometries(frame, Role.kIllustration)
-        properties = inspector.GetProperties(geometry, Role.kIllustration)
-        has_colour = properties.HasProperty("phong", "diffuse")
-        colour = properties.GetProperty("phong", "diffuse") if has_colour else None
-        found.append(-1.0 if colour is None else colour.r())
-    return found
-
-
-def test_a_material_has_the_colour_that_its_name_has_anywhere(tmp_path):
-    bare, white = '<material name="grey"/>', GREY.replace("0.5", "1.0")
-    assert colours(tmp_path, bare, bare, GREY) == [0.5] * 3
-    assert colours(tmp_path, bare, GREY, white) == [0.5] * 3
-    assert colours(tmp_path, bare, white, top=GREY) == [1.0] * 2
-    assert colours(tmp_path, '<material name="none"/>', GREY) == [-1.0, 0.5]
-
-
-def test_a_fixed_joint_mimics_nothing_and_a_transmission_to_no_joint_drives_nothing(tmp_path):
-    arm = joint("a", "base", "arm", "0 0 1")
-    hand = (
-        '<joint name="b" type="fixed"><parent link="arm"/><child link="hand"/>'
-        '<mimic joint="a" multiplier="2"/></joint>'
-    )
-    drive = (
-        '<transmission name="t{0}"><type>transmission_interface/SimpleTransmission</type>'
-        '<joint name="{0}"/><actuator name="motor"/></transmission>'
-    )
-    links = [link(name, 1) for name in ("base", "arm", "hand", "tool")]
-    more = joint("c", "hand", "tool", "0 1 0")
-    drives = "".join(drive.format(name) for name in ("a", "gone", "c"))
-    plant = plant_of(written(tmp_path, robot("r", *links, arm, hand, more, drives)))
-    assert plant.num_constraints() == 0
-    found = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
-    assert [(one.name(), one.joint().name()) for one in found] == [("motor", "a"), ("motor_2", "c")]
-
 
 @pytest.mark.parametrize(
     ("name", "text", "words"),
@@ -411,14 +361,6 @@ def test_a_floating_joint_moves_as_drakes_quaternion_does(name, tmp_path):
 
 
 # A robot in the place of a scenario.
-
-
-@pytest.mark.parametrize("name", [*HELD, "two.dmd.yaml"])
-def test_a_robot_in_the_place_of_a_scenario_is_reported(name, tmp_path):
-    text = HELD.get(name) or TWO.format(written(tmp_path, HELD["arm.urdf"], "arm.urdf"))
-    file = written(tmp_path, text, name)
-    with pytest.raises(ScenarioError, match="drake-dae new"):
-        load_scenario(file)
 
 
 # MJCF with defaults.
