@@ -11,7 +11,6 @@ import pytest
 from runs import some
 
 from drake_dae import Record, load_scenario
-from drake_dae.blocks.machine import num_cores
 from drake_dae.cli import main
 from drake_dae.running.export import loop as exported
 from drake_dae.scenario.build import build_completed
