@@ -67,7 +67,9 @@ def _function(program: "RolloutProgram", what: str, values: Sequence[ca.SX]) -> 
         "parameters": program.block.parameters,
         "noise": program.block.inputs["noise"],
     }
-    return TracedFunction(what, inputs, {"value": stacked(values)}, compiled=program.choice)
+    function = TracedFunction(what, inputs, {"value": stacked(values)}, compiled=program.choice)
+    assert function.function is not None  # Made here: several threads may share expressions.
+    return function
 
 
 def run_stepped(program: "RolloutProgram", problem: RunProblem, settings: StepSettings) -> Run:

@@ -362,9 +362,10 @@ class RolloutProgram:
         self._like, self._made = like, dict[str, Any]()
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
-        if name not in self._made:
-            self._made[name] = make()
-        return self._made[name]
+        with MAKING:
+            if name not in self._made:
+                self._made[name] = make()
+            return self._made[name]
 
     @property
     def stepper(self) -> Stepper | None:
