@@ -135,7 +135,7 @@ class PainleveError(SingularityError):
     """The Painleve paradox in a frictional contact: A(x) is not a P-matrix.
 
     Attributes:
-        outcome: A `dae.system.contacts.PainleveOutcome`; None if it is not known.
+        outcome: A `dae.contacts.PainleveOutcome`; None if it is not known.
     """
 
     def __init__(self, message: str, time: float, state: ArrayLike, outcome: Any = None) -> None:
