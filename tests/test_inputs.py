@@ -27,7 +27,7 @@ from drake_dae.arrays import brief
 from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
-from drake_dae.running import export_code, start_values
+from drake_dae.running import export_loop, start_values
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.typed_yaml import load_yaml
@@ -208,7 +208,7 @@ def test_a_context_of_another_loop_is_refused_in_a_sentence(tmp_path):
         lambda: loop.record(context),
         lambda: loop.set_state(context, arm("two_link").structure.states[0]),
         lambda: start_values(loop, context),
-        lambda: export_code(loop, context, "a", tmp_path),
+        lambda: export_loop(loop, context, "a", tmp_path),
         lambda: make_animation(loop, loop.record(loop.diagram.CreateDefaultContext()), context),
     ):
         with pytest.raises(ModelError, match=r"'(closed_loop|two_link_arm)'"):
