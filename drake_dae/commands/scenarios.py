@@ -140,6 +140,10 @@ def _analyze(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return 2 if report.problems else 0, {"scenario": path.stem, **report.to_dict()}
 
 
+LONGEST = 2.0
+"""The longest run to which exported code is compared, in s."""
+
+
 def _page_options(parser: Parser) -> None:
     parser.scenario(DEFAULT_SCENARIO)
     parser.out("FILE", "the page (default: <scenario>.html)")
@@ -150,16 +154,17 @@ def _page(options: argparse.Namespace) -> int:
     """Writes a scenario as one HTML file in which it runs, without server and network.
 
     There are sliders, a target and surfaces that are dragged, links that are pushed, and plots of
-    force and error with the prediction. It needs drake_dae[compiler].
+    force and error with the prediction. It needs zig: pip install ziglang.
     """
-    from drake_dae.running.bench.page import write_page
+    from drake_dae.pictures.page.page import write_page
     from drake_dae.scenario.commanded import build_commanded
 
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     file = options.out or Path(f"{path.stem}.html")
     check_unwritten([file], options.force)
-    with waiting(f"compiling {path.stem} for a page"):
+    print(f"compiling {path.stem} for a page; the first page on a machine takes longer", flush=True)
+    with waiting(f"compiling {path.stem}"):
         built = build_commanded(scenario)
         title, notes = scenario.description or path.stem, built.left_out
         try:
@@ -179,36 +184,32 @@ def _export_options(parser: Parser) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    """Writes the law, the plant and the projection of a scenario as plain C99.
+    """Writes a scenario as plain C99: the whole loop, and its sampled controller as one step.
 
-    There are no dependencies; sizes, names and units stand in the code. Of a sampled law the whole
-    controller is written as one step, with a class of C++ over it. `make` in the folder compiles
-    programs that compare all with Python and with a run of Drake's Simulator.
+    There are no dependencies; sizes, names and units stand in the code. `make` in the folder
+    compiles programs that compare with runs of Drake's Simulator.
     """
-    path = find_scenario(options.scenario)
-    from drake_dae.running.export.export import export_code
-    from drake_dae.running.export.steps.controller import export_controller
+    from drake_dae.running.export.controller import export_controller
+    from drake_dae.running.export.loop import export_loop
 
+    path = find_scenario(options.scenario)
     folder = options.out or Path(f"{path.stem}_c99")
     check_folder(folder)
-    scenario, missing = load_scenario(path, options.settings), ""
+    scenario, files, missing = load_scenario(path, options.settings), list[Path](), list[str]()
     with waiting(f"exporting {path.stem}"), complete(folder) as place:
         made = *build_scenario(scenario), path.stem, place
-        run = scenario.integrator, scenario.duration
-        if scenario.task is not None:
-            files = export_controller(*made, *run)
-            missing = "functions of law and plant: a task has two laws"
-        else:
-            files = export_code(*made)
+        for what, export in {"controller": export_controller, "loop": export_loop}.items():
             try:
-                files += export_controller(*made, *run)
+                files += export(*made, scenario.integrator, min(scenario.duration, LONGEST))
             except ModelError as error:
-                missing = f"the whole controller as one step: {error}"
+                missing.append(f"the {what}: {error}")
+        if not files:
+            raise ModelError(f"{path.stem} cannot be exported; {'; '.join(missing)}")
         names = list(dict.fromkeys(file.name for file in files))
         check_unwritten((folder / name for name in names), options.force)
     print(f"written to {folder}/: {', '.join(names)}")
-    if missing:
-        print(f"not among them: {missing}")
+    for reason in missing:
+        print(f"not among them: {reason}")
     return 0
 
 
