@@ -42,8 +42,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
         M v' + H = tau + J^T F,
 
     with the forces F of `contact_force`, those of a continuous MultibodyPlant. Torques beyond the
-    effort limits are cut to them, as Drake does; a joint that reaches its limit ends the run. After
-    `set_consistent_state` the robot touches without force, and penetrates when the run starts.
+    effort limits are cut to them, as Drake does; a joint that reaches its limit ends the run.
 
     Input ports:
         control: u, shape (p,).
@@ -52,7 +51,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
     Output ports:
         state, link_state, joint_torque, and the ports of the stages: as for `RobotPlant`.
         contact_force: The force F of each contact on the robot in the world, in N, including
-            friction, shape (3 m,); of a discrete plant the mean force of the step to t_n.
+            friction, shape (3 m,); if discrete, the mean force of the step to t_n.
         constraint_force: lambda = n(q) . F, N, shape (m,).
         constraint_residual: phi and phi', as for `DaePlant`; not zero in compliant contact.
         controlled_output: z = l(x) + m(x) lambda.
