@@ -272,7 +272,6 @@ NONSENSE: tuple[Any, ...] = (
 SIDE_EFFECTS = {
     "start_meshcat": "it opens a port",
     "write_page": "it writes to the given path",
-    "export_loop": "it writes to the given path",
     "sweep": "it writes to the given path",
 }
 

@@ -20,7 +20,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import NOTHING, Block, Held, Projection, Requirement, stacked
 from drake_dae.blocks.primitives import symbolic_block
-from drake_dae.blocks.traced_system import TracedSystem
+from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 
@@ -249,7 +249,7 @@ class _Walk:
         return system.GetSystemPathname().removeprefix(self.prefix).replace("::", ".")
 
     def local(self, system: System) -> Context:
-        return system.GetMyContextFromRoot(self.context)
+        return context_in(system, self.context)
 
     def parameters_of(self, system: System) -> np.ndarray:
         """All numeric parameters of a leaf in the context."""

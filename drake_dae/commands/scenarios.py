@@ -2,7 +2,6 @@
 
 import argparse
 import logging
-import re
 import shlex
 import sys
 import time
@@ -109,14 +108,16 @@ def _check(scenario: Scenario, end: float) -> str:
 
 def _tip(text: str) -> tuple[str, Vector]:
     """The frame and the point in a text "LINK" or "LINK:x,y,z"."""
-    match = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
-    if match is None:
+    frame, comma, y_and_z = text.partition(",")
+    if not comma:
         return text, (0.0, 0.0, 0.0)
-    numbers = [number for word in match[2].split(",") if (number := number_in(word)) is not None]
-    if len(numbers) != 3 or match[2].count(",") != 2:
+    frame, _, x = frame.rpartition(":")
+    words = x, *y_and_z.split(",")
+    point = [number for word in words if (number := number_in(word)) is not None]
+    if not frame or not len(words) == len(point) == 3:
         form = "LINK or LINK:x,y,z with three numbers in m"
         raise ScenarioError(("--tip", f"expected {form}, got '{text}'"))
-    return match[1], (numbers[0], numbers[1], numbers[2])
+    return frame, (point[0], point[1], point[2])
 
 
 def _analyze_options(parser: Parser) -> None:

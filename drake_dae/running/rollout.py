@@ -27,7 +27,7 @@ from drake_dae.blocks.machine import (
     run_several,
 )
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepFunctions, StepSettings
-from drake_dae.blocks.traced_system import TracedSystem
+from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter, computed_record, recorded_values
@@ -459,26 +459,27 @@ class RolloutProgram:
         """State, held values and parameters in a context of the diagram.
 
         Raises:
-            ModelError: An input port without a wire has no value in it.
+            ModelError: An input port without a wire has no value in it, or it is that of another
+                diagram.
         """
         composed, functions = self.composed, self.functions
         state, held = np.zeros(functions.size), np.zeros(functions.sizes[2])
         for system, part in composed.states.items():
-            local = system.GetMyContextFromRoot(context)
+            local = context_in(system, context)
             state[part] = local.get_continuous_state_vector().CopyToVector()
         for (system, i), (group, _) in composed.held.items():
-            local = system.GetMyContextFromRoot(context)
+            local = context_in(system, context)
             held[self.held_places[group]] = local.get_discrete_state(i).value()
         for name, (system, i) in composed.cuts.items():
-            value = system.get_output_port(i).Eval(system.GetMyContextFromRoot(context))
+            value = system.get_output_port(i).Eval(context_in(system, context))
             held[self.held_places[name]] = value
         values = []
         for system in composed.parameters:
-            local = system.GetMyContextFromRoot(context)
+            local = context_in(system, context)
             groups = range(local.num_numeric_parameter_groups())
             values += [local.get_numeric_parameter(i).value() for i in groups]
         for system, i in composed.fixed.values():
-            port, local = system.get_input_port(i), system.GetMyContextFromRoot(context)
+            port, local = system.get_input_port(i), context_in(system, context)
             if not port.HasValue(local):
                 raise ModelError(
                     f"the input port '{port.get_name()}' of '{system.get_name()}' has no value in "

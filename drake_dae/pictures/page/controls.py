@@ -56,19 +56,14 @@ class Control:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """All parameters of a page in one column.
-
-    Attributes:
-        signals: Their names and units.
-        values: Their values at the start.
-        systems: System -> the place of its parameters.
-        inputs: Name of a free input port -> the place of its value.
-    """
+    """All parameters of a page in one column, with their values at the start."""
 
     signals: Sequence[Signal]
     values: FloatArray
     systems: Mapping[System, slice]
+    """System -> the place of its parameters."""
     inputs: Mapping[str, slice]
+    """Name of a free input port -> the place of its value."""
 
     def of(self, system: Any) -> dict[str, int]:
         """Name of a parameter of a block -> its place."""
@@ -80,14 +75,7 @@ class Numbers:
 
 
 def controls_of(loop: ClosedLoop, numbers: Numbers, time: float, size: float) -> list[Control]:
-    """The controls of a loop.
-
-    Args:
-        loop: The loop.
-        numbers: The parameters.
-        time: The time at the start, in s.
-        size: The size of the robot, in m.
-    """
+    """The controls of a loop with a robot of some size in m, from a time in s on."""
     signals = [
         Control("signal", name.removeprefix(SIGNAL), "", 0.0, 1.0, 0.0, (place.start,))
         for name, place in numbers.inputs.items()
@@ -210,12 +198,7 @@ def strongest_pushes(
 
     A law with poles at -p acts on a mass m like a spring of stiffness m p^2, and the effective mass
     at the link's origin, where it is smallest, is 1 / (J M^-1 J^T). So a force m p^2 d moves the
-    link by d.
-
-    Args:
-        plant, state: The robot and its state.
-        links: The names of the links.
-        rate: p^2 d, in m/s^2.
+    link by d; `rate` is p^2 d.
     """
     robot, forces = plant.robot("a page").links.plant, dict[str, float]()
     if robot is None:
@@ -243,15 +226,9 @@ def rounded(value: float) -> float:
 def prediction(loop: ClosedLoop, part: slice | None) -> dict[str, Any] | None:
     """The data for the prediction of the error: E of e' = E e (30), and its outputs.
 
-    Args:
-        loop: The loop.
-        part: The place of the controller's parameters.
-
-    Returns:
-        "size": the number of error coordinates; "ends": the rows of E that contain gains; "gains":
-        (row, column, place) of each gain; "shown": (output, coordinate, whether the derivative is
-        shown), without outputs whose error is zero. None if the controller's errors do not form a
-        linear system.
+    "size" is the number of error coordinates, "ends" are the rows of E that contain gains, "gains"
+    (row, column, place) of each gain, "shown" (output, coordinate, whether the derivative is
+    shown), without outputs whose error is zero. None if the errors do not form a linear system.
     """
     law = loop.controller.law
     if not loop.controller.follows or loop.generator is None or part is None:

@@ -139,18 +139,10 @@ def as_script(data: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """What a page shows and changes.
+    """What a page shows and changes of a loop, from a context on; `size` is that of the scene in m.
 
-    Attributes:
-        loop: The loop.
-        context: The context at the start, with values for all free inputs.
-        code: The outputs and their desired values, "change" of the phases of a task, "scene", and
-            "coordinates" of the errors, as C.
-        numbers: The parameters.
-        controls: The sliders.
-        robot, state: What is drawn, and its state at the start.
-        size: The size of the scene, in m.
-        predicted: The prediction of the errors; None without one.
+    `code` computes the outputs and their desired values, "change" of the phases of a task, "scene",
+    and "coordinates" of the errors.
     """
 
     loop: ClosedLoop
@@ -165,11 +157,7 @@ class Bench:
 
     @classmethod
     def of(cls, loop: ClosedLoop, context: Context | None) -> "Bench":
-        """The bench of a loop.
-
-        Raises:
-            ModelError: The plant is not a robot, or the loop cannot be traced.
-        """
+        """The bench of a loop, whose free inputs are 0 where they have no value."""
         diagram, plant, law = loop.diagram, loop.plant, loop.controller.law
         context = (context or diagram.CreateDefaultContext()).Clone()
         for port in map(diagram.get_input_port, range(diagram.num_input_ports())):

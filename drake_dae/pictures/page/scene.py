@@ -79,12 +79,7 @@ class RobotScene:
         return function(state[: symbols[0].numel()], force, parameters)
 
     def data(self, state: FloatArray, slider: Callable[[str, str], int | None]) -> dict[str, Any]:
-        """What the browser knows of these parts.
-
-        Args:
-            state: The state of the plant at the start.
-            slider: (kind, label) -> the index of a slider; None if there is none.
-        """
+        """What the browser knows of these parts; `slider` gives the index of a slider."""
         model, acting = self.plant.robot("a page"), list(self.wrenches.constraints)
         names = [signal.name for signal in self.plant.dae.output_signals]
         constraints = [
@@ -145,11 +140,7 @@ def scene_size(robot: RobotScene, state: FloatArray, scene_graph: SceneGraph | N
 
 
 def meshcat_page(robot: RobotScene, state: FloatArray, scene_graph: SceneGraph | None) -> str:
-    """Meshcat's page at the start, self-contained.
-
-    Raises:
-        OSError: There is no free port for Meshcat, which makes the page.
-    """
+    """Meshcat's page at the start, self-contained."""
     meshcat = start_unwatched_meshcat()
     meshcat.SetProperty("/Background", "visible", True)
     for part in ("top_color", "bottom_color"):
