@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from actuated import (
-    DEGREES,
     EACH,
     actuated,
     at_rest,
@@ -53,17 +52,6 @@ def test_dynamics_are_those_of_a_dense_solve(name, kind):
             np.testing.assert_array_equal(plant.GetOutputPort(port).Eval(context), x[part])
     stage_ports = {"motor_state", "motor_current", "actuator_force"} - set(ports)
     assert not any(plant.HasOutputPort(port) for port in stage_ports)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "kind"), EACH)
-def test_degrees_are_found(name, kind):
-    """r = 2; joint damping takes one from mu = (4, 2), another stage adds one."""
-    structure = actuated(name, kind).structure
-    position, force = DEGREES[kind]
-    count = len(arm(name).model.position_signals)
-    assert structure.constraint_degrees == (2,)
-    assert structure.output_degrees == (position,) * count + (force,)
 
 
 @pytest.mark.slow

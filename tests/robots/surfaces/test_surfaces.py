@@ -240,12 +240,6 @@ def test_refusals(make, message):
         make()
 
 
-@pytest.mark.slow
-def test_a_surface_without_points_is_not_drawn_and_says_so():
-    with pytest.warns(UserWarning, match=r"ImplicitSurface.*0\.4"):
-        assert ImplicitSurface(lambda p: ca.sumsqr(p) + 1.0).picture([0.1, 0.0, 0.0], 0.4) is None
-
-
 def test_a_surface_is_drawn_around_its_tip():
     """The gradient vanishes at the tip of a cone; beside it there is a normal."""
     cone = ImplicitSurface(lambda p: p[2] ** 2 - p[0] ** 2 - p[1] ** 2)
