@@ -21,7 +21,7 @@ from drake_dae.errors import (
     ScenarioError,
     describe_os_error,
 )
-from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
+from drake_dae.running.interruption import Interruption, end_at_once, ending_signals
 
 COMMANDS = {
     "list": ("texts", "list the shipped scenarios"),

@@ -38,7 +38,7 @@ from drake_dae import (
     poles,
     shipped_model,
 )
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae import Structure
 
 LOW, HIGH = 0.0, 0.6
 """Heights of the tip, m."""

@@ -15,7 +15,7 @@ import pytest
 from runs import scenario
 
 from drake_dae import CsvReference, MeasuredSurface, Record, load_scenario, new_scenario
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
 from drake_dae.files import read_bytes, read_text
 from drake_dae.scenario.robot_file.reading import read_robot

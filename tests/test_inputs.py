@@ -41,13 +41,13 @@ from drake_dae import (
 )
 from drake_dae.arrays import brief, numbers
 from drake_dae.cli import main
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
 from drake_dae.pictures.axes import labelled
 from drake_dae.scenario.forms.typed_yaml import load_yaml
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.simulation.records.record import Recorded
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)

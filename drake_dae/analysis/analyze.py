@@ -16,25 +16,25 @@ from drake_dae.analysis.reference_check import check_reference
 from drake_dae.analysis.report import Analysis, Assumption, Finding
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, check_whole_number
-from drake_dae.dae.states.contact_margin import ContactMargins
-from drake_dae.dae.states.margins import RankMargin, find_margin, is_regular
-from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.structure.assumptions import Violation
-from drake_dae.dae.structure.constrained import (
+from drake_dae.dae import (
     ConstraintStructure,
+    DaeSystem,
+    RankMargin,
+    Stability,
+    Structure,
+    Violation,
+    ZeroDynamics,
+    why_no_law,
+)
+from drake_dae.dae.states.contact_margin import ContactMargins
+from drake_dae.dae.states.margins import find_margin, is_regular
+from drake_dae.dae.states.samples import Samples
+from drake_dae.dae.structure.constrained import (
     check_system,
     constraint_violation,
     examine_constraints,
 )
-from drake_dae.dae.structure.structure import (
-    Structure,
-    control_violation,
-    examine_outputs,
-    why_no_law,
-)
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.stability import Stability
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae.structure.structure import control_violation, examine_outputs
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.references import Reference
 

@@ -8,9 +8,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.analysis.tables import count_of
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.region import Region
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Manifold, Region
 from drake_dae.errors import InconsistentStateError, ModelError
 
 Bounds = Mapping[str, tuple[float, float]]
@@ -35,7 +33,9 @@ class ExaminedStates:
     ) -> "ExaminedStates":
         """Draws random states in a region or around the nominal state, which comes first."""
         nominal = system.nominal_state
-        drawn = nominal + system.nominal_spread * random.standard_normal((count, nominal.size))
+        drawn = nominal + system.spread_around(nominal) * random.standard_normal(
+            (count, nominal.size)
+        )
         if bounds is None:
             return cls(np.vstack([nominal, drawn]), 0, {}, None)
         region = _box(system, bounds)
@@ -57,7 +57,7 @@ class ExaminedStates:
                 f"{system.name}: states must be finite numbers of shape (k, {system.num_states}), "
                 f"got {states!r}"
             )
-        around = system.usual_spread(rows[0]) * random.standard_normal((_NEIGHBOURS, shape[1]))
+        around = system.spread_around(rows[0]) * random.standard_normal((_NEIGHBOURS, shape[1]))
         return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows), {}, None)
 
     def describe(self, count: int, noun: str) -> str:

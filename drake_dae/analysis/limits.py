@@ -10,10 +10,7 @@ import numpy as np
 
 from drake_dae.analysis.tables import digits
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
+from drake_dae.dae import DaeSystem, PinnedMotion, Signal, Structure
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
 
 SLACK, CLOSE = 1e-9, 1e-6

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, DerivativeLayout
 from drake_dae.errors import ModelError
 
 

@@ -11,18 +11,23 @@ import numpy as np
 from drake_dae.analysis.tables import Part, Table, count_of, named_values, to_markdown, to_text
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.states.contact_margin import ContactMargin
-from drake_dae.dae.states.margins import RankMargin
-from drake_dae.dae.states.region import Region
-from drake_dae.dae.structure.assumptions import Violation
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.structure.structure import Structure, why_no_law
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.floquet import StabilityAlong
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.stability import ComplexArray, Stability, Verdict
+from drake_dae.dae import (
+    ComplexArray,
+    ConstraintStructure,
+    ContactMargin,
+    DaeSystem,
+    DerivativeLayout,
+    PinnedMotion,
+    RankMargin,
+    Region,
+    Signal,
+    Stability,
+    StabilityAlong,
+    Structure,
+    Verdict,
+    Violation,
+    why_no_law,
+)
 from drake_dae.errors import ModelError
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from textwrap import fill
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 
 _WIDTH = 100
 """The width of a paragraph, in characters."""

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.functions import SINGULAR_PIVOT, Failure, FailureKind, TracedFunction

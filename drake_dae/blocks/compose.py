@@ -21,7 +21,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import NOTHING, Block, Held, Projection, Requirement, stacked
 from drake_dae.blocks.primitives import symbolic_block
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 
 Port = tuple[System, int]

@@ -8,7 +8,7 @@ import casadi as ca
 from pydrake.systems.framework import Context, System
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 

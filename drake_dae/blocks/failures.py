@@ -6,10 +6,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show_state
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.contacts import painleve_outcome
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import ConstraintStructure, Manifold, Signal, painleve_outcome
 from drake_dae.errors import (
     InconsistentStateError,
     NonFiniteError,

@@ -10,8 +10,8 @@ from pydrake.symbolic import Expression, Variable
 from pydrake.systems.framework import PortDataType, System
 
 from drake_dae.blocks.block import NOTHING, TIME, Block, Held, stacked
+from drake_dae.blocks.symbolic import to_casadi
 from drake_dae.errors import ModelError
-from drake_dae.symbolic import to_casadi
 
 
 def symbolic_block(system: System) -> Block | None:

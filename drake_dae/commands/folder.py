@@ -5,10 +5,10 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.pictures.plots import PLOTS
 from drake_dae.pictures.run_pictures import ANIMATION
-from drake_dae.simulation.records.record import Record
 
 SCENARIO, SUMMARY, RECORD = "scenario.yaml", "summary.txt", "record.npz"
 PART = "record.part"

@@ -8,6 +8,7 @@ from pydrake.systems.framework import Context
 from drake_dae.commands.folder import SCENARIO, load_run, runs_by_name, show
 from drake_dae.commands.parser import Parser, waiting
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.files import check_unwritten, complete
 from drake_dae.pictures.film import save_film
@@ -16,7 +17,6 @@ from drake_dae.pictures.run_pictures import save_run_plots
 from drake_dae.pictures.runs import plot_runs
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.files import load_scenario
-from drake_dae.simulation.records.record import Record
 
 
 def _plot_options(parser: Parser) -> None:

@@ -16,7 +16,8 @@ from drake_dae.arrays import number_in
 from drake_dae.commands.parser import Parser, program, waiting
 from drake_dae.errors import DrakeDaeError, GeometryWarning, ScenarioError, SimulationError
 from drake_dae.files import check_unwritten
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots import Vector
+from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
@@ -24,7 +25,6 @@ from drake_dae.scenario.new import new_scenario
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.simulate import simulate
 
 _LONGEST = 20.0
 """The processor time in s after which a new scenario is no longer checked."""

@@ -20,21 +20,21 @@ import drake_dae
 from drake_dae.commands.folder import FILES, PART, RECORD, SCENARIO, SUMMARY, show
 from drake_dae.commands.parser import Parser, program, waiting
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record, RecordAfter, Recorded
 from drake_dae.errors import DrakeDaeError, ScenarioError, describe_os_error
 from drake_dae.files import check_folder, check_unwritten, complete
 from drake_dae.pictures.run_pictures import ANIMATION, save_animation, save_run_plots
-from drake_dae.pictures.scene.view import start_meshcat
+from drake_dae.running.interruption import Interruption, end_at_once, ending_signals
+from drake_dae.running.record_writer import RecordWriter
+from drake_dae.running.simulate import RunStatistics, simulate
+from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.records.interruption import Interruption, end_at_once, ending_signals
-from drake_dae.simulation.records.record import Record, RecordAfter, Recorded
-from drake_dae.simulation.records.record_writer import RecordWriter
-from drake_dae.simulation.simulate import RunStatistics, simulate
-from drake_dae.simulation.summary import RunSummary
+from drake_dae.scene.view import start_meshcat
 
 
 def _options(parser: Parser) -> None:

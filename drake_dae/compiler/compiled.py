@@ -15,7 +15,7 @@ from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.compiler.rates import ColumnPlace, UpdateRate, dense_function
 from drake_dae.compiler.trace import Expressions, TracedCall
 from drake_dae.compiler.wires import Wires
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 
 ARGUMENTS = ("time", "state", "held", "parameters")

@@ -23,9 +23,9 @@ from drake_dae.blocks.computations import (
     Update,
     not_traced,
 )
+from drake_dae.blocks.symbolic import to_casadi
 from drake_dae.compiler.groups import discrete_states, numeric_parameters
 from drake_dae.errors import ModelError
-from drake_dae.symbolic import to_casadi
 
 
 def primitive(system: System) -> Computations:

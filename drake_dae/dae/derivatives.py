@@ -21,7 +21,7 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import (
     Factorization,

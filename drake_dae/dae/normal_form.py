@@ -9,15 +9,15 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, show, vector
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.margins import RankMargin, find_margin
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.structure import Structure, structure_of
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton
 from drake_dae.trace.round_off import unit_rows
-from drake_dae.trace.smoothness import find_flaw
 
 TRANSVERSAL = 0.05
 """Single states complete the chains if the sine of their smallest angle is above this."""
@@ -261,9 +261,9 @@ def check_completion(
             f"{system.name}: the completion xi of the coordinates depends on "
             f"{', '.join(unknown)}, which is neither a state nor a parameter"
         )
-    flaw = find_flaw(xi, system.state, system.parameter_symbol)
+    flaw = find_flaw(xi, system.state, system.parameter_symbol, "the state")
     if flaw:
-        raise ModelError(f"{system.name}: the completion {flaw.describe('the state')}")
+        raise ModelError(f"{system.name}: the completion {flaw}")
     signals = tuple(
         next(
             (

@@ -13,12 +13,12 @@ from pydrake.systems.primitives import RandomSource, VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.observing import Observer
+from drake_dae.diagrams.record import Record, computed_record, recorded_values
 from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.simulation.records.record import Record, computed_record, recorded_values
 from drake_dae.systems.control.contract import Controller, PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant

@@ -2,7 +2,7 @@
 
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import TrackingLaw
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
 
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.systems.control.contract import Controller

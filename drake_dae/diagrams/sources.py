@@ -7,8 +7,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, System
 from pydrake.systems.primitives import RandomSource
 
 from drake_dae.blocks.traced_system import context_in
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import DaeSystem, TrackingLaw
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import WiringError
 from drake_dae.references import Reference

@@ -7,7 +7,7 @@ from pydrake.systems.primitives import RandomSource
 
 from drake_dae.diagrams.sources import add_noise, seed_noise
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.robots.links.links import velocities_are_rates
+from drake_dae.robots import velocities_are_rates
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 

@@ -6,7 +6,7 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
 from drake_dae.arguments import checked
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import add_drives, hold_before
 from drake_dae.diagrams.force_feedback import add_force_feedback
@@ -28,8 +28,8 @@ from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.sources import add_exogenous, make_generator
 from drake_dae.diagrams.state_feedback import add_encoders
 from drake_dae.errors import DrakeDaeError, WiringError
-from drake_dae.pictures.scene.view import add_live_view
 from drake_dae.references import Reference, references_by_name
+from drake_dae.scene.view import add_live_view
 from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
 from drake_dae.systems.control.references import ReferenceGenerator

@@ -14,9 +14,21 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
+from drake_dae.pictures.friction import DrawnFrictionCone, friction_cones, slips
 from drake_dae.pictures.moments import RunEvent, event_kinds, events_of, sorted_events
-from drake_dae.pictures.scene.arrows import (
+from drake_dae.pictures.run_motion import (
+    RunMotion,
+    ShownLoop,
+    follow,
+    run_points,
+    run_view,
+)
+from drake_dae.robots import Constraint, ConstraintWrenches, axes_along
+from drake_dae.running.limits import robot_limits
+from drake_dae.running.phases import PhaseSpan, phase_spans
+from drake_dae.scene.arrows import (
     FORCE_COLOR,
     LEAST_SCALE,
     MOMENT_COLOR,
@@ -24,18 +36,10 @@ from drake_dae.pictures.scene.arrows import (
     ForceArrows,
     path_of,
 )
-from drake_dae.pictures.scene.floor import Floor, floor_below
-from drake_dae.pictures.scene.framing import ViewAngles
-from drake_dae.pictures.scene.friction import DrawnFrictionCone, friction_cones, slips
-from drake_dae.pictures.scene.run_motion import (
-    RunMotion,
-    ShownLoop,
-    follow,
-    run_points,
-    run_view,
-)
-from drake_dae.pictures.scene.surroundings import scene_extent, surroundings
-from drake_dae.pictures.scene.view import (
+from drake_dae.scene.floor import Floor, floor_below
+from drake_dae.scene.framing import ViewAngles
+from drake_dae.scene.surroundings import scene_extent, surroundings
+from drake_dae.scene.view import (
     ARROW,
     ASPECT,
     CAMERA_ANGLE,
@@ -48,12 +52,6 @@ from drake_dae.pictures.scene.view import (
     start_unwatched_meshcat,
     view_of_links,
 )
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.surfaces.surface import axes_along
-from drake_dae.simulation.limits import robot_limits
-from drake_dae.simulation.records.phases import PhaseSpan, phase_spans
-from drake_dae.simulation.records.record import Record
 
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
 _CONE = Rgba(0.95, 0.6, 0.15, 0.35)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 
 if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.axes import Axes

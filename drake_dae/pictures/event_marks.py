@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from drake_dae.diagrams.record import Record
 from drake_dae.pictures.moments import RunEvent, event_kinds
-from drake_dae.simulation.records.phases import phase_spans
-from drake_dae.simulation.records.record import Record
+from drake_dae.running.phases import phase_spans
 
 if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.axes import Axes

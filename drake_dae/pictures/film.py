@@ -34,27 +34,27 @@ from pydrake.systems.sensors import CameraInfo
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
+from drake_dae.pictures.film_marks import FilmMarks
+from drake_dae.pictures.friction import slips
+from drake_dae.pictures.labels import label_box, reserved_pixels
 from drake_dae.pictures.moments import RunEvent, events_of, sorted_events
-from drake_dae.pictures.scene.film_marks import FilmMarks
-from drake_dae.pictures.scene.floor import floor_below
-from drake_dae.pictures.scene.framing import ViewAngles
-from drake_dae.pictures.scene.friction import slips
-from drake_dae.pictures.scene.labels import label_box, reserved_pixels
-from drake_dae.pictures.scene.rendered import rendered
-from drake_dae.pictures.scene.run_motion import (
+from drake_dae.pictures.rendered import rendered
+from drake_dae.pictures.run_motion import (
     RunMotion,
     ShownLoop,
     follow,
     run_points,
     run_view,
 )
-from drake_dae.pictures.scene.surroundings import surroundings
-from drake_dae.pictures.scene.view import ARROW, PIECE
-from drake_dae.robots.constraint_wrenches import own_values
-from drake_dae.simulation.limits import robot_limits
-from drake_dae.simulation.records.phases import phase_spans, phases_at
-from drake_dae.simulation.records.record import Record
+from drake_dae.robots import own_values
+from drake_dae.running.limits import robot_limits
+from drake_dae.running.phases import phase_spans, phases_at
+from drake_dae.scene.floor import floor_below
+from drake_dae.scene.framing import ViewAngles
+from drake_dae.scene.surroundings import surroundings
+from drake_dae.scene.view import ARROW, PIECE
 
 if TYPE_CHECKING:  # Loaded with the first film.
     from matplotlib.axes import Axes

@@ -7,8 +7,8 @@ from enum import Enum
 import numpy as np
 
 from drake_dae.analysis.limits import LimitKind, SignalLimits
-from drake_dae.simulation.limits import limited_values
-from drake_dae.simulation.records.record import Record
+from drake_dae.diagrams.record import Record
+from drake_dae.running.limits import limited_values
 
 APART = 0.01
 """Events with the same text that follow each other within this fraction of the run are shown as

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record
 from drake_dae.pictures.axes import (
     decades,
     flatten,
@@ -22,13 +23,12 @@ from drake_dae.pictures.axes import (
 )
 from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
 from drake_dae.pictures.moments import RunEvent
-from drake_dae.simulation.judgement import ROUND_OFF, output_sizes
-from drake_dae.simulation.records.record import Record
+from drake_dae.running.judgement import ROUND_OFF, output_sizes
 
 if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
     from matplotlib.figure import Figure
 
-    from drake_dae.pictures.scene.run_motion import ContactPath
+    from drake_dae.pictures.run_motion import ContactPath
 
 PATHS = "path.png"
 """The plot of contact points that move on surfaces; omitted if there are none."""

@@ -5,15 +5,15 @@ from pathlib import Path
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
+from drake_dae.diagrams.record import Record
 from drake_dae.files import complete
 from drake_dae.pictures.animation import animate
+from drake_dae.pictures.friction import slips
 from drake_dae.pictures.moments import RunEvent, events_of, sorted_events
 from drake_dae.pictures.plots import PATHS, PLOTS, save_plots
-from drake_dae.pictures.scene.friction import slips
-from drake_dae.pictures.scene.run_motion import RunMotion, ShownLoop, contact_paths, follow
-from drake_dae.simulation.limits import robot_limits
-from drake_dae.simulation.records.phases import phase_spans
-from drake_dae.simulation.records.record import Record
+from drake_dae.pictures.run_motion import RunMotion, ShownLoop, contact_paths, follow
+from drake_dae.running.limits import robot_limits
+from drake_dae.running.phases import phase_spans
 
 ANIMATION = "animation.html"
 

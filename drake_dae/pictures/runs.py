@@ -10,12 +10,12 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.pictures.axes import decades, grid, labelled, legend, round_off
 from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
 from drake_dae.pictures.moments import events_of
-from drake_dae.simulation.records.record import Record
 
 if TYPE_CHECKING:  # Loaded with the first figure.
     from matplotlib.axes import Axes

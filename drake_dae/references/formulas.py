@@ -21,7 +21,7 @@ from drake_dae.references.reference import (
     check_order,
     common_period,
 )
-from drake_dae.trace.given import result_of
+from drake_dae.trace.expressions import result_of
 
 
 @checked(ReferenceSignalError)

@@ -12,8 +12,8 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import NonFiniteError, ReferenceSignalError
+from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.smoothness import find_flaw
 
 
 @checked(ReferenceSignalError)
@@ -108,10 +108,10 @@ class FormulaReference(Reference):
         rows = self.rows(time)
         others = [symbol for symbol in ca.symvar(rows) if not ca.is_equal(symbol, time)]
         for i, degree in enumerate(degrees):
-            flaw = find_flaw(rows[i], time, ca.vertcat(ca.SX(0, 1), *others))
+            flaw = find_flaw(rows[i], time, ca.vertcat(ca.SX(0, 1), *others), "the time")
             if degree and flaw:
                 raise ReferenceSignalError(
-                    f"row {i} of the reference {flaw.describe('the time')}. The law needs {degree} "
+                    f"row {i} of the reference {flaw}. The law needs {degree} "
                     "derivatives of it; a move from rest to rest is a PointToPointReference"
                 )
 

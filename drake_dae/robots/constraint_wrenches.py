@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.model import RobotModel

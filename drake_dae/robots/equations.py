@@ -7,8 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Parameter, Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.chain import ActuationChain
 from drake_dae.robots.constraints.constraint_set import ConstraintSet

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arguments import checked
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.links.kinematics import Kinematics
 from drake_dae.robots.links.links import Links
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 class ForceOutput(ABC):
@@ -137,7 +137,7 @@ class Squeeze(ForceOutput):
         return (Signal(self.name or f"{self.first}.{self.second}.squeeze", "N"),)
 
 
-def force_outputs(
+def as_force_outputs(
     forces: Sequence[str | ForceOutput] | None, constraints: ConstraintSet
 ) -> tuple[ForceOutput, ...]:
     """The force outputs of a list: a name is that force, None are all forces.

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import numbers, positive
-from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae import Parameter
 from drake_dae.errors import ModelError
 from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.kinematics import Kinematics, Reaction, position_index

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae import Parameter
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.kinematics import Kinematics, Reaction
 from drake_dae.robots.surfaces.surface import Vector

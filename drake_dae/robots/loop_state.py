@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
 from drake_dae.robots.links.links import Links
 

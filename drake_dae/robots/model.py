@@ -12,8 +12,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, vector
-from drake_dae.dae.structure.redundancy import share_forces
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.actuation.chain import chain
 from drake_dae.robots.actuation.stage import Stage
@@ -26,7 +25,7 @@ from drake_dae.robots.equations import (
     check_mass_matrix,
     robot_equations,
 )
-from drake_dae.robots.force_outputs import ForceOutput, force_outputs, force_rows
+from drake_dae.robots.force_outputs import ForceOutput, as_force_outputs, force_rows
 from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
@@ -123,7 +122,7 @@ class RobotModel:
         bound = ConstraintSet(self.constraints)
         if forces is None and (outputs is None or not (links.actuator_signals or bound.motors)):
             forces = ()  # The robot is only simulated.
-        self.forces = force_outputs(forces, bound)
+        self.forces = as_force_outputs(forces, bound)
         S = force_rows(self.forces, bound, links)  # (40)
         self._num_forces = S.shape[0]
         h_1 = ca.vertcat(

@@ -8,14 +8,13 @@ import casadi as ca
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
-from drake_dae.dae.system.fields import as_expression
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal, as_expression
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.kinematics import position_index
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.surfaces.surface import Vector
-from drake_dae.trace.given import numpy_explained, result_of
+from drake_dae.trace.expressions import result_of
 
 
 class PositionOutput(ABC):
@@ -197,8 +196,7 @@ class ExpressionOutput(PositionOutput):
     outputs: Sequence[Signal]
 
     def expression(self, links: Links) -> ca.SX:
-        with numpy_explained("the function of an ExpressionOutput"):
-            given = result_of("function", self.function, links)
+        given = result_of("function", self.function, links)
         value = ca.vec(as_expression("an ExpressionOutput", "its function", given))
         if value.numel() != len(self.outputs):
             raise ModelError(

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots.links.links import Links
 from drake_dae.trace.factorization import Factorization

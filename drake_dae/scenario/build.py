@@ -11,10 +11,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive, unknown_name
-from drake_dae.dae.beyond.disturbance import with_disturbance
-from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.dae.system.signals import outputs_named
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Structure, TrackingLaw, find_structure, outputs_named, with_disturbance
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import hold_before
 from drake_dae.diagrams.settings import LoopSettings
@@ -22,9 +19,7 @@ from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.references import Reference
-from drake_dae.robots.known_forces import ScaledForce
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import Links, RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.forms.keys import at, each, violated
 from drake_dae.scenario.gains import advised

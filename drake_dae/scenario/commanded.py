@@ -12,8 +12,7 @@ from drake_dae.arguments import checked
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.references import ConstantReference
-from drake_dae.robots.constraints.points import PointOnSurface
-from drake_dae.robots.known_forces import KnownWrench
+from drake_dae.robots import KnownWrench, PointOnSurface
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.robot_file.links import robot_links
 from drake_dae.scenario.scenario import Scenario

@@ -11,20 +11,21 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.by_name import denoted
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.constraints.plant_constraints import plant_constraints
-from drake_dae.robots.force_outputs import force_outputs, force_rows
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.outputs import (
+from drake_dae.robots import (
     AxisCoordinates,
+    Constraint,
+    ConstraintSet,
     JointPositions,
+    Links,
     PointCoordinates,
     PositionOutput,
+    as_force_outputs,
+    force_rows,
+    plant_constraints,
 )
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts.written import TiltFromNormalForm, WrittenOutput, make
@@ -75,7 +76,7 @@ def completions(
     """
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
     outputs = [make(form, constraints) for form in scenario.outputs]
-    steered = force_outputs(scenario.forces, bound)
+    steered = as_force_outputs(scenario.forces, bound)
     S = force_rows(steered, bound, links)
     rows = _Rows(scenario, links, outputs, bound)
     missing = len(links.actuator_signals) + len(bound.motors) - rows.given - S.shape[0]

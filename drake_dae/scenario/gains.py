@@ -9,21 +9,20 @@ import numpy as np
 from scipy.linalg import expm
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.beyond.advised_gains import (
-    EVERY,
-    MODEL_ERROR,
+from drake_dae.dae import (
     AdvisedGains,
+    ContactGains,
     SensedContact,
+    SensorNoise,
+    Structure,
     advised_gains,
+    contact_gains,
 )
-from drake_dae.dae.beyond.contact_gains import ContactGains, contact_gains
-from drake_dae.dae.beyond.one_direction import SensorNoise
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR
 from drake_dae.dae.tracking.model_of_law import damping_gains
 from drake_dae.errors import ScenarioError
 from drake_dae.references import Reference
-from drake_dae.robots.links.links import velocities_are_rates
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel, velocities_are_rates
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.parts import parts as parts

@@ -21,18 +21,17 @@ from drake_dae.analysis.limits import (
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, PinnedMotion, Signal, ZeroDynamics, find_structure
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.links_behind import LinkBehind, links_behind
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind
+from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
+from drake_dae.running.limits import limited_values, robot_limits
+from drake_dae.running.simulate import RunStatistics
+from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import tracking_law
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.gains import advised
@@ -41,11 +40,6 @@ from drake_dae.scenario.motion import exogenous_references, reference_and_start,
 from drake_dae.scenario.robot_file.links import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import check_task
-from drake_dae.simulation.judgement import FindingKind, Outcome, RunFinding, judge
-from drake_dae.simulation.limits import limited_values, robot_limits
-from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.simulate import RunStatistics
-from drake_dae.simulation.summary import RunSummary
 from drake_dae.systems.control.contract import PhaseChange
 from drake_dae.trace.functions import TracedFunction
 

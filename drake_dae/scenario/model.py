@@ -13,7 +13,7 @@ from drake_dae.analysis.analyze import examine
 from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.structure.structure import Structure, find_structure
+from drake_dae.dae import Structure, find_structure
 from drake_dae.errors import (
     AssumptionError,
     GeometryWarning,
@@ -21,16 +21,19 @@ from drake_dae.errors import (
     ModelError,
     ScenarioError,
 )
-from drake_dae.robots.actuation.chain import chain
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.constraints.plant_constraints import plant_constraints
-from drake_dae.robots.control_choice import control_choice
-from drake_dae.robots.force_outputs import force_outputs, force_rows
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.model import RobotModel
-from drake_dae.robots.outputs import PositionOutput
+from drake_dae.robots import (
+    Constraint,
+    ConstraintSet,
+    Links,
+    MultibodyExpressions,
+    PositionOutput,
+    RobotModel,
+    as_force_outputs,
+    chain,
+    control_choice,
+    force_rows,
+    plant_constraints,
+)
 from drake_dae.scenario.completion import Completed, completions
 from drake_dae.scenario.forms.keys import at, each
 from drake_dae.scenario.motion import in_the_way
@@ -179,9 +182,9 @@ def _checked_constraints(
     with at("actuation"):
         chain(scenario.actuation, links)
     forces, known = scenario.forces, scenario.robot.known_forces
-    each("forces", forces or (), lambda f: force_rows(force_outputs([f], bound), bound, links))
+    each("forces", forces or (), lambda f: force_rows(as_force_outputs([f], bound), bound, links))
     with at("forces"):
-        force_outputs(forces, bound)
+        as_force_outputs(forces, bound)
     for force, value in (scenario.compliances or {}).items():
         with at(f"compliances.{force}"):
             bound.place(force)

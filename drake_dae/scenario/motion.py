@@ -5,20 +5,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, PinnedMotion, Structure, ZeroDynamics
 from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.references.by_name import assign, in_order
 from drake_dae.references.reference import stack_references
-from drake_dae.robots.links_behind import links_behind
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel, links_behind
+from drake_dae.running.limits import robot_limits
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_state
-from drake_dae.simulation.limits import robot_limits
 
 _TIMES = 201
 """The number of times at which a completed scenario is examined."""

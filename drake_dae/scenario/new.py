@@ -33,13 +33,19 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import DrakeDaeError, ModelError, RobotFileWarning, ScenarioError
 from drake_dae.references import CircleReference, SinusoidReference
-from drake_dae.robots.constraints import PointOnSurface
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.constraints.plant_constraints import couplings_of
-from drake_dae.robots.links.frames import joint_names, unique_names
-from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.surfaces.surface import Surface, Vector
-from drake_dae.robots.surfaces.surfaces import Cylinder, Plane, Sphere
+from drake_dae.robots import (
+    ConstraintSet,
+    Cylinder,
+    MultibodyExpressions,
+    Plane,
+    PointOnSurface,
+    Sphere,
+    Surface,
+    Vector,
+    couplings_of,
+    joint_names,
+    unique_names,
+)
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.forms.typed_yaml import dump_yaml
 from drake_dae.scenario.model import NOTHING_FOUND, completed_model

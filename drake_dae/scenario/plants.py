@@ -11,9 +11,9 @@ from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import brief
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae import Structure
 from drake_dae.errors import DrakeDaeError, ModelError
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant

@@ -11,11 +11,7 @@ from pydrake.multibody.tree import WeldJoint
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Touch
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.links_behind import LinkDepths
-from drake_dae.robots.loop_state import LoopState
+from drake_dae.robots import ConstraintSet, LinkDepths, Links, LoopState, Touch
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 

@@ -10,16 +10,16 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record, RecordAfter
 from drake_dae.diagrams.state_feedback import (
     ENCODER_NOISE,
     encoder_seed,
 )
 from drake_dae.errors import ModelError, SimulationError
+from drake_dae.running.divergence import DivergenceWatch
 from drake_dae.running.rollout.problems import start_values
 from drake_dae.running.rollout.rollout import Rollout, diagnosed, run_loop
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.simulation.divergence import DivergenceWatch
-from drake_dae.simulation.records.record import Record, RecordAfter
 
 ROWS = 1000
 """The number of rows of a record of a rollout under error control, after the first."""

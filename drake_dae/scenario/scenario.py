@@ -15,8 +15,8 @@ from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae.arrays import listed
 from drake_dae.references import Reference
-from drake_dae.robots.actuation.stage import Stage
-from drake_dae.robots.force_outputs import ForceOutput
+from drake_dae.robots import ForceOutput, Stage
+from drake_dae.running.simulate import check_config, check_duration
 from drake_dae.scenario.forms import values
 from drake_dae.scenario.forms.forms import Reader
 from drake_dae.scenario.parts.families import CONFIG, FAMILIES, KEYS, VALUES
@@ -25,7 +25,6 @@ from drake_dae.scenario.parts.task import ScenarioTask
 from drake_dae.scenario.parts.written import WrittenConstraint, WrittenOutput
 from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.simulation.simulate import check_config, check_duration
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.trace.compiled import Compiled
 

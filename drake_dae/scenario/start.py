@@ -8,12 +8,10 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import Signal, ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.links.links import Links
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import Links, RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import opening_contact

@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import TrackingLaw, find_structure
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import Constraint, RobotModel
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario

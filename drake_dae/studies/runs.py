@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context
 from drake_dae.analysis.limits import SignalLimits
 from drake_dae.arrays import brief
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import (
     AssumptionError,
     DrakeDaeError,
@@ -24,17 +25,16 @@ from drake_dae.errors import (
     ScenarioError,
     SimulationError,
 )
+from drake_dae.running.limits import ranges_of, robot_limits
 from drake_dae.running.rollout.program import program_of
+from drake_dae.running.simulate import simulate
+from drake_dae.running.summary import figures_of
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.parts.parts import Matrices
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import Scenario, read_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.limits import ranges_of, robot_limits
-from drake_dae.simulation.records.record import Record
-from drake_dae.simulation.simulate import simulate
-from drake_dae.simulation.summary import figures_of
 from drake_dae.studies.variations import Variation
 
 

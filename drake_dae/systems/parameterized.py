@@ -13,8 +13,7 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.blocks.block import Block, Requirement
 from drake_dae.blocks.computations import Computations
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, DerivativeLayout
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 

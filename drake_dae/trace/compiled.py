@@ -11,10 +11,13 @@ better choice. Calls are counted instead of reading a clock, so that each run do
 """
 
 import hashlib
+import os
 import re
+import stat
+import sys
+import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,8 +25,7 @@ import casadi as ca
 
 from drake_dae.arrays import brief
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
-from drake_dae.trace import cache as files
-from drake_dae.trace.compiler import FLAGS, Compiler, CompilerHangs, find_compiler, give_up
+from drake_dae.trace.compiler import FLAGS, find_compiler
 
 Compiled = bool | Literal["auto"]
 """Whether functions become machine code."""
@@ -41,13 +43,10 @@ STARTING = 0.05
 """The start-up time of a compiler, in s."""
 
 LIMIT = 10.0
-"""The longest compilation under "auto", in s."""
+"""The longest expected compilation under "auto", in s."""
 
-PATIENCE = 3.0
-"""Under "auto" a compiler that takes this many times longer than expected is stopped."""
-
-SLOWEST = 10.0
-"""Under True a compiler that takes this many times longer than expected counts as hanging."""
+HANGS = (30.0, 10.0)
+"""A compiler hangs if it takes this long, in s, and this many times longer than expected."""
 
 
 def attempts(compiled: Compiled, operations: int) -> list[tuple[int, bool]]:
@@ -80,15 +79,7 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     # With many results, a branch for each takes the compiler ten times as long.
     source = without_branches(generate(function))
     path = library(source, function.n_instructions(), compiled, make)
-    if path is None:
-        return None
-    with _warned(make):  # Which makes it None.
-        try:
-            return ca.external(function.name(), str(path))
-        except RuntimeError as error:
-            lines = [line for line in str(error).splitlines() if line.strip()] or [""]
-            why = f"compiled code cannot be loaded: {brief(lines[-1])}"
-            raise MachineCodeError(why) from None
+    return None if path is None else ca.external(function.name(), str(path))
 
 
 def library(
@@ -99,41 +90,85 @@ def library(
     Warns:
         MachineCodeWarning: Machine code is requested and cannot be made.
     """
-    more = tuple(options)
-    with _warned(make):  # Which makes it None.
-        compiler = find_compiler()
-        for level in ("-O1", "-O0") if compiled == "auto" else ("-O1",):
-            path = files.find(_key(source, compiler, level, more))
-            if path is not None:
-                return path
-        level = _level(compiled, operations)
-        if not (make and level):
-            return None
-        with files.workplace() as folder:
-            usual = STARTING + COMPILING[level] * operations
-            seconds = max(PATIENCE * LIMIT, SLOWEST * usual if compiled is True else 0.0)
-            try:
-                compiler.compile(source, folder / "code", level, seconds, more)
-            except CompilerHangs as error:
-                give_up(compiler, error)
-                raise
-            return files.store(_key(source, compiler, level, more), folder / "code.so")
-
-
-@contextmanager
-def _warned(make: bool) -> Iterator[None]:
-    """Ends with a warning, if machine code was requested, where a MachineCodeError is raised."""
     try:
-        yield
+        return _library(source, operations, compiled, make, tuple(options))
     except MachineCodeError as error:
-        if make:
-            # One text at one place: Python shows it once.
-            warnings.warn(
-                f"{error}. Functions run interpreted, at about a tenth of the speed; that is "
-                "chosen without this warning by compiled=False (scenarios: compiled: false)",
-                MachineCodeWarning,
-                stacklevel=1,
-            )
+        reason = str(error)
+    except OSError as error:
+        reason = f"the cache of compiled code cannot be used: {error}"
+    if make:
+        # One text at one place: Python shows it once.
+        warnings.warn(
+            f"{reason}. Functions run interpreted, at about a tenth of the speed; that is "
+            "chosen without this warning by compiled=False (scenarios: compiled: false)",
+            MachineCodeWarning,
+            stacklevel=1,
+        )
+    return None
+
+
+def _library(
+    source: str, operations: int, compiled: Compiled, make: bool, options: tuple[str, ...]
+) -> Path | None:
+    compiler, folder = find_compiler(), cache_folder()
+
+    def stored(level: str) -> Path:
+        build = (*FLAGS, *compiler.target, level, *options)
+        parts = "\0".join((source, *compiler.command, compiler.identity, *build))
+        return folder / f"{hashlib.sha256(parts.encode()).hexdigest()[:32]}.so"
+
+    for level in ("-O1", "-O0") if compiled == "auto" else ("-O1",):
+        if stored(level).exists():
+            _check_trusted(folder)
+            return stored(level)
+    level = _level(compiled, operations)
+    if not (make and level):
+        return None
+    folder.mkdir(0o700, parents=True, exist_ok=True)
+    _check_trusted(folder)
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        file = Path(own) / "code"
+        expected = STARTING + COMPILING[level] * operations
+        compiler.compile(source, file, level, max(HANGS[0], HANGS[1] * expected), options)
+        file.with_suffix(".so").chmod(0o700)
+        os.replace(file.with_suffix(".so"), stored(level))
+    return stored(level)
+
+
+def cache_folder() -> Path:
+    """Returns the path of the cache, also if it does not exist: DRAKE_DAE_CACHE if it is set.
+
+    Otherwise drake_dae in the user's folder for caches: $XDG_CACHE_HOME, or ~/Library/Caches on
+    macOS and ~/.cache elsewhere. Files are put there by one `os.replace` and never change, so that
+    processes share it without locks.
+    """
+    if os.environ.get("DRAKE_DAE_CACHE"):
+        return Path(os.environ["DRAKE_DAE_CACHE"]).absolute()
+    folder = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if folder.is_absolute():  # Its specification says to ignore other paths.
+        return folder / "drake_dae"
+    try:
+        home = Path.home()
+    except RuntimeError:
+        raise MachineCodeError(
+            "no folder for a cache: this user has no home; name one in DRAKE_DAE_CACHE"
+        ) from None
+    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "drake_dae"
+
+
+def _check_trusted(folder: Path) -> None:
+    """Its files are loaded into the process: nobody else may write them."""
+    status = folder.stat()
+    if status.st_uid != os.getuid():
+        raise MachineCodeError(
+            f"the cache {folder} belongs to another user (id {status.st_uid}), whose code is not "
+            "loaded; name a folder of your own in DRAKE_DAE_CACHE"
+        )
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise MachineCodeError(
+            f"others can write the cache {folder} (mode {stat.S_IMODE(status.st_mode):04o}), so "
+            f"its code is not loaded; chmod 700 {folder}"
+        )
 
 
 def without_branches(source: str) -> str:
@@ -176,14 +211,8 @@ def renamed(function: ca.Function, name: str) -> ca.Function:
 
 
 def _level(compiled: Compiled, operations: int) -> str:
-    """Returns the optimization level for a function; empty if compilation would take too long."""
+    """The optimization level for a function; empty if compilation would take too long."""
     if compiled is True:
         return "-O1"
     fast = (level for level, seconds in COMPILING.items() if seconds * operations < LIMIT)
     return next(fast, "")
-
-
-def _key(source: str, compiler: Compiler, level: str, options: tuple[str, ...]) -> str:
-    options_of_build = *FLAGS, *compiler.target, level, *options
-    parts = (source, *compiler.command, compiler.identity, *options_of_build)
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]

@@ -32,8 +32,7 @@ cent with rigid joints, 12 with flexible ones, and 20 to 25 for two arms or a ha
 
 NATIVE = "-march=native"
 """Uses all instructions of this processor, if the compiler accepts the option. Without it a call on
-x86-64 takes 10 % longer, sometimes twice as long, because older instructions mix with newer ones of
-libm and memcpy. The results are the same to the bit."""
+x86-64 takes 10 % longer, sometimes twice as long. The results are the same to the bit."""
 
 ZIG = ("-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
 """Options that make Python a C compiler, if ziglang is installed: code for any processor, since
@@ -51,14 +50,12 @@ WEB_PATIENCE = 600.0
 ANSWERS = 10.0
 """A compiler that takes longer than this to report its version counts as hanging, in s."""
 
+_HANGING: dict[str, str] = {}
+"""Compilers that hung in this process, by identity, with the message: each is waited for once."""
+
 
 class CompilerHangs(MachineCodeError):
     """The exception for a compiler that does not finish."""
-
-
-_HANGING: dict[str, str] = {}
-"""Compilers that hung in this process, by identity, with the message: each is waited for only
-once."""
 
 
 class Compiler(NamedTuple):
@@ -75,17 +72,11 @@ class Compiler(NamedTuple):
         code, library = file.with_suffix(".c"), file.with_suffix(".so")
         code.write_text(source)
         options = [*FLAGS, *self.target, *more, level, str(code), "-o", str(library), "-lm"]
-        done = _run([*self.command, *options], seconds)
-        if done.returncode or not library.exists():
-            raise MachineCodeError(_failure(self.command, done, file.parent))
-
-
-def _failure(command: Sequence[str], done: "subprocess.CompletedProcess[str]", folder: Path) -> str:
-    """The message for a compiler that fails, with its first error."""
-    lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
-    wrong = [line for line in lines if "error" in line.lower()] or lines or ["no message"]
-    said = wrong[0].replace(f"{folder}/", "").strip()
-    return f"the C compiler '{shlex.join(command)}' fails (exit {done.returncode}): {said}"
+        try:
+            _compile([*self.command, *options], library, seconds)
+        except CompilerHangs as error:
+            _HANGING[self.identity] = str(error)
+            raise
 
 
 def find_compiler() -> Compiler:
@@ -109,57 +100,73 @@ def gcc_options(*options: str) -> tuple[str, ...]:
     return ()
 
 
-def give_up(compiler: Compiler, error: MachineCodeError) -> None:
-    """Marks a compiler that hung, so that this process does not wait for it again."""
-    _HANGING[compiler.identity] = str(error)
-
-
 @cache
 def _find_compiler(named: str, path: str) -> Compiler | str:
-    """Returns the compiler, or the reason why there is none; a hanging one is waited for once."""
-    try:
-        return _looked_up(named)
-    except MachineCodeError as error:
-        return str(error)
-
-
-def _looked_up(named: str) -> Compiler:
+    """The compiler, or the reason why there is none; a hanging one is waited for once."""
     try:
         command = shlex.split(named)
     except ValueError as error:
-        raise MachineCodeError(f"CC is no command, {named!r}: {error}") from None
+        return f"CC is no command, {named!r}: {error}"
     if not command:
         has_own = shutil.which("cc") or find_spec("ziglang") is None
         command = ["cc"] if has_own else [sys.executable, *ZIG]
     if shutil.which(command[0]) is None:
         where = f"CC names '{command[0]}', which is" if named.strip() else "'cc' is"
-        raise MachineCodeError(
+        return (
             f"no C compiler: {where} not found; install gcc or clang, or drake_dae[compiler], or "
             "name one in CC"
         )
-    version = _run([*command, "--version"], ANSWERS)
-    library = "CS_GNU_LIBC_VERSION" in os.confstr_names and os.confstr("CS_GNU_LIBC_VERSION")
     # The option for this processor, and the target that the compiler derives from it. The target is
     # part of the identity, so that machines with a shared cache each have their own code.
     target: tuple[str, ...] = ()
     processor = ""
-    if not any(word.startswith(("-march", "-mcpu")) for word in command):
-        answer = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull], ANSWERS)
-        if answer.returncode == 0:
-            target, processor = (NATIVE,), answer.stdout
+    try:
+        version = _run([*command, "--version"], ANSWERS)
+        if not any(word.startswith(("-march", "-mcpu")) for word in command):
+            answer = _run([*command, NATIVE, "-dM", "-E", "-x", "c", os.devnull], ANSWERS)
+            if answer.returncode == 0:
+                target, processor = (NATIVE,), answer.stdout
+    except MachineCodeError as error:
+        return str(error)
+    library = "CS_GNU_LIBC_VERSION" in os.confstr_names and os.confstr("CS_GNU_LIBC_VERSION")
     machine = (library, platform.system(), platform.machine(), processor)
     words = (shutil.which(command[0]), version.stdout, version.stderr, *machine)
     return Compiler(tuple(command), repr(words), target)
 
 
+def compile_webassembly(sources: Sequence[Path], file: Path) -> None:
+    """Compiles C sources to a WebAssembly module that imports nothing, by the zig of ziglang.
+
+    The first call on a machine compiles zig's C library as well, which takes half a minute.
+    """
+    if find_spec("ziglang") is None:
+        raise MachineCodeError(
+            "WebAssembly is compiled by zig, which is not installed: pip install "
+            "'drake_dae[compiler]'"
+        )
+    _compile([sys.executable, *WEB, *map(str, sources), "-o", str(file)], file, WEB_PATIENCE)
+
+
+def _compile(command: list[str], file: Path, seconds: float) -> None:
+    """Runs a command that makes a file; where it fails, raises with its first error."""
+    done = _run(command, seconds)
+    if done.returncode or not file.exists():
+        lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
+        wrong = [line for line in lines if "error" in line.lower()] or lines or ["no message"]
+        raise MachineCodeError(
+            f"the C compiler '{command[0]}' fails (exit {done.returncode}): {wrong[0].strip()}"
+        )
+
+
 def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str]":
     """Runs a command to its end. After a timeout it also ends the child processes."""
+    pipe = subprocess.PIPE
     try:
         with subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stdout=pipe,
+            stderr=pipe,
             text=True,
             errors="replace",
             process_group=0,
@@ -177,19 +184,3 @@ def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str
         ) from None
     except (OSError, ValueError) as error:
         raise MachineCodeError(f"the C compiler '{command[0]}' does not run: {error}") from None
-
-
-def compile_webassembly(sources: Sequence[Path], file: Path) -> None:
-    """Compiles C sources to a WebAssembly module that imports nothing, by the zig of ziglang.
-
-    The first call on a machine compiles zig's C library as well, which takes half a minute.
-    """
-    if find_spec("ziglang") is None:
-        raise MachineCodeError(
-            "WebAssembly is compiled by zig, which is not installed: pip install "
-            "'drake_dae[compiler]'"
-        )
-    command = [sys.executable, *WEB, *map(str, sources), "-o", str(file)]
-    done = _run(command, WEB_PATIENCE)
-    if done.returncode or not file.exists():
-        raise MachineCodeError(_failure(command, done, sources[0].parent))

@@ -123,47 +123,34 @@ class PositiveDefiniteFactorization:
 class Factors(Protocol):
     """A factorization A = L D L^T, as `PositiveDefiniteFactorization`."""
 
-    def solve(self, right: ca.SX) -> ca.SX:
-        """Returns X of A X = B."""
-
-    def forward(self, right: ca.SX) -> ca.SX:
-        """Returns Y = L^-1 B."""
-
-    def backward(self, half: ca.SX) -> ca.SX:
-        """Returns X = L^-T D^-1 Y."""
-
-    def scaled(self, half: ca.SX) -> ca.SX:
-        """Returns D^-1 Y."""
+    def solve(self, right: ca.SX) -> ca.SX: ...
+    def forward(self, right: ca.SX) -> ca.SX: ...
+    def backward(self, half: ca.SX) -> ca.SX: ...
+    def scaled(self, half: ca.SX) -> ca.SX: ...
 
 
 class BlockFactors:
-    """The factors of a block-diagonal matrix, from those of its blocks."""
+    """The factors of a block-diagonal matrix, from those of its blocks, as `Factors`."""
 
     def __init__(self, blocks: Sequence[tuple[Factors, int]]) -> None:
         self._factors = [factors for factors, _ in blocks]
         self._stops = np.cumsum([0, *[size for _, size in blocks]]).tolist()
 
     def solve(self, right: ca.SX) -> ca.SX:
-        """Returns X of A X = B."""
         return self.backward(self.forward(right))
 
     def forward(self, right: ca.SX) -> ca.SX:
-        """Returns Y = L^-1 B."""
         return self._each("forward", right)
 
     def backward(self, half: ca.SX) -> ca.SX:
-        """Returns X = L^-T D^-1 Y."""
         return self._each("backward", half)
 
     def scaled(self, half: ca.SX) -> ca.SX:
-        """Returns D^-1 Y."""
         return self._each("scaled", half)
 
     def _each(self, name: str, matrix: ca.SX) -> ca.SX:
-        parts = ca.vertsplit(matrix, self._stops)
-        return ca.vertcat(
-            *[getattr(f, name)(part) for f, part in zip(self._factors, parts, strict=True)]
-        )
+        parts = zip(self._factors, ca.vertsplit(matrix, self._stops), strict=True)
+        return ca.vertcat(*[getattr(factors, name)(part) for factors, part in parts])
 
 
 def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:

@@ -72,18 +72,14 @@ def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
                 if len(arguments) == count:
                     return function(*map(value, arguments))
                 why = f"{name} takes {count} value(s), got '{_short(piece)}'"
-            case ast.Name(id=name) if name in _FUNCTIONS:
-                why = f"'{name}' is a function and takes brackets, {name}(x)"
             case ast.Name(id=name):
                 why = unknown_name("name", name, names)
-            case ast.Call(ast.Name(id=name)) if name not in (*_FUNCTIONS, *_ROUGH):
-                why = unknown_name("function", name, _FUNCTIONS)
             case ast.Call(ast.Name(id=name)) if name in _ROUGH:
                 why = f"'{_short(piece)}' {_SMOOTH_INSTEAD}"
+            case ast.Call(ast.Name(id=name)):
+                why = unknown_name("function", name, _FUNCTIONS)
             case ast.Compare() | ast.IfExp() | ast.BoolOp():
                 why = f"'{_short(piece)}' {_SMOOTH_INSTEAD}"
-            case ast.BinOp(op=ast.BitXor()):
-                why = f"'{_short(piece)}' has ^; a power is x**2"
             case _:
                 why = (
                     f"'{_short(piece)}' is not allowed; a formula has finite numbers, names, "

@@ -52,13 +52,12 @@ def count_operations(expression: ca.SX) -> int:
 
 
 class TracedFunction:
-    """A compiled or interpreted function of CasADi expressions on preallocated NumPy arrays.
+    """A function of CasADi expressions on preallocated NumPy arrays, compiled or interpreted.
 
-    Each thread has arrays of its own, so that calls from several threads do not mix. A call goes
-    through CasADi's buffer interface and allocates nothing. It also computes one number that says
-    whether its values are valid, see `is_valid`. Only here it is decided whether a function is
-    interpreted or compiled, by the choice `compiled` of the caller. CasADi's function is made when
-    it is first needed: many blocks run as parts of a whole, and a report needs few.
+    Each thread has arrays of its own. A call goes through CasADi's buffer interface and allocates
+    nothing; it also computes one number that says whether its values are valid, see `is_valid`.
+    Only here it is decided whether a function is interpreted or compiled. CasADi's function is made
+    when it is first needed: many blocks run as parts of a whole, and a report needs few.
     """
 
     def __init__(
@@ -102,10 +101,7 @@ class TracedFunction:
 
     @cached_property
     def function(self) -> ca.Function:
-        """The CasADi function: outputs, pivot, and a number that is finite if all outputs are.
-
-        With a pivot, a last number is finite if the pivot is large enough as well.
-        """
+        """The CasADi function: outputs, pivot, and numbers that are finite if they are valid."""
         expressions = self._expressions
         if self._often and not self._lean:
             expressions = ca.cse(expressions)
@@ -121,9 +117,7 @@ class TracedFunction:
         """Makes the function before the first call, and machine code after some more."""
         with self._lock:
             if self._attempts is None:
-                self._attempts = (
-                    attempts(self._compiled, self.num_operations) if self._often else []
-                )
+                self._attempts = attempts(self._compiled, self.num_operations)[: 9 * self._often]
                 self._calls_left = self._attempts[0][0] if self._attempts else 0
                 self._current = self.function
             if not self._attempts:
@@ -140,13 +134,11 @@ class TracedFunction:
 
     @property
     def _arrays(self) -> "_Arrays":
-        """The arrays of this thread."""
         try:
             arrays: _Arrays = self._local.arrays
         except AttributeError:
-            arrays = self._local.arrays = _Arrays(
-                self.sizes, [e.shape for e in self._expressions], self._num_outputs
-            )
+            shapes = [e.shape for e in self._expressions]
+            arrays = self._local.arrays = _Arrays(self.sizes, shapes, self._num_outputs)
         return arrays
 
     def evaluate(self, *arguments: FloatArray | float) -> tuple[FloatArray, ...]:
@@ -238,17 +230,13 @@ class TracedFunction:
                 f"{self.name} takes {self._num_inputs} arguments "
                 f"({', '.join(self.input_names)}), got {len(arguments)}"
             )
-        arrays = [
-            numbers(f"{self.name}: '{label}'", argument)
-            for label, argument in zip(self.input_names, arguments, strict=True)
-        ]
-        for label, size, array in zip(self.input_names, self.sizes, arrays, strict=True):
-            if array.size != size:
-                raise ModelError(f"{self.name}: '{label}' has size {array.size}, not {size}")
-            if array.ndim > 1 and array.shape != (size, 1):
+        arrays = []
+        for label, size, argument in zip(self.input_names, self.sizes, arguments, strict=True):
+            array = numbers(f"{self.name}: '{label}'", argument)
+            if array.size != size or (array.ndim > 1 and array.shape != (size, 1)):
                 raise ModelError(f"{self.name}: '{label}' has shape {array.shape}, not {(size,)}")
-        values = self.evaluate(*(array.reshape(-1) for array in arrays))
-        return tuple(output.copy() for output in values)
+            arrays.append(array.reshape(-1))
+        return tuple(output.copy() for output in self.evaluate(*arrays))
 
 
 class _Arrays:

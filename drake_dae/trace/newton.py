@@ -139,24 +139,15 @@ def shortest_steps(
     length = np.sqrt((gradients * gradients).sum(axis=1))
     length[length == 0.0] = 1.0
     rows = gradients / length[:, None]
-    q, r = _orthogonalized(rows.T)
+    # LAPACK itself: SciPy's functions take several times as long around the same calls. Below the
+    # diagonal of R entries are not zero; nothing reads them.
+    least = min(rows.shape)
+    factors, tau, *_ = dgeqrf(rows.T)
+    q, r = dorgqr(factors[:, :least], tau)[0], factors[:least]
     if len(rows) > len(q) or np.abs(r.diagonal()).min(initial=1.0) <= DEPENDENT:
         inverse = np.linalg.pinv(rows, DEPENDENT)
         return NewtonModel(lambda x: -inverse @ (residual(x) / length), False)
-    # LAPACK itself: SciPy's solve_triangular takes ten times as long around the same call.
     return NewtonModel(lambda x: -q @ dtrtrs(r, residual(x) / length, trans=1)[0], True)
-
-
-def _orthogonalized(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Q and R of a matrix, shapes (n, l) and (l, k) with l = min(n, k).
-
-    The entries below the diagonal of R are not zero: LAPACK does not read them.
-
-    LAPACK itself: SciPy's `qr` takes several times as long around the same calls.
-    """
-    least = min(matrix.shape)
-    factors, tau, *_ = dgeqrf(matrix)
-    return dorgqr(factors[:, :least], tau)[0], factors[:least]
 
 
 def steps_along(

@@ -14,9 +14,7 @@ from runs import some
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.analysis.report import Finding
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae import DaeSystem, Verdict, find_structure
 
 
 @pytest.mark.slow

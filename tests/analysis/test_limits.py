@@ -9,14 +9,13 @@ from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from drake_dae import ConstantReference, DaeSystem, SinusoidReference, ZeroDynamics, load_scenario
 from drake_dae.analysis.limits import LimitKind, SignalLimits, limits_along
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal, find_structure
 from drake_dae.errors import ScenarioError
+from drake_dae.running.judgement import FindingKind
+from drake_dae.running.limits import robot_limits
+from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
-from drake_dae.simulation.judgement import FindingKind
-from drake_dae.simulation.limits import robot_limits
-from drake_dae.simulation.simulate import simulate
 from drake_dae.systems.control.references import ReferenceGenerator
 
 TIMES = np.linspace(0.0, 2.0, 401)

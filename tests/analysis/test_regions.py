@@ -12,9 +12,8 @@ from problems import (
 from problems.found import NO, findings
 
 from drake_dae.analysis.analyze import analyze
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.states.region import ConsistentRegion, Region
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Manifold, Region
+from drake_dae.dae.states.region import ConsistentRegion
 from drake_dae.errors import InconsistentStateError, ModelError
 
 

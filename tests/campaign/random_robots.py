@@ -46,12 +46,8 @@ from drake_dae import (
     poles,
     simulate,
 )
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.robots.actuation.stage import Stage
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.outputs import PositionOutput
-from drake_dae.robots.surfaces.surface import Surface
+from drake_dae.dae import find_structure
+from drake_dae.robots import Constraint, MultibodyExpressions, PositionOutput, Stage, Surface
 
 Random = np.random.Generator
 

@@ -19,8 +19,8 @@ from drake_dae.cli import main
 from drake_dae.commands import simulate
 from drake_dae.pictures import run_pictures
 from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.scene import view
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scene import view
 
 
 @pytest.mark.parametrize("name", ["scenario.yaml", "controls.png"])

@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from drake_dae.files import complete
-from drake_dae.simulation.records.interruption import end_at_once, ending_signals
+from drake_dae.running.interruption import end_at_once, ending_signals
 
 
 def test_files_appear_when_they_are_complete(tmp_path):

@@ -16,10 +16,10 @@ from runs import scenario, some
 from drake_dae import Record, simulate
 from drake_dae.cli import main
 from drake_dae.commands.folder import FILES, PART
+from drake_dae.running.interruption import ENDING_SIGNALS
 from drake_dae.running.rollout.stepping.course import RunStepper
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
-from drake_dae.simulation.records.interruption import ENDING_SIGNALS
 
 SECONDS = 2.5
 """Of the run, by a clock; plots and animation follow."""

@@ -4,9 +4,8 @@ import pytest
 from problems import PROBLEMS, changed
 from runs import some
 
-from drake_dae.dae.derivatives import Derivatives, lie_derivative
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Derivatives, find_structure
+from drake_dae.dae.derivatives import lie_derivative
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 

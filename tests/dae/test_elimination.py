@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from problems import PROBLEMS, Problem
 
+from drake_dae.dae import find_structure
 from drake_dae.dae.derivatives import lie_derivative, lie_derivative_along
-from drake_dae.dae.structure.structure import find_structure
 from drake_dae.trace.functions import TracedFunction
 
 

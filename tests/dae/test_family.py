@@ -7,10 +7,7 @@ from runs import some
 
 from drake_dae import DaePlant, analyze
 from drake_dae.analysis.report import Finding
-from drake_dae.dae.structure.assumptions import ViolationKind
-from drake_dae.dae.structure.constrained import find_constraint_structure
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, ViolationKind, find_constraint_structure, find_structure
 from drake_dae.errors import AssumptionError, ModelError
 
 

@@ -6,9 +6,7 @@ import pytest
 import scipy.linalg
 from arms import arm, consistent_states, numbers
 
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.structure.constrained import find_constraint_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Manifold, find_constraint_structure
 
 
 def least(mass: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:

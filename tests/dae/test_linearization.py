@@ -8,11 +8,16 @@ from problems import PROBLEMS, hanging_pendulum
 from runs import some
 from scipy.optimize import root
 
-from drake_dae.dae.linearization import Linearization, linearize, linearize_loop
-from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.gains import poles
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import (
+    DaeSystem,
+    Linearization,
+    Structure,
+    TrackingLaw,
+    find_structure,
+    linearize,
+    linearize_loop,
+    poles,
+)
 
 Array = np.ndarray
 

@@ -12,9 +12,7 @@ from problems import PROBLEMS, knife_edge
 from runs import some
 from two_arms import two_arms
 
-from drake_dae.dae.normal_form import NormalForm
-from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, NormalForm, Structure, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import NewtonModel, newton
 

@@ -6,9 +6,7 @@ import pytest
 import scipy.linalg
 from problems import PROBLEMS, Problem
 
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.stability import Verdict
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, Verdict, ZeroDynamics
 
 # ---- linear systems by matrix computations
 

@@ -7,10 +7,7 @@ from runs import some
 
 from drake_dae import analyze
 from drake_dae.analysis.report import Finding
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import EndCause
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, EndCause, ZeroDynamics, find_structure
 from drake_dae.errors import AssumptionError, ModelError, NegligibleWarning
 
 

@@ -34,16 +34,15 @@ from drake_dae import (
     simulate,
     start_meshcat,
 )
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
-from drake_dae.pictures.scene.arrows import ForceArrows, GrowingPaths
-from drake_dae.pictures.scene.run_motion import contact_paths, follow, frame_times
-from drake_dae.pictures.scene.surroundings import scene_extent
-from drake_dae.pictures.scene.view import FRAME_RATE, draw_scene
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches
+from drake_dae.pictures.run_motion import contact_paths, follow, frame_times
+from drake_dae.robots import ConstraintWrenches, Wrenches, tangents
 from drake_dae.robots.surfaces import surfaces
-from drake_dae.robots.surfaces.surface import tangents
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation.records.record import Recorded
+from drake_dae.scene.arrows import ForceArrows, GrowingPaths
+from drake_dae.scene.surroundings import scene_extent
+from drake_dae.scene.view import FRAME_RATE, draw_scene
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 

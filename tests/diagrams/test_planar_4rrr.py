@@ -7,7 +7,7 @@ from runs import run_scenario, scenario
 
 from drake_dae import FlexibleJoints, RobotModel, TrackingLaw, ZeroDynamics, build_scenario, poles
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae import Verdict
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.model import scenario_model
 

@@ -16,7 +16,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia, UnitInertia
 
 from drake_dae import RobotModel, RobotPlant, RollingWheel, Signal, simulate
-from drake_dae.robots.constraints.constraint import Application, Constraint
+from drake_dae.robots import Application, Constraint
 
 MASS, RADIUS, GRAVITY = 0.4, 0.25, 9.81
 ACROSS, ABOUT = MASS * RADIUS**2 / 4, MASS * RADIUS**2 / 2

@@ -14,9 +14,7 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 from pydrake.systems.framework import DiagramBuilder
 from scipy.integrate import solve_ivp
 
-from drake_dae.dae.structure.constrained import find_constraint_structure
-from drake_dae.dae.system.signals import Parameter
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Parameter, find_constraint_structure
 from drake_dae.references import ExpressionReference
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.dae_plant import DaePlant

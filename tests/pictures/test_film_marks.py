@@ -9,9 +9,9 @@ from pydrake.systems.analysis import SimulatorConfig
 from runs import run, scenario
 
 from drake_dae import build_scenario
+from drake_dae.pictures.film_marks import FilmMarks, told
 from drake_dae.pictures.moments import RunEvent, RunEventKind
-from drake_dae.pictures.scene.film_marks import FilmMarks, told
-from drake_dae.pictures.scene.run_motion import follow
+from drake_dae.pictures.run_motion import follow
 
 QUICK = SimulatorConfig(
     integration_scheme="runge_kutta3", max_step_size=0.01, use_error_control=False

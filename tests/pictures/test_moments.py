@@ -7,16 +7,16 @@ import pytest
 from arms import arm
 from runs import scenario
 
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record, Recorded
 from drake_dae.pictures.event_marks import mark_phases
+from drake_dae.pictures.friction import friction_cones, slips
 from drake_dae.pictures.moments import RunEvent, RunEventKind, events_of, sorted_events
 from drake_dae.pictures.plots import plot_controls
-from drake_dae.pictures.scene.friction import friction_cones, slips
-from drake_dae.pictures.scene.run_motion import follow
+from drake_dae.pictures.run_motion import follow
+from drake_dae.running.limits import robot_limits
+from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
-from drake_dae.simulation.limits import robot_limits
-from drake_dae.simulation.records.record import Record, Recorded
-from drake_dae.simulation.simulate import simulate
 
 TIMES = np.linspace(0.0, 10.0, 101)
 

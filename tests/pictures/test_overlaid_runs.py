@@ -9,10 +9,10 @@ from runs import scenario
 
 from drake_dae import Record, build_scenario, simulate
 from drake_dae.cli import main
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.pictures.runs import plot_runs
-from drake_dae.simulation.records.record import Recorded
 
 TIME = np.linspace(0.0, 2.0, 21)
 OUTPUTS = (Signal("tool.y", "m"), Signal("wall.force", "N"))

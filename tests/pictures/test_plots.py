@@ -5,7 +5,8 @@ import pytest
 from matplotlib.colors import to_hex
 
 from drake_dae import Record
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Recorded
 from drake_dae.pictures.plots import (
     PLOTS,
     plot_controls,
@@ -15,9 +16,8 @@ from drake_dae.pictures.plots import (
     plot_residual,
     save_plots,
 )
-from drake_dae.pictures.scene.run_motion import ContactPath
-from drake_dae.simulation.records.phases import phase_spans, phases_at
-from drake_dae.simulation.records.record import Recorded
+from drake_dae.pictures.run_motion import ContactPath
+from drake_dae.running.phases import phase_spans, phases_at
 
 TIME = np.linspace(0.0, 2.0, 41)
 

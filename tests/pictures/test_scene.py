@@ -6,13 +6,13 @@ from matplotlib.figure import Figure
 from runs import scenario, some
 
 from drake_dae.pictures.film import _HEIGHT, _TOP, _WIDTH, _Scene
-from drake_dae.pictures.scene.floor import floor_below
-from drake_dae.pictures.scene.framing import ViewAngles, direction_of, framed
-from drake_dae.pictures.scene.labels import label_box, overlap, reserved_pixels
-from drake_dae.pictures.scene.run_motion import follow, run_points
-from drake_dae.pictures.scene.surroundings import scene_points, surroundings
+from drake_dae.pictures.labels import label_box, overlap, reserved_pixels
+from drake_dae.pictures.run_motion import follow, run_points
+from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
-from drake_dae.simulation.simulate import simulate
+from drake_dae.scene.floor import floor_below
+from drake_dae.scene.framing import ViewAngles, direction_of, framed
+from drake_dae.scene.surroundings import scene_points, surroundings
 
 WITHIN = (0.0, 0.0, 480.0, 400.0)
 

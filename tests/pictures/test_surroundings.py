@@ -11,10 +11,10 @@ from runs import some
 
 from drake_dae.pictures.animation import animate
 from drake_dae.pictures.plots import plot_paths
-from drake_dae.pictures.scene.run_motion import contact_paths, follow, run_points
-from drake_dae.pictures.scene.surroundings import surroundings
+from drake_dae.pictures.run_motion import contact_paths, follow, run_points
+from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
-from drake_dae.simulation.simulate import simulate
+from drake_dae.scene.surroundings import surroundings
 from tests.support.runs import scenario
 
 

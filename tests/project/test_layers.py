@@ -87,7 +87,7 @@ def test_the_guide_has_the_rules_of_this_file() -> None:
 
 
 def test_the_guide_has_the_order_of_the_paper() -> None:
-    (order,) = re.findall(r"^    (system/(?:\s+\w+/?)*)$", GUIDE, flags=re.MULTILINE)
+    (order,) = re.findall(r"^    (signals(?:\s+\w+/?)*)$", GUIDE, flags=re.MULTILINE)
     assert tuple(name.rstrip("/") for name in order.split()) == PAPER
 
 

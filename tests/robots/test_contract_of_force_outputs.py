@@ -20,8 +20,7 @@ from drake_dae import (
     Squeeze,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.force_outputs import force_outputs, force_rows
+from drake_dae.robots import ConstraintSet, as_force_outputs, force_rows
 from drake_dae.scenario.model import scenario_model
 from drake_dae.trace.functions import TracedFunction
 
@@ -124,9 +123,9 @@ class Pressed(ForceOutput):
             lambda: ForceCombination({"grip1.fx": 1.0, "gear.moment": 1.0}, "a").signals(bound()),
             "'a'",
         ),
-        (lambda: force_outputs(["grip1.fx", "grip1.fx"], bound()), r"grip1\.fx"),
+        (lambda: as_force_outputs(["grip1.fx", "grip1.fx"], bound()), r"grip1\.fx"),
         (
-            lambda: force_outputs([Squeeze("object", "grip1", "grip2")] * 2, bound()),
+            lambda: as_force_outputs([Squeeze("object", "grip1", "grip2")] * 2, bound()),
             r"grip1\.grip2\.squeeze",
         ),
         (lambda: force_rows([Pressed()], bound(), robot().links), "pressed"),

@@ -20,7 +20,7 @@ from drake_dae import (
     TiltFromNormal,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots.outputs import PositionOutput
+from drake_dae.robots import PositionOutput
 from drake_dae.trace.functions import TracedFunction
 
 WALL = PointOnSurface("tool", Plane((0.7, 0, 0), (-1, 0, 0)), name="wall")

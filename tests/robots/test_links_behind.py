@@ -16,8 +16,7 @@ from drake_dae import (
     Sphere,
     shipped_model,
 )
-from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.links_behind import links_behind
+from drake_dae.robots import MultibodyExpressions, links_behind
 from drake_dae.scenario.judging import find_feasibility
 
 BASE, LENGTH, RADIUS, JOINTS = 0.3, 0.5, 0.06, 4

@@ -29,8 +29,7 @@ from drake_dae import (
     RobotPlant,
     Sphere,
 )
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, contact_normals
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots import ConstraintSet, ConstraintWrenches, contact_normals
 
 
 def accelerations(plant, q, v, u, wrenches, frames):

@@ -12,10 +12,10 @@ from runs import scenario
 from drake_dae import Record, build_scenario, grid_variations, load_scenario, sweep
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
+from drake_dae.running.phases import phase_spans
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.simulation.records.phases import phase_spans
 
 # At rest 20 mm before the wall, which gives way.
 SHORT = """

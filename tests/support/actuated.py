@@ -11,11 +11,8 @@ from arms import arm, consistent_states, numbers, touching
 from pydrake.multibody.tree import JacobianWrtVariable
 
 from drake_dae import RobotModel, find_structure
-from drake_dae.dae.structure.structure import Structure
-from drake_dae.robots.actuation.dc_motors import DcMotors
-from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
-from drake_dae.robots.actuation.hydraulics import ElectrohydraulicServos
-from drake_dae.robots.actuation.stage import Stage
+from drake_dae.dae import Structure
+from drake_dae.robots import DcMotors, ElectrohydraulicServos, FlexibleJoints, Stage
 
 ARMS = ["two_link", "seven_joint"]
 DEGREES = {

@@ -24,9 +24,8 @@ from drake_dae import (
     load_scenario,
     poles,
 )
-from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.dae.tracking.gains import GainDesign
-from drake_dae.robots.actuation.stage import Stage
+from drake_dae.dae import GainDesign, Structure, find_structure
+from drake_dae.robots import Stage
 from drake_dae.scenario.shipped import FOLDER, find_scenario
 
 

@@ -26,14 +26,14 @@ FLOORS = (
     ("trace",),
     ("dae",),
     ("references",),
-    ("analysis", "symbolic", "robots"),
+    ("analysis", "robots"),
     ("blocks",),
     ("systems",),
+    ("scene",),
     ("compiler",),
-    ("simulation",),
-    ("pictures",),
     ("diagrams",),
     ("running",),
+    ("pictures",),
     ("scenario",),
     ("studies",),
     ("drake_dae",),
@@ -48,6 +48,9 @@ WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "refe
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (
+    "signals",
+    "contacts",
+    "fields",
     "system",
     "manifold",
     "derivatives",

@@ -11,11 +11,9 @@ import numpy as np
 from pydrake.systems.framework import BasicVector, LeafSystem
 
 from drake_dae import Controller, ForceOutput, Plant, PointOnSurface
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
+from drake_dae.robots import Application, AttachedStage, Constraint, Stage, Surface
 from drake_dae.robots.actuation.numbers import diagonal_parameter
-from drake_dae.robots.actuation.stage import AttachedStage, Stage
-from drake_dae.robots.constraints.constraint import Application, Constraint
-from drake_dae.robots.surfaces.surface import Surface
 from drake_dae.systems.task.phases import Phase
 
 

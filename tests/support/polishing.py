@@ -34,7 +34,7 @@ from drake_dae import (
     simulate,
     wire_loop,
 )
-from drake_dae.simulation.simulate import RunStatistics
+from drake_dae.running.simulate import RunStatistics
 from drake_dae.systems.task.phases import Phase
 
 SPEED, OVER, FAR = 0.05, 0.2, 0.02

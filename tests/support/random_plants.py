@@ -25,7 +25,7 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 
-from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots import MultibodyExpressions
 from drake_dae.trace.functions import TracedFunction
 
 TOLERANCE = 1e-12

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
 from pydrake.systems.analysis import SimulatorConfig
@@ -147,3 +148,12 @@ def roll(chosen: Scenario) -> tuple[ClosedLoop, Record]:
     found = roll_scenario(chosen, loop, context)
     assert found.failure is None
     return loop, found.record
+
+
+def same_records(one, other):
+    """Asserts that two records have the same numbers, names and units."""
+    np.testing.assert_array_equal(one.time, other.time)
+    assert set(one.signals) == set(other.signals)
+    for name, recorded in one.signals.items():
+        np.testing.assert_array_equal(recorded.values, other[name])
+        assert recorded.signals == other.signals[name].signals

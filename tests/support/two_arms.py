@@ -16,7 +16,7 @@ from drake_dae import (
     SinusoidReference,
     WeldedFrames,
 )
-from drake_dae.robots.actuation.stage import Stage
+from drake_dae.robots import Stage
 from drake_dae.scenario.shipped import FOLDER
 
 APART = 1.8

@@ -2,7 +2,6 @@
 
 import gc
 import os
-import platform
 import re
 import shutil
 import subprocess
@@ -17,7 +16,6 @@ from drake_dae import DaeSystem, build_scenario
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
 from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.trace.cache import cache_folder, clear, contents
 from drake_dae.trace.compiled import attempts
 from drake_dae.trace.compiler import Compiler, find_compiler
 from drake_dae.trace.functions import TracedFunction
@@ -62,21 +60,10 @@ def runs_interpreted(match: str) -> None:
     function(X, P)  # Warnings are errors: it warns once.
 
 
-# What it computes.
-
-
 @needs_compiler
 @pytest.mark.parametrize(
     ("x", "p"),
-    [
-        (X, P),
-        ([-1.0, 2.0, 3.0], P),
-        (X, [0.0, 20.0]),
-        (X, [10.0, 0.0]),
-        ([np.nan, 1.0, 1.0], P),
-        ([1.0, np.inf, 1.0], P),
-        ([1.0, 1e31, np.nan], [1.0, -np.inf]),
-    ],
+    [(X, P), ([-1.0, 2.0, 3.0], P), (X, [10.0, 0.0]), ([1.0, 1e31, np.nan], [1.0, -np.inf])],
 )
 def test_values_that_are_not_finite_are_reported_alike(x, p, cache):
     code, interpreted = made(True), made(False)
@@ -104,8 +91,6 @@ def functions_of(name: str, compiled: str) -> dict[tuple, TracedFunction]:
 SLOW = some(
     each_scenario(lambda name: name.startswith(IN_CONTACT)), of=4, dear=["seven_joint_moving_plate"]
 )
-
-
 OPTIMIZED = ("two_link_wall", "two_link_motors", "seven_joint_wall", "cart_wall")
 """Others would take two minutes together to compile by -O1."""
 
@@ -137,18 +122,14 @@ def test_machine_code_agrees_with_the_interpreter(name, monkeypatch):
     assert compiled >= 6
 
 
-# When.
-
-
 @needs_compiler
 def test_the_choice(cache):
-    calls = {True: 1, False: None, "auto": None}
-    for compiled, first in calls.items():
+    for compiled in (True, False, "auto"):
         function = made(compiled)
         function.evaluate(X, P)
-        assert function.is_machine_code == (first == 1)
+        assert function.is_machine_code == (compiled is True)
     assert not made(True, often=False).is_machine_code
-    for bad in ("yes", 1, None, 0.0, np.array([True])):
+    for bad in ("yes", 1, None):
         with pytest.raises(ModelError, match="compiled"):
             DaeSystem.from_functions(1, f=lambda x: -x, compiled=bad)
 
@@ -159,28 +140,12 @@ def test_auto_compiles_what_was_called_so_often_that_it_pays(cache):
     function = made("auto")
     look, make = attempts("auto", function.num_operations)
     assert (look[1], make[1]) == (False, True)
-    function.evaluate(X, P)
-    for _ in range(look[0] + make[0] - 2):
+    for _ in range(look[0] + make[0] - 1):
         function.evaluate(X, P)
     assert not function.is_machine_code
     function.evaluate(X, P)
     assert function.is_machine_code
     np.testing.assert_array_equal(function(X, P)[0], made(False)(X, P)[0])
-
-
-# Where it cannot be.
-
-
-def test_without_a_compiler(cache, monkeypatch):
-    monkeypatch.setenv("CC", "/nowhere/cc")
-    runs_interpreted("CC names '/nowhere/cc', which is not found")
-    monkeypatch.setenv("CC", "'")
-    runs_interpreted("CC is no command")
-    monkeypatch.delenv("CC")
-    monkeypatch.setenv("PATH", "/nowhere")
-    monkeypatch.setattr("drake_dae.trace.compiler.find_spec", lambda name: None)
-    runs_interpreted("no C compiler: 'cc' is not found")
-    assert contents() == []
 
 
 def script(path, text: str) -> str:
@@ -189,17 +154,22 @@ def script(path, text: str) -> str:
     return str(path)
 
 
-def test_a_compiler_that_fails(cache, monkeypatch, tmp_path):
+def test_where_no_compiler_works(cache, monkeypatch, tmp_path):
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    runs_interpreted("/nowhere/cc")
+    monkeypatch.setenv("CC", "'")
+    runs_interpreted("CC")
     monkeypatch.setenv("CC", script(tmp_path / "cc1", "echo 'error: out of order' >&2; exit 3"))
     runs_interpreted("cc1.*3")
     monkeypatch.setenv("CC", script(tmp_path / "cc2", "exit 0"))
     runs_interpreted("cc2")
     monkeypatch.setenv("CC", str(tmp_path))
     runs_interpreted(re.escape(str(tmp_path)))
-    monkeypatch.setenv("CC", script(tmp_path / "cc3", "sleep 60"))
-    monkeypatch.setattr("drake_dae.trace.compiler.ANSWERS", 0.05)
-    runs_interpreted(r"cc3.*0\.05")
-    assert contents() == []
+    monkeypatch.delenv("CC")
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.setattr("drake_dae.trace.compiler.find_spec", lambda name: None)
+    runs_interpreted("'cc'")
+    assert not list(cache.glob("*"))
 
 
 @pytest.mark.slow
@@ -212,8 +182,7 @@ def test_a_compiler_that_hangs_is_waited_for_once(cache, monkeypatch, tmp_path):
         monkeypatch.setenv("CC", script(tmp_path / name, does))
         # Long enough for a process to start; what it waits for never comes.
         monkeypatch.setattr("drake_dae.trace.compiler.ANSWERS", 1.0)
-        monkeypatch.setattr("drake_dae.trace.compiled.LIMIT", 1.0)
-        monkeypatch.setattr("drake_dae.trace.compiled.PATIENCE", 1.0)
+        monkeypatch.setattr("drake_dae.trace.compiled.HANGS", (1.0, 1.0))
         runs_interpreted(name)
         before = asked.read_text()
         runs_interpreted(name)
@@ -223,85 +192,14 @@ def test_a_compiler_that_hangs_is_waited_for_once(cache, monkeypatch, tmp_path):
 
 
 @needs_compiler
-def test_a_cache_of_another_user(cache, monkeypatch):
+def test_a_cache_that_others_can_write(cache, monkeypatch):
     made(True)(X, P)
+    for mode in (0o777, 0o720):
+        cache.chmod(mode)
+        runs_interpreted(f"{mode:04o}.*{cache}")
+    cache.chmod(0o700)
     monkeypatch.setattr(os, "getuid", lambda: 12345)
     runs_interpreted(re.escape(str(cache)))
-    with pytest.raises(MachineCodeError, match=re.escape(str(cache))):
-        clear()
-
-
-@needs_compiler
-@pytest.mark.parametrize("mode", [0o777, 0o720, 0o702])
-def test_a_cache_that_others_can_write(mode, cache):
-    made(True)(X, P)
-    cache.chmod(mode)
-    runs_interpreted(f"others can write the cache .* {mode:04o}.*; chmod 700 {cache}")
-    cache.chmod(0o700)
-
-
-@needs_compiler
-@pytest.mark.parametrize("damage", [b"", b"nonsense", None])
-def test_code_that_was_damaged_is_made_anew(damage, cache):
-    made(True)(X, P)
-    (path,) = contents()
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-100] if damage is None else damage)
-    function = made(True)
-    with pytest.warns(MachineCodeWarning, match=r"\.so"):
-        function(X, P)
-    assert function.is_machine_code
-    (path,) = contents()
-    assert path.read_bytes() == whole
-    np.testing.assert_array_equal(function(X, P)[0], made(False)(X, P)[0])
-
-
-# What is kept.
-
-
-@needs_compiler
-def test_what_is_kept(cache, monkeypatch):
-    assert cache_folder() == cache
-    assert contents() == []
-    made(True)(X, P)
-    assert cache.stat().st_mode & 0o777 == 0o700
-    (first,) = contents()
-    assert first.stat().st_mode & 0o777 == 0o700
-    written = first.stat().st_mtime_ns
-    made(True)(X, P)
-    assert [path.stat().st_mtime_ns for path in contents()] == [written]
-    # Another function, and another compiler.
-    made(True, "other")(X, P)
-    assert len(contents()) == 2
-    monkeypatch.setenv("CC", f"{' '.join(find_compiler().command)} -g")
-    made(True)(X, P)
-    assert len(contents()) == 3
-    # What is not ours stays.
-    (cache / "mine.txt").touch()
-    (cache / "new-killed").mkdir()
-    assert len(contents()) == 4
-    clear()
-    assert contents() == []
-    assert [path.name for path in cache.iterdir()] == ["mine.txt"]
-
-
-@needs_compiler
-def test_code_for_the_processor_at_hand_has_the_same_bits(cache, monkeypatch):
-    """As for any of its kind: nothing is contracted, and no sum is taken in another order."""
-    x = ca.SX.sym("x", 20)
-    sums = {"sums": x[:18] * ca.sin(x[1:19]) + x[2:]}
-    at = np.random.default_rng(0).normal(size=20)
-    commands = [" ".join(find_compiler().command)]
-    if platform.machine() == "x86_64":
-        commands.append(f"{commands[0]} -march=x86-64")
-    found = []
-    for command in commands:
-        monkeypatch.setenv("CC", command)
-        function = TracedFunction("sums", {"x": x}, sums, compiled=True)
-        found.append(function(at)[0])
-        assert function.is_machine_code
-    assert len(contents()) == len(commands)
-    np.testing.assert_array_equal(found[0], found[-1])
 
 
 PROCESS = """
@@ -315,11 +213,16 @@ print(f(np.arange(20.0))[0].sum(), f.is_machine_code)
 
 @pytest.mark.slow
 @needs_compiler
-def test_processes_share_the_cache(cache):
+def test_processes_share_the_cache_and_code_is_kept_for_each_compiler(cache, monkeypatch):
     command = [sys.executable, "-W", "error", "-c", PROCESS]
-    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(6)]
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     printed = [process.communicate(timeout=120)[0] for process in running]
     assert len(set(printed)) == 1
     assert printed[0].split()[1] == "True"
-    assert len(contents()) == 1
-    assert [path.suffix for path in cache.iterdir()] == [".so"]
+    assert cache.stat().st_mode & 0o777 == 0o700
+    (file,) = cache.iterdir()
+    assert file.suffix == ".so"
+    assert file.stat().st_mode & 0o777 == 0o700
+    monkeypatch.setenv("CC", f"{' '.join(find_compiler().command)} -g")
+    assert subprocess.run(command, capture_output=True, text=True).stdout == printed[0]
+    assert len(list(cache.iterdir())) == 2

@@ -9,10 +9,9 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.beyond.identified import IdentifiedTerms, check_bounded
+from drake_dae.dae.signals import DerivativeLayout, Parameter
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.signals import Parameter
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction

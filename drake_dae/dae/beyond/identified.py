@@ -7,8 +7,8 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Parameter, Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 

@@ -23,11 +23,11 @@ from drake_dae.arrays import FloatArray, check_whole_number, show
 from drake_dae.dae.derivatives import lie_derivative
 from drake_dae.dae.extension.extension import Extension, by_control, integrated, refuse_metric
 from drake_dae.dae.manifold.manifold import Manifold
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.samples import Samples, spread_of
 from drake_dae.dae.structure.relative_degrees import InputActions
 from drake_dae.dae.structure.structure import Structure, examine_structure, find_structure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import Factorization
 from drake_dae.trace.round_off import positive

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.round_off import positive

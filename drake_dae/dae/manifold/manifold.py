@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae.manifold.newton_steps import FOUND, STAYS, shortest_step, trace_first_steps
 from drake_dae.dae.manifold.settling import CONSISTENT, Settling
-from drake_dae.dae.system.layout import DerivativeLayout, Indices
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.signals import DerivativeLayout, Indices
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction, count_operations
 from drake_dae.trace.newton import NewtonModel, newton, norm, shortest_steps

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.signals import DerivativeLayout
+from drake_dae.dae.system import DaeSystem
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import PRECISION, ROUNDING

@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.layout import DerivativeLayout, Indices
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.signals import DerivativeLayout, Indices
+from drake_dae.dae.system import DaeSystem
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps, steps_along
 

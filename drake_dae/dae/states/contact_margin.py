@@ -8,11 +8,11 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae.contacts import critical_factor
 from drake_dae.dae.states.margins import surroundings
 from drake_dae.dae.states.region import ConsistentRegion
 from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.system.contacts import critical_factor
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 
 MEANINGLESS = 1e6
 """Critical coefficients above this are meaningless: they occur where sliding is only round-off."""

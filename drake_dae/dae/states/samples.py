@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arrays import FloatArray, brief, numbers, show
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.region import ConsistentRegion, Region
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.round_off import are_dependent, significant
 
@@ -91,7 +91,7 @@ def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> 
 def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:
     """Converts a spread to shape (n,); the default of the system if None."""
     if spread is None:
-        return system.nominal_spread
+        return system.spread_around(system.nominal_state)
     deviations = numbers(f"{system.name}: spread", spread)
     if deviations.shape not in ((), (system.num_states,)) or not np.all(np.isfinite(deviations)):
         raise ModelError(

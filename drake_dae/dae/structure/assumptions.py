@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.states.family import Deciding
 from drake_dae.dae.states.margins import RankMargin
 from drake_dae.dae.structure.dependence import Combination
-from drake_dae.dae.system.signals import Signal
 from drake_dae.errors import AssumptionError
 
 

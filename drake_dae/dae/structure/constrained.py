@@ -22,7 +22,7 @@ from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_v
 from drake_dae.dae.structure.dependence import find_dependence, redundant_constraints
 from drake_dae.dae.structure.redundancy import all_constraints_hold
 from drake_dae.dae.structure.relative_degrees import InputActions, constraint_chains
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.round_off import equilibrated, equilibration, positive, smallest_singular_value

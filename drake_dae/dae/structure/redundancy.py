@@ -12,7 +12,7 @@ from drake_dae.arrays import Booleans, FloatArray, unknown_name
 from drake_dae.dae.manifold.manifold import Manifold
 from drake_dae.dae.states.samples import Samples, draw
 from drake_dae.dae.structure.dependence import redundant_constraints
-from drake_dae.dae.system.system import DaeSystem, ForceSharing
+from drake_dae.dae.system import DaeSystem, ForceSharing
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.newton import ROUND_OFF

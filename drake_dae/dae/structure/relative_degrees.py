@@ -22,7 +22,7 @@ from drake_dae.dae.states.region import Region
 from drake_dae.dae.states.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind
 from drake_dae.dae.structure.dependence import following_outputs, redundant_constraints
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError, NegligibleWarning
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.round_off import Sized, multiply

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, show
+from drake_dae.dae.signals import DerivativeLayout
 from drake_dae.dae.states.margins import RankMargin, find_margin
 from drake_dae.dae.states.samples import Samples
 from drake_dae.dae.structure.assumptions import Violation, ViolationKind, rank_violation
@@ -21,8 +22,7 @@ from drake_dae.dae.structure.constrained import (
 )
 from drake_dae.dae.structure.dependence import combinations_of
 from drake_dae.dae.structure.relative_degrees import output_chains
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization, nearest_solution
 
@@ -137,7 +137,7 @@ def find_structure(
     Args:
         system: The system (1)-(3).
         spread: The standard deviation of the drawn states around the nominal one, a number for all
-            or shape (n,); `DaeSystem.nominal_spread` if None.
+            or shape (n,); `DaeSystem.spread_around` it if None.
         count: The number of random states, at least 1.
         seed: The seed of the random numbers.
 

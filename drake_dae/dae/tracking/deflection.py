@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import positive
+from drake_dae.dae.signals import DerivativeLayout
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.layout import DerivativeLayout
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.measured_force import force_outputs_of
 from drake_dae.dae.tracking.model_of_law import damping_gains

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, show, vector
-from drake_dae.dae.system.layout import DerivativeLayout
+from drake_dae.dae.signals import DerivativeLayout
 from drake_dae.errors import GainError
 
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.signals import DerivativeLayout, Signal
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking.measured_force import ForceMeasurement
 from drake_dae.errors import GainError
 

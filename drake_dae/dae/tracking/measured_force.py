@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.signals import DerivativeLayout
+from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
 
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import eliminate
+from drake_dae.dae.signals import DerivativeLayout
 from drake_dae.dae.structure.structure import Structure
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.errors import GainError, ModelError
-from drake_dae.trace.given import result_of
+from drake_dae.trace.expressions import result_of
 
 
 def damped(

@@ -10,18 +10,17 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
+from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.structure.structure import Structure, structure_of
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking.deflection import Deflection
 from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
 from drake_dae.dae.tracking.integral import IntegralAction
 from drake_dae.dae.tracking.measured_force import ForceMeasurement
 from drake_dae.dae.tracking.model_of_law import damped
 from drake_dae.errors import GainError, ModelError
+from drake_dae.trace.expressions import result_of
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.given import result_of
 
 
 @checked(ModelError)

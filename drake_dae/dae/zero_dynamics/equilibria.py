@@ -50,7 +50,7 @@ class Equilibria:
     def __init__(self, pinned: PinnedOutputs) -> None:
         self.pinned, system = pinned, pinned.system
         examined = np.abs(pinned.structure.states).max(axis=0)
-        self.sizes = np.maximum(examined, system.nominal_spread)
+        self.sizes = np.maximum(examined, system.spread_around(system.nominal_state))
         # The rates of states with a constant rate, such as clocks.
         explicit, self._clocks = system.explicit, np.zeros(system.num_states)
         for i in range(system.num_states):

@@ -19,7 +19,7 @@ from drake_dae.dae.zero_dynamics.pinned_motion import GROWN, PinnedMotion, TimeF
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedSet
 from drake_dae.dae.zero_dynamics.stability import ComplexArray, Verdict, eigenvalues_of
 from drake_dae.errors import ModelError
-from drake_dae.trace.given import result_of
+from drake_dae.trace.expressions import result_of
 
 ACCURACY = 1e-9
 """The error of an integration step, relative to the scale of the states."""

@@ -10,7 +10,7 @@ import scipy  # SciPy loads its large parts when they are used.
 from drake_dae.arrays import FloatArray, numbers, show
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
-from drake_dae.trace.given import result_of
+from drake_dae.trace.expressions import result_of
 
 TOLERANCE = 1e-6
 """The tolerance of an integration step; the method overestimates its error by two orders."""

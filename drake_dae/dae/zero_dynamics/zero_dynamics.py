@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, show, vector
 from drake_dae.dae.structure.structure import Structure, structure_of
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.zero_dynamics.equilibria import AT_REST, ISOLATED, Equilibria
 from drake_dae.dae.zero_dynamics.floquet import PeriodicMotions, StabilityAlong
 from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion, TimeFunction, follow

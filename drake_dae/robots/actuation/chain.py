@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.stage import AttachedStage, Stage
 from drake_dae.robots.links.links import Links

@@ -7,7 +7,7 @@ import casadi as ca
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.actuation.numbers import diagonal_parameter, full_matrix, matrix_parameter
 from drake_dae.robots.actuation.stage import AttachedStage, Stage

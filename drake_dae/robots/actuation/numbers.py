@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae import Parameter
 from drake_dae.errors import ModelError
 
 

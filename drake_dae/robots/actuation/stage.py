@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import Parameter, Signal
 from drake_dae.robots.links.links import Links
 
 

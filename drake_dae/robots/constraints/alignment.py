@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics
@@ -17,7 +17,7 @@ from drake_dae.robots.surfaces.surface import (
     unit_vector,
     with_parameters,
 )
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 @checked(ModelError)

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import casadi as ca
@@ -13,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Parameter, Signal, moving
+from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.picture import PosedShape
@@ -189,7 +189,8 @@ class Constraint(ABC):
         if not any(parameter.name in names for parameter in self.parameters):
             return self
         changed = copy(self)  # Its class may be frozen.
-        object.__setattr__(changed, "parameters", moving(self.parameters, names))
+        parameters = [replace(p, exogenous=p.exogenous or p.name in names) for p in self.parameters]
+        object.__setattr__(changed, "parameters", tuple(parameters))
         return changed
 
     @property

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.system.contacts import UnilateralInput
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import Parameter, Signal, UnilateralInput
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction

@@ -8,7 +8,7 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics, position_index

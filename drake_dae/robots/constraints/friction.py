@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import positive
-from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae import Parameter
 from drake_dae.errors import ModelError
 
 

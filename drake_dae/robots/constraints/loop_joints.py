@@ -11,7 +11,7 @@ from pydrake.math import RollPitchYaw
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief
-from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
 from drake_dae.robots.links.joints import clean

@@ -9,14 +9,14 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
 from drake_dae.robots.constraints.friction import Friction, friction_parameters
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 @checked(ModelError)

@@ -8,13 +8,13 @@ import numpy as np
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.links.kinematics import Frames, Kinematics
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 
 @checked(ModelError)

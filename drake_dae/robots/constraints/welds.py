@@ -10,7 +10,7 @@ from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
-from drake_dae.dae.system.signals import Parameter, Signal, signals
+from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
 from drake_dae.robots.links.frames import body_with_frame

@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyForces
 
-from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae import Parameter
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 

@@ -18,10 +18,10 @@ from pydrake.multibody.tree import (
     UniformGravityFieldElement,
 )
 
-from drake_dae.dae.system.signals import LARGEST
+from drake_dae.dae.signals import LARGEST
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import PlantFrames, position_of
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 SUPPORTED_FORCE_ELEMENTS = (
     UniformGravityFieldElement,

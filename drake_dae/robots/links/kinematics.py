@@ -9,7 +9,7 @@ import casadi as ca
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import unknown_name
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 
 ORIGIN = (0.0, 0.0, 0.0)

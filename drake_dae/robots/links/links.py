@@ -6,7 +6,7 @@ import casadi as ca
 from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import Parameter, Signal
 from drake_dae.robots.links.articulated import ArticulatedBodies
 from drake_dae.robots.links.frames import Outline
 from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction

@@ -11,7 +11,7 @@ from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.articulated import ArticulatedBodies, is_one_by_one
 from drake_dae.robots.links.comparison import compare_with_plant

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.system.fields import as_expression
-from drake_dae.dae.system.signals import Parameter, Signal, is_symbol, signals
+from drake_dae.dae import Parameter, Signal, as_expression, signals
+from drake_dae.dae.signals import is_symbol
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.frames import Outline
 from drake_dae.robots.links.kinematics import ORIGIN, Kinematics, Reaction

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pydrake.multibody.tree import Frame
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.robots.links.frames import PlantFrames, check_point, position_of
 from drake_dae.robots.links.kinematics import (
     ORIGIN,

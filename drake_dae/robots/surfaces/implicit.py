@@ -11,8 +11,8 @@ import casadi as ca
 from drake_dae.arguments import checked
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.surface import Surface, Vector, normalized, triple
+from drake_dae.trace.expressions import result_of
 from drake_dae.trace.formula import check_names, parse_formula
-from drake_dae.trace.given import numpy_explained, result_of
 
 _TAKEN = (
     "position",
@@ -85,5 +85,4 @@ class ImplicitSurface(Surface):
                 self.function, {**dict(zip("xyz", ca.vertsplit(p), strict=True)), **names}
             )
         more = [SimpleNamespace(**names)] if names else []
-        with numpy_explained("the function of an ImplicitSurface"):
-            return result_of("function", self.function, p, *more)
+        return result_of("function", self.function, p, *more)

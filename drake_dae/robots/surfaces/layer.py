@@ -8,7 +8,7 @@ from pydrake.geometry import InMemoryMesh, Mesh
 from pydrake.math import RigidTransform
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.layout import Indices
+from drake_dae.dae import Indices
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.picture import PosedShape
 from drake_dae.trace.functions import TracedFunction

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, positive, show, vector
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.files import MESHES, check_file, read_mesh
 from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid

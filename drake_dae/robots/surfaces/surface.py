@@ -11,14 +11,13 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
 from drake_dae.arrays import FloatArray, show, vector
-from drake_dae.dae.system.fields import as_expression
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import Parameter, Signal, as_expression
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.layer import facets_needed, layer_below, sides
 from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
+from drake_dae.trace.expressions import length_of
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
-from drake_dae.trace.smoothness import length_of
 
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
 from drake_dae.robots.surfaces.surface import (
@@ -23,7 +23,7 @@ from drake_dae.robots.surfaces.surface import (
     triple,
     unit_vector,
 )
-from drake_dae.trace.smoothness import length_of
+from drake_dae.trace.expressions import length_of
 
 _SOLID_LENGTH = 100.0
 """The length of the solid of a cylinder, in m: its ends are out of the reach of a robot."""

@@ -18,7 +18,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.computations import Traced
 from drake_dae.compiler.wires import Wires
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.running.bench.controls import (
     Control,

@@ -10,8 +10,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.gains import poles
+from drake_dae.dae import DaeSystem, poles
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import GainError
 from drake_dae.running.bench.inputs import PUSH, Inputs

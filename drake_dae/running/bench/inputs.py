@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
 
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.wires import Wires, leaf_inputs
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.running.export.steps.words import block_name, distinct, parameters_of_block
 from drake_dae.systems.control.contract import SIGNAL

@@ -10,14 +10,16 @@ from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
-from drake_dae.pictures.scene.arrows import path_of
-from drake_dae.pictures.scene.surroundings import scene_points
-from drake_dae.pictures.scene.view import draw_scene, start_unwatched_meshcat, view_of_links
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.model import RobotModel
-from drake_dae.robots.outputs import PointCoordinates
-from drake_dae.robots.surfaces.surface import rotation_of
+from drake_dae.robots import (
+    Constraint,
+    ConstraintWrenches,
+    PointCoordinates,
+    RobotModel,
+    rotation_of,
+)
+from drake_dae.scene.arrows import path_of
+from drake_dae.scene.surroundings import scene_points
+from drake_dae.scene.view import draw_scene, start_unwatched_meshcat, view_of_links
 from drake_dae.systems.plants.contract import Plant
 
 VISUALIZER = ("drake", "visualizer")

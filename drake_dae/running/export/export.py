@@ -8,9 +8,7 @@ from pydrake.systems.framework import Context, Diagram
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import ConstraintStructure, Signal, TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.parts import parts_of

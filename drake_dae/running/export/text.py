@@ -10,7 +10,7 @@ from string import Template
 import casadi as ca
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.trace.compiled import generate, renamed
 from drake_dae.trace.functions import TracedFunction
 

@@ -8,7 +8,7 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.rates import ColumnPlace
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.running.export.text import CFunction, Vector
 from drake_dae.trace.functions import TracedFunction
 

@@ -13,10 +13,10 @@ from pydrake.systems.framework import Diagram
 from drake_dae.blocks.computations import NOISE
 from drake_dae.compiler.compile import compile_diagram, with_twins
 from drake_dae.compiler.compiled import CompiledDiagram
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
-from drake_dae.simulation.records.record import Record
 from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")

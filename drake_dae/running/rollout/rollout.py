@@ -14,7 +14,14 @@ from pydrake.systems.framework import Diagram
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import (
+    Record,
+    RecordAfter,
+    computed_record,
+    recorded_values,
+)
 from drake_dae.errors import ModelError, SimulationError
+from drake_dae.running.diagnosis import explained, too_long
 from drake_dae.running.rollout.drake_stepped import run_stepped
 from drake_dae.running.rollout.events import Seed
 from drake_dae.running.rollout.failures import failure_of
@@ -26,14 +33,7 @@ from drake_dae.running.rollout.program import MAKING, RolloutProgram, program_of
 from drake_dae.running.rollout.run import Run, RunEnding, Settings, num_cores
 from drake_dae.running.rollout.stepping import interpreted, machine
 from drake_dae.running.rollout.stepping.functions import functions_of
-from drake_dae.simulation.diagnosis import explained, too_long
-from drake_dae.simulation.records.record import (
-    Record,
-    RecordAfter,
-    computed_record,
-    recorded_values,
-)
-from drake_dae.simulation.simulate import check_config
+from drake_dae.running.simulate import check_config
 from drake_dae.trace.compiled import Compiled, attempts, check_choice
 
 SEVERAL = 8

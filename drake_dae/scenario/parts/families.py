@@ -9,12 +9,7 @@ from casadi import SX
 from numpy.typing import ArrayLike
 from pydrake.systems.analysis import SimulatorConfig
 
-from drake_dae import references
-from drake_dae.robots import actuation, force_outputs, joint_friction, known_forces, outputs
-from drake_dae.robots import constraints as contact
-from drake_dae.robots.actuation.stage import Stage
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.surfaces import implicit, measured, surface, surfaces
+from drake_dae import references, robots
 from drake_dae.scenario import plants
 from drake_dae.scenario.forms import values
 from drake_dae.scenario.forms.forms import Family, Key, keys_of
@@ -39,41 +34,39 @@ _REFERENCES: dict[str, type] = {
 }
 
 FAMILIES: dict[type, Family] = {
-    surface.Surface: _family(
-        surfaces.Plane,
-        surfaces.Sphere,
-        surfaces.Cylinder,
-        surfaces.Ellipsoid,
-        surfaces.Torus,
-        implicit.ImplicitSurface,
-        measured.MeasuredSurface,
+    robots.Surface: _family(
+        robots.Plane,
+        robots.Sphere,
+        robots.Cylinder,
+        robots.Ellipsoid,
+        robots.Torus,
+        robots.ImplicitSurface,
+        robots.MeasuredSurface,
     ),
-    Constraint: _family(
-        contact.PointOnSurface,
+    robots.Constraint: _family(
+        robots.PointOnSurface,
         written.WeldedFramesForm,
-        contact.CoincidentPoints,
-        contact.FixedDistance,
-        contact.JointCoupler,
-        contact.RevoluteLoopJoint,
-        contact.PrismaticLoopJoint,
-        contact.AxisNormalToSurface,
-        contact.Blade,
-        contact.RollingWheel,
-        contact.RollingBall,
+        robots.CoincidentPoints,
+        robots.FixedDistance,
+        robots.JointCoupler,
+        robots.RevoluteLoopJoint,
+        robots.PrismaticLoopJoint,
+        robots.AxisNormalToSurface,
+        robots.Blade,
+        robots.RollingWheel,
+        robots.RollingBall,
     ),
-    outputs.PositionOutput: _family(
-        outputs.PointCoordinates,
-        outputs.AxisCoordinates,
+    robots.PositionOutput: _family(
+        robots.PointCoordinates,
+        robots.AxisCoordinates,
         written.SurfaceCoordinatesForm,
         written.TiltFromNormalForm,
-        outputs.JointPositions,
+        robots.JointPositions,
     ),
-    force_outputs.ForceOutput: _family(
-        force_outputs.Squeeze, force_outputs.ForceCombination, plain=str
-    ),
-    Stage: _family(actuation.FlexibleJoints, actuation.DcMotors, actuation.ElectrohydraulicServos),
+    robots.ForceOutput: _family(robots.Squeeze, robots.ForceCombination, plain=str),
+    robots.Stage: _family(robots.FlexibleJoints, robots.DcMotors, robots.ElectrohydraulicServos),
     references.Reference: Family(_REFERENCES, float),
-    known_forces.Load: _family(known_forces.KnownForce, joint_friction.JointFriction),
+    robots.Load: _family(robots.KnownForce, robots.JointFriction),
     plants.ScenarioPlant: _family(
         plants.IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
     ),
@@ -89,8 +82,8 @@ VALUES: dict[Any, Any] = {
     str | Sequence[str]: Annotated[Any, values.NAMES],
     float | list[float]: Annotated[Any, values.NUMBER_OR_LIST],
     ArrayLike: Annotated[Any, values.NUMBERS],
-    surface.Vector: Annotated[Any, values.TRIPLE],
-    surface.Pair: Annotated[Any, values.PAIR],
+    robots.Vector: Annotated[Any, values.TRIPLE],
+    robots.Pair: Annotated[Any, values.PAIR],
 }
 
 _CONFIG = {

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray, positive
-from drake_dae.dae.tracking.gains import GainDesign, gain_coefficients, gain_matrices, poles
+from drake_dae.dae import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
-from drake_dae.robots.constraints.friction import FrictionCone
+from drake_dae.robots import FrictionCone
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor

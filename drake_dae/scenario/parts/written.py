@@ -9,11 +9,16 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.robots import constraints as contact
-from drake_dae.robots import outputs
+from drake_dae.robots import (
+    Constraint,
+    PositionOutput,
+    SurfaceCoordinates,
+    TiltFromNormal,
+    WeldedFrames,
+)
 from drake_dae.scenario.robot_file.robot import Pose
 
-T = TypeVar("T", contact.Constraint, outputs.PositionOutput)
+T = TypeVar("T", Constraint, PositionOutput)
 
 
 @dataclass(frozen=True)
@@ -32,11 +37,11 @@ class WeldedFramesForm:
     pose: Pose = field(default_factory=Pose)
     name: str = "weld"
 
-    def make(self, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+    def make(self, constraints: Sequence[Constraint]) -> Constraint:
         """The constraint."""
         rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
         pose = RigidTransform(rotation, self.pose.translation)
-        return contact.WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
+        return WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
 
 
 @dataclass(frozen=True)
@@ -49,9 +54,9 @@ class SurfaceCoordinatesForm:
 
     constraint: str
 
-    def make(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
         """The output."""
-        return outputs.SurfaceCoordinates(_named(self.constraint, constraints))
+        return SurfaceCoordinates(_named(self.constraint, constraints))
 
 
 @dataclass(frozen=True)
@@ -68,19 +73,19 @@ class TiltFromNormalForm:
     axis: str
     components: str = ""
 
-    def make(self, constraints: Sequence[contact.Constraint]) -> outputs.PositionOutput:
+    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
         """The output."""
         contact = _named(self.constraint, constraints)
-        return outputs.TiltFromNormal(contact, self.axis, self.components)
+        return TiltFromNormal(contact, self.axis, self.components)
 
 
-WrittenConstraint = contact.Constraint | WeldedFramesForm
-WrittenOutput = outputs.PositionOutput | SurfaceCoordinatesForm | TiltFromNormalForm
+WrittenConstraint = Constraint | WeldedFramesForm
+WrittenOutput = PositionOutput | SurfaceCoordinatesForm | TiltFromNormalForm
 
 
 def make(
     form: T | WeldedFramesForm | SurfaceCoordinatesForm | TiltFromNormalForm,
-    constraints: Sequence[contact.Constraint],
+    constraints: Sequence[Constraint],
 ) -> T:
     """The library's object of a form that may name constraints; such an object as it is.
 
@@ -90,7 +95,7 @@ def make(
     return cast(T, form.make(constraints) if hasattr(form, "make") else form)
 
 
-def _named(name: str, constraints: Sequence[contact.Constraint]) -> contact.Constraint:
+def _named(name: str, constraints: Sequence[Constraint]) -> Constraint:
     named = {constraint.name: constraint for constraint in constraints}
     if name not in named:
         raise ModelError(unknown_name("constraint", name, named))

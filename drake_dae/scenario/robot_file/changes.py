@@ -21,8 +21,7 @@ from pydrake.multibody.tree import (
 
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.plant_constraints import Coupling
-from drake_dae.robots.links.frames import frame_named, joint_names, unique_names
+from drake_dae.robots import Coupling, frame_named, joint_names, unique_names
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.loops import actuators_of, joints_of
 from drake_dae.scenario.robot_file.mending import Mender

@@ -8,10 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import QuaternionFloatingJoint
 
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints import Constraint
-from drake_dae.robots.constraints.plant_constraints import plant_constraints
-from drake_dae.robots.links.frames import joint_names
-from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots import Constraint, MultibodyExpressions, joint_names, plant_constraints
 from drake_dae.scenario.forms.keys import at
 from drake_dae.scenario.robot_file.changes import add_payloads, change_robot, finalize
 from drake_dae.scenario.robot_file.loops import cut_loops, joints_of, loop_constraints

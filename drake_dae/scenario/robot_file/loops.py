@@ -11,9 +11,15 @@ from pydrake.multibody.tree import Joint, JointActuator, PrismaticJoint, Revolut
 
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints import Constraint, PrismaticLoopJoint, RevoluteLoopJoint
-from drake_dae.robots.links.frames import frame_name, joint_names
-from drake_dae.robots.surfaces.surface import axes_along, triple
+from drake_dae.robots import (
+    Constraint,
+    PrismaticLoopJoint,
+    RevoluteLoopJoint,
+    axes_along,
+    frame_name,
+    joint_names,
+    triple,
+)
 
 
 class CutJoint(NamedTuple):

@@ -8,8 +8,7 @@ import numpy as np
 
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
-from drake_dae.robots.known_forces import Load
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots import Load, Vector
 from drake_dae.scenario.forms.typed_yaml import TAG
 from drake_dae.scenario.forms.values import FILE, Value, in_folder
 

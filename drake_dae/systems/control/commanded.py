@@ -8,7 +8,7 @@ import casadi as ca
 from drake_dae.arguments import checked
 from drake_dae.blocks.block import stacked
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import Reference
 from drake_dae.systems.control.references import (

@@ -8,12 +8,15 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import (
+    ConstraintStructure,
+    DaeSystem,
+    DerivativeLayout,
+    FeedbackGains,
+    GainDesign,
+    Signal,
+    TrackingLaw,
+)
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.plants.contract import NOWHERE, Plant
 

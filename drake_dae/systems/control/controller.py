@@ -15,9 +15,7 @@ from drake_dae.arrays import FloatArray, vector
 from drake_dae.blocks.block import Block, Held, Requirement, where_finite
 from drake_dae.blocks.computations import DERIVATIVE, HELD, PARAMETERS, STATE, Computation
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.gains import FeedbackGains, GainDesign
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import FeedbackGains, GainDesign, Signal, TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.control.non_minimum_phase import warn_of_zero_dynamics

@@ -4,9 +4,7 @@ import warnings
 
 from numpy.typing import ArrayLike
 
-from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.stability import Verdict
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import TrackingLaw, Verdict, ZeroDynamics
 from drake_dae.errors import NonMinimumPhaseWarning
 
 

@@ -15,7 +15,7 @@ from drake_dae.blocks.block import TIME, Block, BlockFunction, Requirement, stac
 from drake_dae.blocks.failures import simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import DrakeDaeError, ReferenceSignalError
 from drake_dae.references import Reference, ReferenceRows
 from drake_dae.references.reference import with_degrees

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.beyond.disturbance import Observation
+from drake_dae.dae import Observation
 from drake_dae.systems.observing.observer_functions import (
     BREAK_RATE,
     EARLY,

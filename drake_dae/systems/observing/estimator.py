@@ -10,7 +10,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.blocks.block import TIME, Held, where_finite
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
 from drake_dae.systems.observing.observer_rates import Observing

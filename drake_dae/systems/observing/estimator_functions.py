@@ -4,10 +4,10 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
+from drake_dae.dae import TrackingLaw
 from drake_dae.dae.beyond.chain_filter import ChainFilter
 from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.beyond.friction_share import beside, shares
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.break_away import BreakAway, SampledContacts, Slides
 from drake_dae.systems.observing.estimate import Estimate

@@ -8,9 +8,9 @@ from typing import Protocol
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.beyond.disturbance import DISTURBANCE, Observation
+from drake_dae.dae import Observation, TrackingLaw
+from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.beyond.friction_share import Metric, shares
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.trace.functions import TracedFunction
 

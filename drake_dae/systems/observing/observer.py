@@ -8,8 +8,7 @@ import numpy as np
 from drake_dae.arguments import checked
 from drake_dae.blocks.block import Held, where_finite
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observer_functions import ObserverFunctions
 from drake_dae.systems.observing.observer_rates import Observing

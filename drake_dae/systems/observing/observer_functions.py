@@ -6,9 +6,8 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
+from drake_dae.dae import Lags, TrackingLaw
 from drake_dae.dae.beyond.friction_share import beside, shares
-from drake_dae.dae.beyond.lags import Lags
-from drake_dae.dae.tracking.tracking import TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observed import ContactTerms, Observed, disturbance_degree
 from drake_dae.systems.observing.observer_rates import Observing

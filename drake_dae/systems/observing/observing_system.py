@@ -10,8 +10,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import numbers, positive
 from drake_dae.blocks.block import Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observed import Observed
 from drake_dae.systems.observing.observer_rates import Observing

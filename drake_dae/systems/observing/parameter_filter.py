@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.beyond.identified import IdentifiedTerms
+from drake_dae.dae import IdentifiedTerms
 
 GAP = 1e-5
 """The standard deviation of a measured distance to a surface, in m."""

@@ -10,12 +10,9 @@ from pydrake.systems.framework import Context, DiagramBuilder, System
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import check_context
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import ConstraintStructure, DaeSystem, DerivativeLayout, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import System

@@ -18,10 +18,8 @@ from drake_dae.blocks.failures import (
     singular_configuration,
 )
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
+from drake_dae.dae import ConstraintStructure, DaeSystem, Manifold, constraint_structure_of
 from drake_dae.dae.structure.redundancy import manifold_of_left_out
-from drake_dae.dae.system.system import DaeSystem
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plants.contract import Plant

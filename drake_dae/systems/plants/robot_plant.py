@@ -8,11 +8,9 @@ import casadi as ca
 from drake_dae.arguments import checked
 from drake_dae.blocks.block import Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import ConstraintStructure, Signal, constraint_structure_of
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import ConstraintSet, RobotModel
 from drake_dae.systems.plants.dae_plant import DaePlant, dae_block
 
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.blocks.block import TIME, Block, Held, Requirement, stacked
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError, ReferenceSignalError
 from drake_dae.references import ConstantReference
 from drake_dae.references.by_name import assign, in_order

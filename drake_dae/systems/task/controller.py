@@ -10,10 +10,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import ConstraintStructure, Signal, TrackingLaw, ZeroDynamics
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import (
     Compared,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from drake_dae.dae.beyond.lags import Lags
+from drake_dae.dae import Lags
 
 RATE, PERIOD = 8.0, 0.01
 TIMES = PERIOD * np.arange(1, 200)

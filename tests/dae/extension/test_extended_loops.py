@@ -13,10 +13,7 @@ from problems.extensions import (
     wheels,
 )
 
-from drake_dae.dae.extension.dynamic_extension import dynamic_extension
-from drake_dae.dae.extension.extension import Extension
-from drake_dae.dae.tracking.gains import poles
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import Extension, TrackingLaw, dynamic_extension, poles
 
 
 def rope_force(x: np.ndarray, free: np.ndarray) -> float:

@@ -18,9 +18,7 @@ from problems.extensions import (
 )
 from runs import some
 
-from drake_dae.dae.extension.dynamic_extension import dynamic_extension
-from drake_dae.dae.extension.extension import extend
-from drake_dae.dae.structure.structure import find_structure
+from drake_dae.dae import dynamic_extension, extend, find_structure
 from drake_dae.errors import AssumptionError, ModelError
 
 

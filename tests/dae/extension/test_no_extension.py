@@ -12,8 +12,7 @@ from problems.extensions import (
     vtol,
 )
 
-from drake_dae.dae.extension.dynamic_extension import dynamic_extension
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, dynamic_extension
 from drake_dae.errors import AssumptionError
 
 

@@ -7,11 +7,7 @@ from problems import PROBLEMS, Problem, double_integrator, pendulum, system_of
 from runs import scenario
 
 from drake_dae import build_scenario
-from drake_dae.dae.manifold.manifold import Manifold
-from drake_dae.dae.structure.constrained import find_constraint_structure
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Manifold, Signal, find_constraint_structure, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import newton, shortest_steps
 from drake_dae.trace.round_off import are_dependent

@@ -6,7 +6,7 @@ import pytest
 from problems import system_of
 
 from drake_dae import DaeSystem, find_structure
-from drake_dae.dae.structure.assumptions import ViolationKind
+from drake_dae.dae import ViolationKind
 from drake_dae.errors import AssumptionError, ModelError
 
 

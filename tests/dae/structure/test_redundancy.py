@@ -173,4 +173,4 @@ def test_a_nominal_state_of_round_off_is_zero(nominal):
         nominal_state=nominal,
     )
     assert find_structure(system).constraint_degrees == (2, 2)
-    assert np.all(system.nominal_spread >= 0.1 * system.scale)
+    assert np.all(system.spread_around(system.nominal_state) >= 0.1 * system.scale)

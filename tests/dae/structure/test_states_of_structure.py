@@ -12,9 +12,7 @@ from problems import (
 from problems.found import violation
 
 from drake_dae.analysis.analyze import analyze
-from drake_dae.dae.structure.constrained import find_constraint_structure
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, find_constraint_structure, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError
 
 

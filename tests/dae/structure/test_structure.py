@@ -13,8 +13,7 @@ from problems import (
 from problems.found import degrees, untidy_one, violation
 from runs import some
 
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, find_structure
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 

@@ -15,11 +15,10 @@ from problems import (
 )
 from problems.found import degrees, untidy_one, violation
 
-from drake_dae.dae.derivatives import Derivatives, lie_derivative
+from drake_dae.dae import DaeSystem, Derivatives, ViolationKind, find_structure
+from drake_dae.dae.derivatives import lie_derivative
 from drake_dae.dae.structure import relative_degrees
-from drake_dae.dae.structure.assumptions import ViolationKind
-from drake_dae.dae.structure.structure import examine_structure, find_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae.structure.structure import examine_structure
 from drake_dae.errors import AssumptionError
 from drake_dae.trace.functions import TracedFunction
 

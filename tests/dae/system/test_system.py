@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from problems import double_integrator
 
-from drake_dae.dae.system.signals import Parameter, signals
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Parameter, signals
 from drake_dae.errors import ModelError
 
 

@@ -10,9 +10,7 @@ from problems import PROBLEMS, in_other_units
 from runs import some
 
 from drake_dae.analysis.analyze import analyze
-from drake_dae.dae.structure.redundancy import drop_constraints
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, drop_constraints, find_structure
 from drake_dae.errors import ModelError
 
 # From nanometres to giga-units, all states alike or each in a unit of its own.

@@ -25,7 +25,7 @@ from drake_dae import (
     make_closed_loop,
     poles,
 )
-from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae import Verdict
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import nearest_solution
 

@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 from scipy.integrate import solve_ivp
 
-from drake_dae.dae.tracking.gains import FeedbackGains, gain_coefficients, gain_matrices, poles
+from drake_dae.dae import FeedbackGains, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError
 
 

@@ -11,10 +11,15 @@ from problems import (
 )
 from runs import some
 
-from drake_dae.dae.system.signals import Parameter
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.gains import FeedbackGains, gain_coefficients, gain_matrices, poles
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import (
+    DaeSystem,
+    FeedbackGains,
+    Parameter,
+    TrackingLaw,
+    gain_coefficients,
+    gain_matrices,
+    poles,
+)
 from drake_dae.errors import GainError, ModelError
 
 

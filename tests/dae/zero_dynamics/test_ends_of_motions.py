@@ -18,8 +18,7 @@ from problems.zero_systems import (
 from scipy.integrate import solve_ivp
 
 import drake_dae.dae.zero_dynamics.pinned_motion as module
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.pinned_motion import EndCause
+from drake_dae.dae import DaeSystem, EndCause
 from drake_dae.errors import NonFiniteError
 
 

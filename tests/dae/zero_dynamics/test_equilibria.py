@@ -27,12 +27,7 @@ from drake_dae import (
     analyze,
     make_closed_loop,
 )
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.gains import poles
-from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.stability import Verdict
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, TrackingLaw, Verdict, ZeroDynamics, find_structure, poles
 from drake_dae.errors import (
     InconsistentStateError,
     NonMinimumPhaseWarning,

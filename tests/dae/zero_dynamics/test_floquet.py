@@ -11,10 +11,7 @@ from scipy.optimize import fsolve
 
 from drake_dae import analyze
 from drake_dae.analysis.report import Finding
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.floquet import StabilityAlong
-from drake_dae.dae.zero_dynamics.stability import Verdict
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, StabilityAlong, Verdict, ZeroDynamics
 from drake_dae.errors import ModelError
 from drake_dae.references import (
     CircleReference,

@@ -22,10 +22,7 @@ from problems.zero_systems import (
 from runs import some
 from scipy.integrate import solve_ivp
 
-from drake_dae.dae.tracking.gains import poles
-from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.pinned_motion import PinnedMotion
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import PinnedMotion, TrackingLaw, ZeroDynamics, poles
 from drake_dae.errors import (
     ModelError,
 )

@@ -6,11 +6,7 @@ import pytest
 from runs import some
 
 from drake_dae import DaePlant, analyze, make_closed_loop
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.gains import poles
-from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.stability import Verdict
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, TrackingLaw, Verdict, ZeroDynamics, poles
 from drake_dae.errors import InconsistentStateError, ModelError, NonMinimumPhaseWarning
 
 

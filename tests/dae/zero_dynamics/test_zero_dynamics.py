@@ -17,10 +17,7 @@ from problems.zero_systems import (
 )
 from runs import some
 
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.gains import poles
-from drake_dae.dae.tracking.tracking import TrackingLaw
-from drake_dae.dae.zero_dynamics.stability import Verdict
+from drake_dae.dae import DaeSystem, TrackingLaw, Verdict, poles
 
 
 def finite_zeros(system: DaeSystem) -> Array:

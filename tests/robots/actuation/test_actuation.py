@@ -17,10 +17,7 @@ from arms import arm, touching
 
 from drake_dae import LinkExpressions, RobotModel, RobotPlant, find_structure
 from drake_dae.errors import AssumptionError, ModelError
-from drake_dae.robots.actuation.dc_motors import DcMotors
-from drake_dae.robots.actuation.flexible_joints import FlexibleJoints
-from drake_dae.robots.actuation.hydraulics import ElectrohydraulicServos
-from drake_dae.robots.outputs import JointPositions
+from drake_dae.robots import DcMotors, ElectrohydraulicServos, FlexibleJoints, JointPositions
 
 
 @pytest.mark.slow

@@ -9,9 +9,7 @@ from members import TorqueLag, subclasses
 
 from drake_dae import DcMotors, ElectrohydraulicServos, FlexibleJoints, RobotPlant
 from drake_dae.errors import ModelError
-from drake_dae.robots.actuation import Stage
-from drake_dae.robots.actuation.chain import chain
-from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots import MultibodyExpressions, Stage, chain
 from drake_dae.trace.functions import TracedFunction
 
 MEMBERS = {

@@ -40,8 +40,7 @@ from drake_dae import (
     Sphere,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints import Constraint, WeldedFrames
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
+from drake_dae.robots import Constraint, ConstraintSet, WeldedFrames
 from drake_dae.trace.functions import TracedFunction
 
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}

@@ -34,7 +34,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.plant_constraints import plant_constraints
+from drake_dae.robots import plant_constraints
 
 # What is read from a plant.
 

@@ -40,7 +40,7 @@ from drake_dae.analysis.limits import LimitKind
 from drake_dae.diagrams.wiring import make_closed_loop
 from drake_dae.errors import ModelError
 from drake_dae.references import SinusoidReference
-from drake_dae.simulation.limits import ranges_of, robot_limits
+from drake_dae.running.limits import ranges_of, robot_limits
 
 COUNT = 8
 SLIDES = {2, 6}

@@ -36,15 +36,8 @@ from drake_dae import (
     simulate,
     start_values,
 )
-from drake_dae.dae.system.contacts import (
-    MOST,
-    Contacts,
-    PainleveOutcome,
-    UnilateralInput,
-    critical_factor,
-    painleve_outcome,
-)
-from drake_dae.dae.system.signals import Parameter, Signal
+from drake_dae.dae import PainleveOutcome, Parameter, Signal, UnilateralInput, painleve_outcome
+from drake_dae.dae.contacts import MOST, Contacts, critical_factor
 from drake_dae.errors import ModelError, PainleveError
 from drake_dae.references import stack_references
 from drake_dae.scenario.model import scenario_model

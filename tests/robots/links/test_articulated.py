@@ -28,7 +28,7 @@ from drake_dae import (
     start_values,
 )
 from drake_dae.blocks.block import BlockFunction
-from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots import MultibodyExpressions
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction, count_operations
 

@@ -24,7 +24,7 @@ from pydrake.multibody.tree import (
 
 from drake_dae import LinkExpressions, MultibodyExpressions
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.kinematics import Reaction
+from drake_dae.robots import Reaction
 from drake_dae.trace.functions import TracedFunction
 
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}

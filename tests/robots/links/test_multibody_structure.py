@@ -20,7 +20,7 @@ from random_plants import (
     terms_of,
 )
 
-from drake_dae.robots.links.multibody import MultibodyExpressions
+from drake_dae.robots import MultibodyExpressions
 from drake_dae.trace.functions import TracedFunction
 
 

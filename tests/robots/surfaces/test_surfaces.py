@@ -15,10 +15,17 @@ from runs import some
 
 from drake_dae import PointOnSurface
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.implicit import ImplicitSurface
-from drake_dae.robots.surfaces.measured import MeasuredSurface
-from drake_dae.robots.surfaces.surface import Surface, tangents
-from drake_dae.robots.surfaces.surfaces import Cylinder, Ellipsoid, Plane, Sphere, Torus
+from drake_dae.robots import (
+    Cylinder,
+    Ellipsoid,
+    ImplicitSurface,
+    MeasuredSurface,
+    Plane,
+    Sphere,
+    Surface,
+    Torus,
+    tangents,
+)
 from drake_dae.trace.functions import TracedFunction
 
 FOLDER = Path(tempfile.mkdtemp(prefix="drake_dae_surfaces_"))

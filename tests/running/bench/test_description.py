@@ -15,7 +15,7 @@ from drake_dae import (
     poles,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.robots import ConstraintWrenches
 from drake_dae.running.bench.controls import controls_of, prediction
 from drake_dae.running.bench.description import as_script, bench_of, shown_function
 from drake_dae.running.bench.inputs import Inputs

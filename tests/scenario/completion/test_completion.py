@@ -23,7 +23,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import ScenarioError
-from drake_dae.robots.constraints.constraint import Touch
+from drake_dae.robots import Touch
 from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.parts.parts import Start
@@ -172,8 +172,7 @@ def test_a_start_that_is_left_out_is_found_for_outputs_that_are_given():
 
 def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_kinetic_energy():
     """For one output z and one contact x it is sqrt(1 - c^2), c = J M^-1 P^T of unit rows."""
-    from drake_dae.robots.constraints.constraint_set import ConstraintSet
-    from drake_dae.robots.force_outputs import force_rows
+    from drake_dae.robots import ConstraintSet, force_rows
 
     model = scenario_model(scenario("two_link_wall"))
     links, bound = model.links, ConstraintSet(model.constraints)

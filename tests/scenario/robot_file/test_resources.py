@@ -9,7 +9,7 @@ import pytest
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import GeometryWarning
-from drake_dae.pictures.scene.view import start_meshcat
+from drake_dae.scene.view import start_meshcat
 
 SECRET = "the secret of this machine, 36 bytes"
 

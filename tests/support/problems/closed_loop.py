@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import TrackingLaw
 from problems.problem import Array, Problem
 
 

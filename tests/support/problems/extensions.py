@@ -3,10 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.extension.dynamic_extension import dynamic_extension
-from drake_dae.dae.extension.extension import Extension
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Extension, Signal, dynamic_extension
 from drake_dae.trace.functions import TracedFunction
 from problems import (
     PROBLEMS,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem
 
 
 class Hidden(NamedTuple):

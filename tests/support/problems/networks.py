@@ -3,8 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Signal
 from problems.problem import Array, Known, Problem, known, unconstrained
 
 

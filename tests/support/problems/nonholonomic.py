@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem
 from problems.problem import Array, Known, Problem, known
 
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_dae.dae.structure.structure import Structure, find_structure
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem, Structure, find_structure
 
 Array = np.ndarray
 

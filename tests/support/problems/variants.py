@@ -5,7 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system.system import DaeSystem
+from drake_dae.dae import DaeSystem
 
 
 def changed(system: DaeSystem, **fields) -> DaeSystem:

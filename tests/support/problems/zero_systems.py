@@ -5,8 +5,7 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.zero_dynamics.zero_dynamics import ZeroDynamics
+from drake_dae.dae import DaeSystem, ZeroDynamics
 
 Array = np.ndarray
 

@@ -28,7 +28,7 @@ from drake_dae import (
     simulate,
     start_meshcat,
 )
-from drake_dae.simulation import compiled_run
+from drake_dae.running import compiled_run
 from drake_dae.systems.control.references import ReferenceGenerator
 
 

@@ -12,7 +12,7 @@ from drake_dae import (
     ConstantReference,
     ExpressionReference,
 )
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.systems.control.commanded import RATE, RATES, SPEEDS
 

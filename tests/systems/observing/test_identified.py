@@ -28,10 +28,7 @@ from drake_dae import (
     with_disturbance,
 )
 from drake_dae.cli import main
-from drake_dae.dae.beyond.disturbance import Observation
-from drake_dae.dae.structure.structure import find_structure
-from drake_dae.dae.system.layout import DerivativeLayout
-from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae import DerivativeLayout, Observation, Parameter, find_structure
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model

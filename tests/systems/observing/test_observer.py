@@ -38,7 +38,7 @@ from drake_dae import (
     simulate,
     with_disturbance,
 )
-from drake_dae.dae.beyond.disturbance import Observation
+from drake_dae.dae import Observation
 from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.errors import ModelError, WiringError
 

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from drake_dae import DaeSystem
-from drake_dae.dae.beyond.identified import IdentifiedTerms
-from drake_dae.dae.system.signals import Parameter
+from drake_dae.dae import IdentifiedTerms, Parameter
 from drake_dae.systems.observing.parameter_filter import (
     FADING,
     ParameterFilter,

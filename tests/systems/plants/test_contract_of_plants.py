@@ -30,11 +30,11 @@ from drake_dae import (
     start_meshcat,
     sweep,
 )
+from drake_dae.diagrams.record import Record
 from drake_dae.diagrams.recorded import log_steps
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.links import add_robot
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.simulation.records.record import Record
 from drake_dae.studies.runs import Outcome
 from drake_dae.systems.plants.contract import Plant
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from polishing import FAR, OVER, PERIOD, SPEED, run_on, started, task_loop
 
 from drake_dae import Approach, Condition, Dwell, Move, PointToPointReference, Press, Record
-from drake_dae.simulation.records.phases import phase_spans
+from drake_dae.running.phases import phase_spans
 
 PRESS = Press(10.0, over=0.05)
 

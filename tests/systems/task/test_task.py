@@ -46,7 +46,7 @@ from drake_dae import (
     wire_loop,
 )
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.simulation.records.phases import phase_spans, phases_at
+from drake_dae.running.phases import phase_spans, phases_at
 from drake_dae.systems.task.automaton import faded
 
 TOUCH = FAR / SPEED + OVER / 2.0

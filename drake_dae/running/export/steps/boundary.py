@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, Diagram, OutputPort
 from drake_dae.compiler.compile import compile_part
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.wires import Wires
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.cuts import (

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, Diagram, OutputPortIndex
 
 from drake_dae.arguments import checked
 from drake_dae.compiler.wires import Port
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.export.steps.boundary import ExportedPart, controller_part

@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import (

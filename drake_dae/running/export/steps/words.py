@@ -13,9 +13,7 @@ from pydrake.systems.framework import System
 from drake_dae.arrays import FloatArray
 from drake_dae.compiler.compiled import CompiledDiagram
 from drake_dae.compiler.rates import UpdateRate
-from drake_dae.dae.system.signals import Signal
-from drake_dae.dae.system.system import DaeSystem
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae import DaeSystem, Signal, TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.running.export.text import braced, comment, entry_lines, generated, string
 from drake_dae.trace.compiled import without_branches

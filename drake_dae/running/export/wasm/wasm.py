@@ -13,7 +13,7 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.controller import write_controller

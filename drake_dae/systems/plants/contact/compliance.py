@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae.structure.constrained import ConstraintStructure
+from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import ModelError
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel
 from drake_dae.systems.plants.contact.contact_laws import (
     Compliance,
     contact_force,

@@ -11,10 +11,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import Block, Held, Requirement
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import ConstraintStructure, Signal, constraint_structure_of
 from drake_dae.errors import ModelError
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel
 from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plants.contact.compliance import OUTSIDE, CompliantEquations
 from drake_dae.systems.plants.contact.contact_checks import changed_parameters

@@ -10,10 +10,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import own_values
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.model import RobotModel
-from drake_dae.robots.surfaces.picture import PosedShape
+from drake_dae.robots import Constraint, PosedShape, RobotModel, own_values
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial
 
 

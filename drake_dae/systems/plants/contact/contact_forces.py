@@ -13,10 +13,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.signals import Signal
-from drake_dae.robots.constraint_wrenches import contact_normals
-from drake_dae.robots.model import RobotModel
+from drake_dae.dae import ConstraintStructure, Signal
+from drake_dae.robots import RobotModel, contact_normals
 
 
 class ContactForces(LeafSystem):

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.systems.plants.contact.point_contact import PointContact
+from drake_dae.trace.expressions import as_constant
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
-from drake_dae.trace.smoothness import as_constant
 
 ITERATIONS = 10
 """The number of Newton steps for the velocities of contacts. A robot in contact needs 3 to 5. Among

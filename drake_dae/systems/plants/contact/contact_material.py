@@ -16,10 +16,9 @@ from pydrake.multibody.plant import CoulombFriction
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import own_values
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel, own_values
 
 FRICTION = Signal("plant.friction")
 """The coefficient of friction of all contacts, among `PointMaterial.signals`."""

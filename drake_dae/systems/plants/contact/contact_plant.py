@@ -26,12 +26,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.computations import Computations
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae.structure.constrained import ConstraintStructure
-from drake_dae.dae.system.signals import Signal
+from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, own_values
-from drake_dae.robots.links.frames import frame_named
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import ConstraintWrenches, RobotModel, frame_named, own_values
 from drake_dae.systems.plants.contact.contact_checks import (
     changed_parameters,
     check_model,

@@ -15,7 +15,7 @@ from drake_dae.arrays import brief, number, positive
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.errors import ModelError
 from drake_dae.references import ExpressionReference
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots import Vector
 
 
 @checked(ModelError)

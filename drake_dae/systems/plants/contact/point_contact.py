@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Constraint, Touch
-from drake_dae.robots.model import RobotModel
-from drake_dae.trace.smoothness import length_of
+from drake_dae.robots import Constraint, RobotModel, Touch
+from drake_dae.trace.expressions import length_of
 
 TURNS = 4
 """The number of iterations for the deepest point of a ball, if a distance is exact only on the

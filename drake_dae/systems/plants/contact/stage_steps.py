@@ -5,7 +5,7 @@ import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.errors import ModelError
-from drake_dae.robots.model import RobotModel
+from drake_dae.robots import RobotModel
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
 _GROWTH = 1e-7

@@ -7,7 +7,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.computations import HELD, Computation, Computations, DrakeStepped
-from drake_dae.robots.constraint_wrenches import contact_normals
+from drake_dae.robots import contact_normals
 from drake_dae.systems.plants.contact.contact_forces import ContactForces
 from drake_dae.systems.plants.contract import Plant
 

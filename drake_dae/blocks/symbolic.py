@@ -1,0 +1,167 @@
+"""A DaeSystem from expressions of pydrake.symbolic."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
+from numbers import Real
+from operator import add, mul, truediv
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from pydrake.symbolic import Expression, ExpressionKind, Formula, FormulaKind, Variable
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import numbers
+from drake_dae.dae import DaeSystem, Parameter, Signal
+from drake_dae.errors import ModelError
+
+_FUNCTIONS: dict[ExpressionKind, Callable[..., ca.SX]] = {
+    ExpressionKind.Constant: lambda number: number,
+    ExpressionKind.Var: lambda symbol: symbol,
+    ExpressionKind.Add: lambda *terms: reduce(add, terms),
+    ExpressionKind.Mul: lambda *factors: reduce(mul, factors),
+    ExpressionKind.Div: truediv,
+    ExpressionKind.Pow: pow,
+    **{
+        getattr(ExpressionKind, name.title()): getattr(ca, name)
+        for name in (
+            *("log", "exp", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
+            *("sinh", "cosh", "tanh"),
+        )
+    },
+}
+
+_NOT_SMOOTH: dict[ExpressionKind, tuple[str, Callable[..., ca.SX]]] = {
+    ExpressionKind.Abs: ("abs", ca.fabs),
+    ExpressionKind.Min: ("min", ca.fmin),
+    ExpressionKind.Max: ("max", ca.fmax),
+    ExpressionKind.Ceil: ("ceil", ca.ceil),
+    ExpressionKind.Floor: ("floor", ca.floor),
+    ExpressionKind.IfThenElse: ("if_then_else", ca.if_else),
+}
+"""Functions without derivatives everywhere, which can be evaluated nevertheless; with their
+names."""
+
+_RELATIONS: dict[FormulaKind, Callable[..., ca.SX]] = {
+    FormulaKind.True_: lambda: ca.SX(1),
+    FormulaKind.False_: lambda: ca.SX(0),
+    FormulaKind.Eq: ca.eq,
+    FormulaKind.Neq: ca.ne,
+    FormulaKind.Gt: ca.gt,
+    FormulaKind.Geq: ca.ge,
+    FormulaKind.Lt: ca.lt,
+    FormulaKind.Leq: ca.le,
+    FormulaKind.And: lambda *parts: reduce(ca.logic_and, parts),
+    FormulaKind.Or: lambda *parts: reduce(ca.logic_or, parts),
+    FormulaKind.Not: ca.logic_not,
+}
+
+_CONTINUOUS = Variable.Type.CONTINUOUS
+
+
+@checked(ModelError)
+def from_symbolic(
+    state: Sequence[Variable],
+    *,
+    f: Any,
+    h: Any = None,
+    l: Any = None,  # noqa: E741 - the paper's letter
+    g: Any = None,
+    k: Any = None,
+    m: Any = None,
+    parameters: Mapping[Variable, float] | None = None,
+    **labels: Any,
+) -> DaeSystem:
+    """Builds a system (1)-(3) from expressions of `pydrake.symbolic`.
+
+    These share no subexpressions, so repeated subexpressions are translated repeatedly.
+
+    Args:
+        state: The variables x, in order.
+        f, g, h, k, l, m: The functions of (1)-(3): an Expression, Variable or number, or a list or
+            array of these, of lists for a matrix, row by row. Without constraints leave out g, k
+            and m; without controls h; without controlled outputs l and m.
+        parameters: Variable -> default.
+        labels: The remaining fields of `DaeSystem`; the states are named as their variables.
+
+    Raises:
+        ModelError: A variable is neither a state nor a parameter; an expression is not smooth, such
+            as abs, or not known, such as an uninterpreted function; or the functions form no valid
+            system, see `DaeSystem`.
+    """
+    owner = labels.get("name", "system")
+    defaults = dict(parameters or {})
+    symbols: dict[int, ca.SX] = {}
+    for variable in [*state, *defaults]:
+        if not (isinstance(variable, Variable) and variable.get_type() == _CONTINUOUS):
+            raise ModelError(
+                f"{owner}: states and parameters must be continuous Variables of "
+                f"pydrake.symbolic, got {variable!r}"
+            )
+        if variable.get_id() in symbols:
+            raise ModelError(
+                f"{owner}: the variable {variable} occurs twice among the states and parameters"
+            )
+        symbols[variable.get_id()] = ca.SX.sym(variable.get_name())
+
+    def translate(letter: str, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
+        if isinstance(value, (list, tuple)):
+            return [translate(letter, item) for item in value]
+        try:
+            return to_casadi(value, symbols)
+        except ModelError as error:
+            raise ModelError(f"{owner}: {letter} cannot hold {value}: {error}") from None
+
+    functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
+    return DaeSystem(
+        state=ca.vertcat(ca.SX(0, 1), *[symbols[variable.get_id()] for variable in state]),
+        **{
+            letter: ca.SX(0, 0) if value is None else translate(letter, value)
+            for letter, value in functions.items()
+        },
+        parameters=tuple(
+            Parameter(variable.get_name(), value, symbol=symbols[variable.get_id()])
+            for variable, value in defaults.items()
+        ),
+        **{"state_signals": tuple(Signal(v.get_name()) for v in state), **labels},
+    )
+
+
+def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True) -> ca.SX:
+    """Converts a scalar expression of `pydrake.symbolic`, or a number, to CasADi.
+
+    Args:
+        expression: The expression, or a Formula in it.
+        symbols: Variable.get_id() -> its CasADi symbol.
+        smooth: Whether it must have derivatives everywhere.
+
+    Raises:
+        ModelError: A variable has no symbol, or a function is not smooth or not known.
+    """
+    if isinstance(expression, Variable):
+        if expression.get_id() not in symbols:
+            raise ModelError(
+                f"the variable {expression} is neither a state nor a parameter; pass it in "
+                "'parameters' or put its number in"
+            )
+        return symbols[expression.get_id()]
+    if isinstance(expression, Real):
+        return ca.SX(float(numbers("it", expression)))
+    if not isinstance(expression, Expression | Formula):
+        raise ModelError(
+            f"it is no expression of pydrake.symbolic, but {type(expression).__name__}"
+        )
+    kind = expression.get_kind()
+    name, function = _NOT_SMOOTH.get(kind, ("", None))
+    if smooth and name:
+        raise ModelError(
+            f"{name} has no derivatives everywhere, and the theory differentiates; use a smooth "
+            "function instead"
+        )
+    function = function or (_RELATIONS if isinstance(expression, Formula) else _FUNCTIONS).get(kind)
+    if function is None:
+        raise ModelError(f"nothing is known of the function {expression}")
+    _, parts = expression.Unapply()
+    return function(*[to_casadi(part, symbols, smooth) for part in parts])

@@ -1,0 +1,187 @@
+"""Frictional contacts: whether a unique nonnegative force exists, and the motions if not.
+
+A contact that can only push keeps phi >= 0 with lambda >= 0 and phi'' lambda = 0, where
+
+    phi'' = A(x) lambda + b(x, u).
+
+Without friction A = J M^-1 J^T is positive definite, and exactly one lambda fits. With friction it
+is A = J M^-1 (J^T - mu J_t^T s), not symmetric; one lambda fits for every b exactly where all
+principal minors of A are positive (a P-matrix: Samelson, Thrall and Wesler 1958). A minor that
+reaches zero is the Painleve paradox (1895).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from itertools import chain, combinations
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.signals import Parameter, Signal
+from drake_dae.errors import ModelError
+
+FAR = 1e9
+"""Forces that exceed what they balance by this factor count as infinite."""
+
+MOST = 8
+"""The largest number of unilateral forces with friction: every subset of them is examined."""
+
+
+@dataclass(frozen=True)
+class UnilateralInput:
+    """A constraint input that must not be negative: a contact force that can only push."""
+
+    force: str
+    friction: str | None = None
+    sliding: ca.SX | None = field(default=None, repr=False, compare=False)
+
+
+class PainleveOutcome(Enum):
+    """The number of possible motions in a Painleve paradox; the enum value is a description."""
+
+    INCONSISTENT = (
+        "inconsistent: no compressive force maintains the contact, and without a force there "
+        "would be penetration"
+    )
+    INDETERMINATE = (
+        "indeterminate: a compressive force maintains the contact, and it can open as well"
+    )
+    OPENING = "opening: without a force the contact opens, and no compressive force maintains it"
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """The unilateral contacts of a system in which at least one contact has friction."""
+
+    owner: str
+    inputs: Sequence[Signal]
+    parameters: Sequence[Parameter]
+    contacts: Sequence[UnilateralInput]
+
+    def __post_init__(self) -> None:
+        if len(self.rows) > MOST:
+            raise ModelError(
+                f"{self.owner}: {len(self.rows)} unilateral forces, one of them with friction; "
+                f"with friction at most {MOST} are possible, since all their subsets are "
+                "examined. Remove the friction, or some contacts"
+            )
+
+    def __bool__(self) -> bool:
+        return any(self.frictions)
+
+    @property
+    def rows(self) -> list[int]:
+        return list(self._friction_of_rows)
+
+    @property
+    def frictions(self) -> list[Parameter | None]:
+        return list(self._friction_of_rows.values())
+
+    @property
+    def _friction_of_rows(self) -> dict[int, Parameter | None]:
+        names = [signal.name for signal in self.inputs]
+        by_name = {parameter.name: parameter for parameter in self.parameters}
+        return {
+            names.index(contact.force): by_name[contact.friction] if contact.friction else None
+            for contact in self.contacts
+            if contact.force in names
+        }
+
+    def without_friction(self, matrix: ca.SX) -> ca.SX:
+        """Returns an expression with all coefficients of friction set to zero."""
+        if not self:
+            return matrix
+        # Contacts may share a coefficient.
+        symbols = ca.vertcat(*{p.name: p.symbol for p in self.frictions if p}.values())
+        return ca.substitute(matrix, symbols, ca.SX.zeros(symbols.numel()))
+
+    def reserve(self, matrix: ca.SX) -> ca.SX:
+        """Returns the smallest principal minor of A(x), relative to its value without friction.
+
+        Minors are those of sets of contacts with all other constraints, of which none can open. The
+        least ratio is the same in any order of the contacts and in any units, 1 without friction,
+        and positive exactly where all minors are.
+        """
+        smallest = ca.SX(1)
+        others = [i for i in range(matrix.shape[0]) if i not in self.rows]
+        both = [matrix, self.without_friction(matrix)]
+        for i in others:  # These constraints have no friction, so their pivots are positive.
+            both = [_eliminated(part, i) for part in both]
+        for minor, without in zip(*(_minors(part, self.rows) for part in both), strict=True):
+            smallest = ca.fmin(smallest, minor / without)
+        return smallest
+
+
+def _eliminated(matrix: ca.SX, i: int) -> ca.SX:
+    """The Schur complement of entry (i, i), in the shape of the matrix."""
+    return matrix - ca.mtimes(matrix[:, i], matrix[i, :]) / matrix[i, i]
+
+
+def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> Iterator[ca.SX]:
+    """All principal minors of some rows, one for each set of them.
+
+    A minor with the first row is a_11 times that of the Schur complement of a_11 without it; one
+    without the first row is that of A without it.
+    """
+    if rows:
+        first, *others = rows
+        with_first = before * matrix[first, first]
+        yield with_first
+        yield from _minors(matrix, others, before)
+        if others:
+            yield from _minors(_eliminated(matrix, first), others, with_first)
+
+
+def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[int]) -> float:
+    """Returns the smallest s > 0 at which a principal minor of A_0 - s D is zero; else infinity."""
+    largest = 0.0
+    for used in _sets(len(without), rows):
+        part = np.ix_(used, used)
+        values = np.linalg.eigvals(np.linalg.solve(without[part], per_unit[part]))
+        real = values.real[np.abs(values.imag) <= 1e-9 * np.abs(values).max(initial=0.0)]
+        largest = max(largest, float(real.max(initial=0.0)))
+    return 1.0 / largest if largest > 0.0 else np.inf
+
+
+def painleve_outcome(
+    matrix: FloatArray,
+    without: FloatArray,
+    force: FloatArray,
+    size: FloatArray,
+    rows: Sequence[int],
+) -> PainleveOutcome | None:
+    """Determines the outcome of a Painleve paradox by the linear complementarity problem."""
+    if not np.all(np.isfinite(force)):
+        return PainleveOutcome.INCONSISTENT
+    edge = np.abs(without) @ np.abs(force)
+    if not np.all(edge <= FAR * size):
+        return PainleveOutcome.INCONSISTENT  # A is singular, and no forces balance b.
+    if np.all(np.abs(matrix @ force) <= edge / FAR):
+        return PainleveOutcome.INDETERMINATE  # A is singular, and several forces balance b.
+    free = -matrix @ force
+    fitting = []
+    for used in _sets(len(matrix), rows, with_none=True):
+        force = np.zeros(len(matrix))
+        try:
+            force[used] = np.linalg.solve(matrix[np.ix_(used, used)], -free[used])
+        except np.linalg.LinAlgError:
+            return None
+        closed = np.isin(rows, used)
+        rate = (matrix @ force + free)[rows]
+        if np.all(force[rows][closed] >= 0.0) and np.all(rate[~closed] >= 0.0):
+            fitting.append(closed)
+    if not fitting:
+        return PainleveOutcome.INCONSISTENT
+    if len(fitting) > 1:
+        return PainleveOutcome.INDETERMINATE
+    return None if fitting[0].any() else PainleveOutcome.OPENING
+
+
+def _sets(size: int, rows: Sequence[int], with_none: bool = False) -> Iterator[list[int]]:
+    """Generates every set of contacts, each together with all bilateral constraints."""
+    always = [i for i in range(size) if i not in rows]
+    counts = range(0 if with_none else 1, len(rows) + 1)
+    for chosen in chain.from_iterable(combinations(rows, count) for count in counts):
+        yield [*always, *chosen]

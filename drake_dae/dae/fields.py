@@ -1,0 +1,248 @@
+"""The fields of a `DaeSystem`, from expressions and functions of users: converted and checked.
+
+CasADi's own messages do not say which function of (1)-(3) is wrong, or how to correct it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import brief, number, numbers, unknown_name, vector
+from drake_dae.dae.contacts import UnilateralInput
+from drake_dae.dae.signals import Parameter, Signal, is_symbol, parameter_slice, parameter_symbol
+from drake_dae.errors import ModelError
+from drake_dae.trace.compiled import check_choice
+from drake_dae.trace.expressions import find_flaw
+
+
+def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Checks the fields of a system and returns those that change, converted."""
+    name, state = given["name"], given["state"]
+    if not isinstance(name, str):
+        raise ModelError(f"the name of a system must be text, got {name!r}")
+    if not (is_symbol(state) and state.numel()):
+        raise ModelError(
+            f"{name}: 'state' must be a CasADi SX column of symbols, "
+            f"for example casadi.SX.sym('x', 4); got {type(state).__name__}"
+        )
+    state = ca.vec(state)
+    check_choice(name, given["compiled"])
+    for key in ("least_margin", "negligible"):
+        if not 1e-15 <= number(f"{name}: {key}", given[key]) < 1.0:
+            raise ModelError(
+                f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
+                f"{brief(given[key])}"
+            )
+    for key, kind in (("contacts", UnilateralInput), ("parameters", Parameter)):
+        items = given[key]
+        if not isinstance(items, (list, tuple)) or not all(isinstance(i, kind) for i in items):
+            raise ModelError(
+                f"{name}: {key} must be a list of {kind.__name__}s, got {brief(items)}"
+            )
+    parameters = tuple(given["parameters"])
+    _check_unique(name, "parameter", [p.name for p in parameters])
+    for contact in given["contacts"]:
+        if contact.friction is not None:
+            parameter_slice(name, parameters, contact.friction)
+    functions = {key: given[key] for key in ("f", "g", "h", "k", "l", "m", "mass_matrix")}
+    if functions["mass_matrix"] is None:
+        functions["mass_matrix"] = ca.SX.eye(state.numel())
+    metric, free = given["control_metric"], given["free_control"]
+    functions |= {} if metric is None else {"control_metric": metric}
+    functions |= {} if free is None else {"free_control": free}
+    expressions = _expressions(name, functions, state, parameter_symbol(parameters))
+    fields = {"state": state, "parameters": parameters, **expressions}
+    n, m = state.numel(), expressions["k"].numel()
+    p, q = expressions["h"].shape[1], expressions["l"].numel()
+    for key, count, letter in (
+        ("state_signals", n, "x"),
+        ("constraint_input_signals", m, "v"),
+        ("constraint_output_signals", m, "y"),
+        ("control_signals", p, "u"),
+        ("output_signals", q, "z"),
+    ):
+        named = given[key] or [f"{letter}{i}" for i in range(count)]
+        fields[key] = signals = _as_signals(f"{name}: {key}", named)
+        if len(signals) != count:
+            raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
+        _check_unique(name, key, [signal.name for signal in signals])
+    nominal, scale = given["nominal_state"], given["state_scale"]
+    start = np.zeros(n) if nominal is None else nominal
+    fields["nominal_state"] = vector(f"{name}: nominal_state", start, n)
+    fields["nominal_state"].setflags(write=False)
+    if scale is not None:
+        fields["state_scale"] = vector(f"{name}: state_scale", scale, n)
+        fields["state_scale"].setflags(write=False)
+        if not np.all(fields["state_scale"] > 0.0):
+            raise ModelError(f"{name}: state_scale must be positive, got {brief(scale)}")
+    if free is not None and metric is None:
+        raise ModelError(
+            f"{name}: free_control needs a control_metric, which measures the distance from it"
+        )
+    if metric is not None and p <= q:
+        raise ModelError(
+            f"{name}: control_metric chooses among controls, but with {p} controls and {q} "
+            "controlled outputs there is nothing to choose; leave it out"
+        )
+    if metric is not None and free is None:
+        fields["free_control"] = ca.SX(p, 1)
+    return fields
+
+
+def fields_of_functions(
+    state: Sequence[Signal | str] | int,
+    functions: Mapping[str, Any],
+    parameters: Mapping[str, ArrayLike],
+    labels: Mapping[str, Any],
+    fields: Sequence[str],
+) -> dict[str, Any]:
+    """Returns the fields of a `DaeSystem` from Python functions; see `from_functions`."""
+    owner = labels.get("name", "system")
+    fixed = {"state", "parameters", "state_signals", *"fghklm"}
+    allowed = [item for item in fields if item not in fixed]
+    for label in labels:
+        if label not in allowed:
+            raise ModelError(f"{owner}: {unknown_name('field', label, allowed)}")
+    bad = [name for name in parameters if not name.isidentifier()]
+    if bad:
+        raise ModelError(
+            f"parameter names must be Python identifiers, for use as p.name, got {bad}"
+        )
+    names = [f"x{i}" for i in range(state)] if isinstance(state, int) else state
+    named = _as_signals(f"{owner}: the states", names)
+    if not named:
+        raise ModelError(f"{owner}: a system needs at least one state")
+    x = ca.vertcat(*[ca.SX.sym(signal.name) for signal in named])
+    defined = tuple(
+        Parameter(name, numbers(f"parameter '{name}'", value)) for name, value in parameters.items()
+    )
+    arguments: list[Any] = [x]
+    if defined:
+        arguments.append(SimpleNamespace(**{p.name: p.symbol for p in defined}))
+    values = {key: _called(owner, key, function, arguments) for key, function in functions.items()}
+    if values["h"].shape[0] == 1 and x.numel() != 1:
+        values["h"] = values["h"].T
+    return {"state": x, **values, "parameters": defined, "state_signals": named, **labels}
+
+
+def as_expression(owner: str, key: str, value: Any) -> ca.SX:
+    """Converts an SX, a number, an array, or a (nested) list of these to an SX matrix."""
+    if isinstance(value, ca.MX):
+        raise ModelError(f"{owner}: {key} is a CasADi MX; use SX symbols and expressions")
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = value.tolist()
+    try:
+        if isinstance(value, (list, tuple)):
+            rows = [ca.horzcat(*row) if isinstance(row, (list, tuple)) else row for row in value]
+            value = ca.vertcat(*rows) if rows else ca.SX(0, 1)
+        return ca.SX(np.asarray(value, dtype=float) if not isinstance(value, ca.SX) else value)
+    except Exception as error:
+        raise ModelError(
+            f"{owner}: {key} must be a CasADi SX expression, an array, or a list of these (of "
+            f"lists of one length for a matrix), got {type(value).__name__}"
+        ) from error
+
+
+def _expressions(
+    owner: str, functions: Mapping[str, Any], state: ca.SX, parameters: ca.SX
+) -> dict[str, ca.SX]:
+    """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them."""
+    values = {key: as_expression(owner, key, value) for key, value in functions.items()}
+    n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
+    q = values["l"].numel()
+    shapes = {"f": (n, 1), "g": (n, m), "h": (n, p), "k": (m, 1), "l": (q, 1), "m": (q, m)}
+    shapes |= {"mass_matrix": (n, n), "control_metric": (p, p), "free_control": (p, 1)}
+    allowed = ca.vertcat(state, parameters)
+    if len(ca.symvar(allowed)) != allowed.numel():
+        raise ModelError(f"{owner}: a symbol occurs twice among the states and parameters")
+    for key, value in values.items():
+        shape = shapes[key]
+        if value.numel() == 0 and 0 in shape:
+            value = ca.SX(*shape)
+        if value.shape != shape and value.shape == shape[::-1] and 1 in shape:
+            value = value.T
+        if value.shape != shape:
+            missing = " (k is given, so g and m are needed)" if value.numel() == 0 else ""
+            raise ModelError(
+                f"{owner}: {key} has shape {value.shape}, expected {shape} for n = {n} states, "
+                f"m = {m} constraints, p = {p} controls, {q} controlled outputs{missing}"
+            )
+        unknown = [s.name() for s in ca.symvar(value) if not ca.depends_on(allowed, s)]
+        if unknown:
+            raise ModelError(
+                f"{owner}: {key} depends on {', '.join(unknown)}, which is neither a "
+                "state nor a parameter; pass it in 'parameters' or put its number in"
+            )
+        values[key] = ca.sparsify(value)  # Zeros of an array are structural, too.
+    if find_flaw(ca.veccat(*values.values()), state, parameters):
+        for key, value in values.items():
+            for row, column in zip(*value.sparsity().get_triplet(), strict=True):
+                if flaw := find_flaw(value[row, column], state, parameters, "the state"):
+                    raise ModelError(
+                        f"{owner}: {key}, entry [{row}, {column}] of shape {value.shape}, {flaw}"
+                    )
+    return values
+
+
+def _check_unique(owner: str, kind: str, names: Sequence[str]) -> None:
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise ModelError(f"{owner}: {kind} names must be unique, twice: {', '.join(double)}")
+
+
+def _as_signals(what: str, signals: Any) -> tuple[Signal, ...]:
+    """Converts a list of signals, or of names of signals without unit, to signals."""
+    items = [signals] if isinstance(signals, str) or not isinstance(signals, Sequence) else signals
+    bad = [item for item in items if not isinstance(item, (Signal, str))]
+    if items is not signals or bad:
+        raise ModelError(f"{what} must be a list of names or Signals, got {(bad or items)[0]!r}")
+    return tuple(Signal(item) if isinstance(item, str) else item for item in items)
+
+
+def _called(
+    owner: str, letter: str, function: Callable[..., Any] | None, arguments: list[Any]
+) -> ca.SX:
+    """Calls a user's function with symbols and returns its expression; empty without a function."""
+    if function is None:
+        return ca.SX(0, 0)
+    if not callable(function):
+        raise ModelError(
+            f"{owner}: {letter} must be a function of the state, got "
+            f"{type(function).__name__}; `DaeSystem(...)` takes expressions"
+        )
+    try:
+        value = function(*arguments)
+    except Exception as error:
+        raise ModelError(
+            f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
+            f"states: {_explained(error, function, arguments)}"
+        ) from error
+    if value is None:
+        raise ModelError(f"{owner}: function {letter} returned nothing")
+    return as_expression(owner, letter, value)
+
+
+def _explained(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
+    """Explains an error in a user's function."""
+    text = str(error)
+    try:
+        signature(function).bind(*arguments)
+    except TypeError:
+        called = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
+        return f"{text}. It is called with {called}"
+    except ValueError:
+        pass  # Built-in functions have no signature.
+    if "truth value" in text:
+        return (
+            "it asks whether a condition on the state is true, as in if, max or min. Conditions "
+            "are not smooth, and the theory differentiates: write the branch in which the state "
+            "remains, or a smooth function"
+        )
+    if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
+        return f"no parameter '{error.name}'; there are {', '.join(vars(error.obj))}"
+    return f"{text}. Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"

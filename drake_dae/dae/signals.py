@@ -1,0 +1,370 @@
+"""Names, units and numbers of the scalars that a system is made of, and how they are stacked."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, brief, check_writable, numbers, unknown_name
+from drake_dae.errors import ModelError
+
+Indices = np.typing.NDArray[np.intp]
+
+DERIVATIVES = 10
+"""The number of symbols for derivatives of an exogenous parameter; long chains need 8."""
+
+LARGEST = 1e60
+"""The largest value of a parameter; positive ones are at least its inverse. Equations multiply up
+to five parameters before they divide."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class Signal:
+    """One scalar component of a vector signal: its name and its unit.
+
+    Attributes:
+        name: Its name, unique in its vector.
+        unit: Its SI unit as text, "" for a pure number.
+    """
+
+    name: str
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        check_writable("the name of a signal", self.name)
+
+    def derivative(self, order: int) -> "Signal":
+        """Returns the signal of a time derivative: x -> x', x'', ..., with the matching unit."""
+        if order == 0:
+            return self
+        per_time = "/s" if order == 1 else f"/s^{order}"
+        return Signal(self.name + "'" * order, (self.unit or "1") + per_time)
+
+
+def signals(names: Sequence[str], unit: str = "") -> tuple[Signal, ...]:
+    """Returns signals of the given names that share a unit."""
+    return tuple(Signal(name, unit) for name in names)
+
+
+def outputs_named(names: Collection[str], outputs: Sequence[Signal]) -> list[int]:
+    """Returns the indices of outputs by their names."""
+    known = [signal.name for signal in outputs]
+    for name in names:
+        if name not in known:
+            raise ModelError(unknown_name("output", name, known))
+    return [known.index(name) for name in names]
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """A number, or a vector of numbers, whose value can change without tracing the equations again.
+
+    An exogenous one is a signal w(t) that is not controlled but has known derivatives, as a
+    reference has: the position of a moving surface, a known load, time.
+
+    Attributes:
+        name: Its name, unique in its system, for example "link1.mass".
+        value: The default, shape (k,); a float is taken as shape (1,).
+        unit: Its SI unit as text, "" for a pure number.
+        positive: Whether only positive numbers make sense, as for a mass.
+        nonnegative: Whether negative numbers make no sense, as for a coefficient of friction.
+        symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
+            not given.
+        exogenous: Whether it moves.
+        bounds: The range (low, high) of its values, each a number or of shape (k,). Relative
+            degrees must be the same in this range. If None, half and twice the default, or -1 and 1
+            where the default is 0. Equal bounds fix the value; the signal is then constant.
+        derivatives: The symbols of w', w'', ..., each of shape (k, 1), if it moves. Made where not
+            given.
+
+    Raises:
+        ModelError: The value is not finite or out of its bounds, or the symbol does not fit it.
+    """
+
+    name: str
+    value: FloatArray
+    unit: str = ""
+    positive: bool = False
+    symbol: ca.SX = field(default=None)
+    exogenous: bool = False
+    nonnegative: bool = False
+    bounds: tuple[ArrayLike, ArrayLike] | None = None
+    derivatives: tuple[ca.SX, ...] = field(default=(), repr=False)
+
+    def __post_init__(self) -> None:
+        value = np.atleast_1d(numbers(f"parameter '{self.name}'", self.value))
+        if value.ndim != 1:
+            raise ModelError(f"parameter '{self.name}' must be one-dimensional, got {self.value!r}")
+        value.setflags(write=False)
+        object.__setattr__(self, "value", value)
+        if self.bounds is not None:
+            what = f"parameter '{self.name}': bounds"
+            low, high = (np.atleast_1d(numbers(what, bound)) for bound in self.bounds)
+            fits = all(bound.shape in ((1,), value.shape) for bound in (low, high))
+            if not fits or not np.all(low <= high):
+                raise ModelError(
+                    f"{what} must be a lowest and a highest value, each a number or of shape "
+                    f"({value.size},), got {self.bounds!r}"
+                )
+        self.check(value)
+        if self.symbol is None:
+            object.__setattr__(self, "symbol", ca.SX.sym(self.name, value.size))
+        elif not is_symbol(self.symbol) or self.symbol.shape != (value.size, 1):
+            raise ModelError(
+                f"the symbol of parameter '{self.name}' must be a CasADi SX column of "
+                f"{value.size} symbols, as its value has; got {self.symbol}"
+            )
+        if self.exogenous and not self.derivatives:
+            names = [self.name + "'" * order for order in range(1, DERIVATIVES + 1)]
+            rates = tuple(ca.SX.sym(name, value.size) for name in names)
+            object.__setattr__(self, "derivatives", rates)
+
+    @property
+    def low(self) -> FloatArray:
+        """The lowest values for which relative degrees are checked, shape (k,)."""
+        if self.bounds is not None:
+            return np.broadcast_to(np.asarray(self.bounds[0], dtype=float), self.value.shape)
+        least = -1.0 if not (self.positive or self.nonnegative) else 0.0
+        return np.where(self.value == 0.0, least, np.minimum(0.5 * self.value, 2.0 * self.value))
+
+    @property
+    def high(self) -> FloatArray:
+        """The highest values for which relative degrees are checked, shape (k,)."""
+        if self.bounds is not None:
+            return np.broadcast_to(np.asarray(self.bounds[1], dtype=float), self.value.shape)
+        return np.where(self.value == 0.0, 1.0, np.maximum(0.5 * self.value, 2.0 * self.value))
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Names and units of its entries."""
+        if self.value.size == 1:
+            return (Signal(self.name, self.unit),)
+        return signals([f"{self.name}[{i}]" for i in range(self.value.size)], self.unit)
+
+    @property
+    def rate(self) -> ca.SX:
+        """The symbols of w', shape (k, 1); structural zeros if it is constant."""
+        return self.derivatives[0] if self.derivatives else ca.SX(self.value.size, 1)
+
+    def entries(self, value: ArrayLike) -> FloatArray:
+        """Returns a value of it, shape (k,); one number stands for all entries."""
+        entries = np.atleast_1d(numbers(f"parameter '{self.name}'", value))
+        if entries.shape not in ((1,), self.value.shape):
+            raise ModelError(
+                f"parameter '{self.name}' has {self.value.size} entries, got {value!r}"
+            )
+        return np.broadcast_to(entries, self.value.shape).copy()
+
+    def check(self, value: FloatArray) -> None:
+        """Checks that values are within the range of the parameter.
+
+        Raises:
+            ModelError: A number is not finite, has the wrong sign, or exceeds `LARGEST`.
+        """
+        least = 1.0 / LARGEST if self.positive else 0.0
+        size = np.abs(value)
+        if not np.all(np.isfinite(value)):
+            wrong = "be finite"
+        elif self.positive and not np.all(value > 0.0):
+            wrong = "be positive"
+        elif self.nonnegative and not np.all(value >= 0.0):
+            wrong = "not be negative"
+        elif np.any(size > LARGEST) or np.any(size < least):
+            wrong = f"be from {1.0 / LARGEST:g} to {LARGEST:g}, so that a double holds its products"
+        elif self.bounds is not None and not np.all((self.low <= value) & (value <= self.high)):
+            low, high = map(brief, self.bounds)
+            wrong = f"stay in its bounds, from {low} to {high}"
+        else:
+            return
+        raise ModelError(f"parameter '{self.name}' must {wrong}, got {value}")
+
+
+def is_symbol(value: Any) -> bool:
+    """Whether it is a CasADi SX matrix of symbols."""
+    return isinstance(value, ca.SX) and value.is_valid_input()
+
+
+def parameter_symbol(parameters: Sequence[Parameter]) -> ca.SX:
+    """Returns the symbols of all parameters in one column, then w', w'', ... of exogenous ones."""
+    rates = [rate for p in parameters if p.exogenous for rate in p.derivatives]
+    return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters], *rates)
+
+
+def parameter_slice(owner: str, parameters: Sequence[Parameter], name: str) -> slice:
+    """Returns the slice of a parameter in the parameter vector."""
+    start = 0
+    for parameter in parameters:
+        if parameter.name == name:
+            return slice(start, start + parameter.value.size)
+        start += parameter.value.size
+    raise ModelError(f"{owner}: {unknown_name('parameter', name, [p.name for p in parameters])}")
+
+
+@dataclass(frozen=True, eq=False)
+class Exogenous:
+    """The exogenous parameters w of a system, with symbols for their time derivatives."""
+
+    owner: str
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def moving(self) -> tuple[Parameter, ...]:
+        """The exogenous parameters."""
+        return tuple(p for p in self.parameters if p.exogenous)
+
+    def __bool__(self) -> bool:
+        return bool(self.moving)
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Names and units of the entries of w."""
+        return tuple(signal for p in self.moving for signal in p.signals)
+
+    def rate(self, expression: ca.SX) -> ca.SX:
+        """Returns the part sum_j (d/dw^(j)) w^(j+1) of a time derivative, shape (k, 1)."""
+        rate = ca.SX(expression.numel(), 1)
+        for p in self.moving:
+            levels = (p.symbol, *p.derivatives)
+            if ca.depends_on(expression, levels[-1]):
+                raise ModelError(
+                    f"{self.owner}: more than {len(p.derivatives)} derivatives of '{p.name}' are "
+                    "needed"
+                )
+            rate += ca.jtimes(expression, ca.vertcat(*levels[:-1]), ca.vertcat(*levels[1:]))
+        return rate
+
+    def degrees(self, *expressions: ca.SX) -> tuple[int, ...]:
+        """Returns the number of derivatives of each entry of w on which expressions depend."""
+        every = ca.veccat(*expressions)
+        degrees: list[int] = []
+        for p in self.moving:
+            for i in range(p.value.size):
+                orders = [k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i])]
+                degrees.append(max(orders, default=0))
+        return tuple(degrees)
+
+    def rates(self) -> dict[str, slice]:
+        """Name of an exogenous parameter -> the place of w', w'', ... in the parameter vector."""
+        first, rates = sum(p.value.size for p in self.parameters), dict[str, slice]()
+        for p in self.moving:
+            rates[p.name] = slice(first, first + p.value.size * len(p.derivatives))
+            first = rates[p.name].stop
+        return rates
+
+    def places(self, degrees: Sequence[int]) -> list[int]:
+        """Returns the indices of w_1, w_1', ..., w_1^(d_1), w_2, ... among the parameters."""
+        rates, places, degree = self.rates(), list[int](), iter(degrees)
+        for p in self.moving:
+            start = parameter_slice(self.owner, self.parameters, p.name).start
+            for i in range(p.value.size):
+                following = range(rates[p.name].start + i, rates[p.name].stop, p.value.size)
+                places += [start + i, *following[: next(degree)]]
+        return places
+
+
+@dataclass(frozen=True)
+class DerivativeLayout:
+    """The indices of p signals and their derivatives in the stacked vectors of section 2.
+
+    A chain holds mu_i derivatives of each signal, and a reference one more:
+
+        chain     = (z_1, z_1', ..., z_1^(mu_1 - 1), z_2, ...)    sum mu_i numbers
+        reference = (r_1, r_1', ..., r_1^(mu_1),     r_2, ...)    sum (mu_i + 1) numbers
+
+    The constraint chains of (4) are stacked likewise, with r_i in place of mu_i. `more` further
+    derivatives of each signal may be in a reference.
+    """
+
+    degrees: tuple[int, ...]
+    more: tuple[int, ...] = ()
+
+    @property
+    def chain_size(self) -> int:
+        return sum(self.degrees)
+
+    @cached_property
+    def reference_size(self) -> int:
+        return sum(self.reference_degrees) + len(self.degrees)
+
+    @cached_property
+    def reference_degrees(self) -> tuple[int, ...]:
+        """The number of derivatives of each r_i in a reference, mu_i without further ones."""
+        more = self.more or (0,) * len(self.degrees)
+        return tuple(degree + added for degree, added in zip(self.degrees, more, strict=True))
+
+    @cached_property
+    def lowest(self) -> Indices:
+        """The indices of r_1, ..., r_p in a reference vector, shape (p,)."""
+        return np.cumsum([0, *[d + 1 for d in self.reference_degrees]], dtype=np.intp)[:-1]
+
+    @cached_property
+    def highest(self) -> Indices:
+        """The indices of r_1^(mu_1), ..., r_p^(mu_p) in a reference vector, shape (p,)."""
+        return self.lowest + np.array(self.degrees, dtype=np.intp)
+
+    @cached_property
+    def chained(self) -> Indices:
+        """The index in a reference vector of the target of each chain entry, shape (sum mu_i,)."""
+        return np.repeat(self.lowest, self.degrees) + self.orders
+
+    @cached_property
+    def owners(self) -> Indices:
+        """The index of the signal of each chain entry, shape (sum mu_i,)."""
+        return np.repeat(np.arange(len(self.degrees)), self.degrees)
+
+    @cached_property
+    def orders(self) -> Indices:
+        """The order of the derivative of each chain entry, shape (sum mu_i,)."""
+        return np.concatenate([np.zeros(0, dtype=np.intp), *map(np.arange, self.degrees)])
+
+    @cached_property
+    def starts(self) -> Indices:
+        """The index of the first chain entry of each signal, shape (p,)."""
+        return np.cumsum([0, *self.degrees], dtype=np.intp)[:-1]
+
+    @cached_property
+    def heads(self) -> Indices:
+        """The chain index of the zeroth derivative of each signal with mu_i >= 1."""
+        return np.flatnonzero(self.orders == 0)
+
+    @cached_property
+    def ends(self) -> Indices:
+        """The chain index of the highest derivative of each signal with mu_i >= 1."""
+        return self.heads + np.array(self.degrees, dtype=np.intp)[self.dynamic] - 1
+
+    @cached_property
+    def dynamic(self) -> Indices:
+        """The indices of the signals with mu_i >= 1."""
+        return np.flatnonzero(self.degrees)
+
+    @cached_property
+    def direct(self) -> Indices:
+        """The indices of the signals with mu_i = 0, which have no chain."""
+        return np.flatnonzero(np.array(self.degrees) == 0)
+
+    def chain_signals(self, signals: Sequence[Signal]) -> tuple[Signal, ...]:
+        """Returns names and units of the entries of a chain."""
+        pairs = zip(signals, self.degrees, strict=True)
+        return tuple(signal.derivative(order) for signal, d in pairs for order in range(d))
+
+    def reference_signals(self, signals: Sequence[Signal]) -> tuple[Signal, ...]:
+        """Returns names and units of the entries of a reference vector."""
+        pairs = zip(signals, self.reference_degrees, strict=True)
+        return tuple(signal.derivative(order) for signal, d in pairs for order in range(d + 1))
+
+    def values(self, reference: ArrayLike) -> FloatArray:
+        """Returns the values r_1, ..., r_p of a reference vector, shape (p,)."""
+        return np.asarray(reference, dtype=float).reshape(-1)[self.lowest]
+
+    def constant(self, values: ArrayLike) -> FloatArray:
+        """Returns the reference vector of constant values of shape (p,); its derivatives are 0."""
+        reference = np.zeros(self.reference_size)
+        reference[self.lowest] = values
+        return reference

@@ -1,0 +1,406 @@
+"""The system class of the paper: x' = f + g v + h u, 0 = k(x), z = l + m v.      (1)-(3)"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from math import isfinite
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, numbers, vector
+from drake_dae.dae.contacts import Contacts, UnilateralInput
+from drake_dae.dae.fields import checked_fields, fields_of_functions
+from drake_dae.dae.signals import Exogenous, Parameter, Signal, parameter_slice, parameter_symbol
+from drake_dae.errors import ModelError
+from drake_dae.trace.compiled import Compiled
+from drake_dae.trace.factorization import Factors, PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
+
+
+@dataclass(frozen=True, eq=False)
+class ForceSharing:
+    """The distribution of forces among redundant constraints, some of which are removed.
+
+    The motion determines the sum v = G(x) v_all alone. Among all v_all with that sum the one with
+    the least sum of c_i v_i^2 is shown, v_all = T(x) v: G T = 1. See `share_forces`.
+    """
+
+    split: ca.SX
+    gather: ca.SX
+    signals: tuple[Signal, ...]
+    undetermined: tuple[str, ...]
+    left_out: ca.SX
+    left_out_signals: tuple[Signal, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class DaeSystem:
+    """A nonlinear differential-algebraic control system, equations (1)-(3):
+
+        x' = f(x) + g(x) v + h(x) u,    0 = k(x),    z = l(x) + m(x) v.
+
+    The fields are CasADi SX expressions of `state` and of the symbols of `parameters`; numbers are
+    constants. Exogenous signals w(t) are parameters with `exogenous=True`: in section 2, L_f then
+    becomes D = L_f + sum_j (d/dw^(j)) w^(j+1), and N* moves. With E the first equation is
+    E x' = f + g v + h u; giving M(q) costs far fewer operations than giving its inverse.
+
+    Attributes:
+        state: The symbols x, shape (n, 1).
+        f, g, h: The drift and the input matrices of v and u, shapes (n, 1), (n, m) and (n, p).
+        k: The constraint outputs y, shape (m, 1); m = 0 is an ordinary control system.
+        l, m: The controlled outputs z, shapes (q, 1) and (q, m). A law (28) needs q = p, or fewer
+            with a `control_metric`; a system that is only simulated may have any number.
+        parameters: Named numbers that the expressions depend on.
+        state_signals, constraint_input_signals, control_signals, constraint_output_signals,
+            output_signals: Names and units of x, v, u, y, z; "x0", "x1", ... where not given.
+        nominal_state: The initial guess for consistent states, shape (n,); zero if None.
+        state_scale: The size of each state, to which tolerances are relative; if None,
+            max(|nominal state|, 1): give it where a unit is far from the size of a state.
+        mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
+        implicit: (x', v) -> E x' - f - g v and the derivatives of L_f^(r_i - 1) k_i along x', if
+            that takes fewer operations: for a robot it is inverse dynamics.
+        factorize: Rows of E -> its factors, or None: for a long robot articulated bodies.
+        sharing: The forces of redundant constraints, from `share_forces`.
+        control_metric, free_control: W, shape (p, p), and u_0: with more controls than outputs (28)
+            takes u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0), nearest to u_0. Make the
+            terms of u^T W u comparable, as by 1 / limit^2.
+        compiled: Machine code from the first call (True), never, or when it pays ("auto").
+        least_margin: A(x) or B(x) is singular where its smallest singular value, scaled, is below.
+        negligible: Entries below this, relative to their row or column, are zero in degrees.
+        contacts: Constraint inputs that only push, if one has friction: see `contacts`.
+        dry: The names of parameters that are coefficients of Coulomb friction in f.
+
+    Raises:
+        ModelError: A shape does not fit, a symbol is unknown, names are not unique, a number is not
+            finite, or a function is not smooth in the state, such as fabs.
+    """
+
+    state: ca.SX
+    f: ca.SX
+    g: ca.SX
+    h: ca.SX
+    k: ca.SX
+    l: ca.SX  # noqa: E741 - the paper's letter
+    m: ca.SX
+    parameters: tuple[Parameter, ...] = ()
+    state_signals: tuple[Signal, ...] = ()
+    constraint_input_signals: tuple[Signal, ...] = ()
+    constraint_output_signals: tuple[Signal, ...] = ()
+    control_signals: tuple[Signal, ...] = ()
+    output_signals: tuple[Signal, ...] = ()
+    nominal_state: FloatArray = field(default=None)  # type: ignore[arg-type]
+    state_scale: FloatArray | None = None
+    name: str = "system"
+    mass_matrix: ca.SX = None
+    implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
+    factorize: Callable[[Sequence[int]], Factors | None] | None = None
+    sharing: ForceSharing | None = None
+    control_metric: ca.SX = None
+    free_control: ca.SX = None
+    compiled: Compiled = "auto"
+    contacts: tuple[UnilateralInput, ...] = ()
+    least_margin: float = SINGULAR
+    negligible: float = NEGLIGIBLE
+    dry: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        arguments = {item.name: getattr(self, item.name) for item in fields(self)}
+        for key, value in checked_fields(arguments).items():
+            object.__setattr__(self, key, value)
+
+    def __repr__(self) -> str:
+        counts = (self.num_states, self.num_constraints, self.num_controls)
+        return f"DaeSystem('{self.name}', n={counts[0]}, m={counts[1]}, p={counts[2]})"
+
+    @classmethod
+    @checked(ModelError)
+    def from_functions(
+        cls,
+        state: Sequence[Signal | str] | int,
+        *,
+        f: Callable[..., Any],
+        h: Callable[..., Any] | None = None,
+        l: Callable[..., Any] | None = None,  # noqa: E741
+        g: Callable[..., Any] | None = None,
+        k: Callable[..., Any] | None = None,
+        m: Callable[..., Any] | None = None,
+        parameters: Mapping[str, ArrayLike] | None = None,
+        exogenous: Sequence[str] = (),
+        bounds: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+        **labels: Any,
+    ) -> "DaeSystem":
+        """Builds a system from Python functions of the state.
+
+        Each function is called once with a CasADi column x, and, if there are `parameters`, with a
+        namespace p of their symbols: `f=lambda x, p: [x[1], -p.stiffness * x[0]]`. It returns an
+        expression, or a list (of lists for a matrix, row by row). Use functions of CasADi, such as
+        casadi.sin. numpy.sin works but CasADi warns about it; math.sin does not work.
+
+        Args:
+            state: Names (or Signals) of the states, or their number n.
+            f, g, h, k, l, m: The functions of (1)-(3). Without constraints leave out g, k and m;
+                without controls h; without controlled outputs l and m.
+            parameters: Name -> default; a name must be a Python identifier.
+            exogenous: The names of the parameters that are exogenous signals w(t).
+            bounds: Name of a parameter -> its range (low, high); see `with_bounds`.
+            labels: The remaining fields of the class.
+
+        Raises:
+            ModelError: A function fails, or the functions do not form a system; see the class.
+        """
+        functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
+        names = [item.name for item in fields(cls)]
+        system = cls(**fields_of_functions(state, functions, parameters or {}, labels, names))
+        system = system.with_exogenous(exogenous) if exogenous else system
+        return system.with_bounds(bounds) if bounds else system
+
+    @cached_property
+    def explicit(self) -> "DaeSystem":
+        """The equivalent system with E = 1, whose f, g and h are those of the paper."""
+        if ca.is_equal(self.mass_matrix, ca.SX.eye(self.num_states)):
+            return self
+        fields = ca.horzcat(self.f, self.g, self.h)
+        solved = PositiveDefiniteFactorization(self.mass_matrix).solve(fields)
+        m = self.num_constraints
+        return replace(
+            self,
+            f=solved[:, 0],
+            g=solved[:, 1 : 1 + m],
+            h=solved[:, 1 + m :],
+            mass_matrix=None,
+            implicit=None,
+            factorize=None,
+            state_scale=self.scale,
+        )
+
+    @cached_property
+    def fields(self) -> TracedFunction:
+        """The function (state, parameters) -> f, g, h, l, m of the system with E = 1."""
+        e = self.explicit
+        outputs = {"f": e.f, "g": e.g, "h": e.h, "l": e.l, "m": e.m}
+        return self.trace("fields", outputs, often=False)
+
+    @cached_property
+    def num_states(self) -> int:
+        """n"""
+        return int(self.state.numel())
+
+    @cached_property
+    def num_constraints(self) -> int:
+        """m"""
+        return int(self.k.numel())
+
+    @cached_property
+    def num_controls(self) -> int:
+        """p"""
+        return int(self.h.shape[1])
+
+    @cached_property
+    def num_outputs(self) -> int:
+        """q; the law (28) needs as many outputs as controls."""
+        return int(self.l.numel())
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        """Names and units of all constraint inputs, including those of redundant constraints."""
+        return self.constraint_input_signals if self.sharing is None else self.sharing.signals
+
+    def forces(self, constraint_input: ca.SX) -> ca.SX:
+        """Returns all constraint inputs, named by `force_signals`, from v of shape (m, 1)."""
+        if self.sharing is None:
+            return constraint_input
+        return ca.mtimes(self.sharing.split, constraint_input)
+
+    def outputs(self, constraint_input: ca.SX) -> ca.SX:
+        """Returns the controlled outputs z = l(x) + m(x) v (3), shape (p, 1)."""
+        return self.l + ca.mtimes(self.m, constraint_input)  # (3)
+
+    @cached_property
+    def parameter_symbol(self) -> ca.SX:
+        """The symbols of all parameters in one column, then w', w'', ... of exogenous ones."""
+        return parameter_symbol(self.parameters)
+
+    @property
+    def parameter_values(self) -> FloatArray:
+        """The default parameter vector, as `parameter_symbol`; derivatives are zero."""
+        return self._defaults.copy()
+
+    @cached_property
+    def _defaults(self) -> FloatArray:
+        values = np.concatenate([np.zeros(0), *[p.value for p in self.parameters]])
+        return np.pad(values, (0, self.parameter_symbol.numel() - values.size))
+
+    @cached_property
+    def exogenous(self) -> Exogenous:
+        """The exogenous parameters w, and the terms that they add to time derivatives."""
+        return Exogenous(self.name, self.parameters)
+
+    @cached_property
+    def frictional_contacts(self) -> Contacts:
+        """The unilateral contacts; it is true if at least one of them has friction."""
+        return Contacts(self.name, self.constraint_input_signals, self.parameters, self.contacts)
+
+    @checked(ModelError)
+    def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
+        """Returns the same system with some parameters as exogenous signals."""
+        return self._with_parameters({name: {"exogenous": True} for name in names})
+
+    @checked(ModelError)
+    def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
+        """Returns the same system with bounds for some parameters.
+
+        Relative degrees must be the same for all values of the parameters: an input acts on a
+        derivative for all of them or for none. Bounds restrict the values to those for which this
+        holds.
+
+        Args:
+            bounds: Name -> (low, high), each a number or one for each entry; the default lies
+                between them. Equal bounds fix the parameter; as an exogenous signal it is constant.
+        """
+        return self._with_parameters({name: {"bounds": each} for name, each in bounds.items()})
+
+    @checked(ModelError)
+    def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
+        """Returns the same system with other defaults of some parameters."""
+        return self._with_parameters({name: {"value": value} for name, value in values.items()})
+
+    def _with_parameters(self, changes: Mapping[str, dict[str, Any]]) -> "DaeSystem":
+        for name in changes:
+            self.parameter_slice(name)
+        parameters = []
+        for p in self.parameters:
+            change = dict(changes.get(p.name, {}))
+            if "value" in change:
+                change["value"] = p.entries(change["value"])
+            parameters.append(replace(p, **change) if change else p)
+        return replace(self, parameters=tuple(parameters))
+
+    @property
+    def parameter_box(self) -> tuple[FloatArray, FloatArray]:
+        """The lowest and highest values of `parameter_symbol` for which degrees are checked.
+
+        Derivatives of signals are bounded by the size of the signal, or 1, per second.
+        """
+        low, high = (
+            [np.zeros(0), *[getattr(p, k) for p in self.parameters]] for k in ("low", "high")
+        )
+        for p in self.exogenous.moving:
+            size = np.where(p.low < p.high, np.where(p.value == 0.0, 1.0, np.abs(p.value)), 0.0)
+            low += [-size] * len(p.derivatives)
+            high += [size] * len(p.derivatives)
+        return np.concatenate(low), np.concatenate(high)
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """The typical size of each state: `state_scale`, or max(|nominal state|, 1)."""
+        if self.state_scale is not None:
+            return self.state_scale
+        return np.maximum(np.abs(self.nominal_state), 1.0)
+
+    def spread_around(self, state: ArrayLike) -> FloatArray:
+        """Returns the default standard deviation of random states around a state, shape (n,).
+
+        It is 0.1 of the scale, a hundredth of a value above 10 scales, and a tenth of one below
+        1e-3 scales that is not round-off.
+        """
+        size = np.abs(self.state_vector(state)) / self.scale
+        small = (size < 1e-3) & (size > 1e-12 * max(1.0, size.max()))
+        return self.scale * np.where(size > 10.0, 0.01 * size, np.where(small, 0.1 * size, 0.1))
+
+    def trace(
+        self,
+        name: str,
+        outputs: Mapping[str, ca.SX],
+        inputs: Mapping[str, ca.SX] | None = None,
+        pivot: ca.SX | None = None,
+        regular: str = "a matrix",
+        often: bool = True,
+        doubt: ca.SX | None = None,
+        lean: bool = False,
+    ) -> TracedFunction:
+        """Compiles expressions to a function of the state, of other inputs and of the parameters.
+
+        Further inputs stand between these; the other arguments are those of `TracedFunction`.
+        """
+        every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
+        return TracedFunction(
+            f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled, doubt, lean
+        )
+
+    def agree(self, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
+        """Returns whether two expressions agree at random states around the nominal state.
+
+        The parameters are varied as well.
+        """
+        symbols = [self.state, *unknowns, self.parameter_symbol]
+        function = ca.Function("both", symbols, [ca.densify(first), ca.densify(second)])
+        random, p = np.random.default_rng(0), self.parameter_values
+        deviation = self.spread_around(self.nominal_state)
+        finite = 0
+        for spread in (0.0, 0.1, 0.1):
+            x = self.nominal_state + deviation * random.standard_normal(self.num_states)
+            numbers = [random.standard_normal(u.numel()) for u in unknowns]
+            changed = p + spread * random.standard_normal(p.size) * np.where(p == 0.0, 1.0, p)
+            a, b = (v.full() for v in function(x, *numbers, changed))
+            if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+                continue  # Out of the domain of one of the functions.
+            finite += 1
+            # By columns: constraints may have very different units.
+            size = np.abs(a).max(axis=0, initial=0.0) + np.abs(b).max(axis=0, initial=0.0)
+            if not np.all(np.abs(a - b) <= 1e-9 * np.abs(b) + 1e-11 * size):
+                return False
+        return finite > 0
+
+    def parameter_vector(self, parameters: ArrayLike | None) -> FloatArray:
+        """Checks a parameter vector, the default if None; do not change the array."""
+        if parameters is None:
+            return self._defaults
+        if (  # Called in each step of a simulation, so without a copy.
+            type(parameters) is np.ndarray
+            and parameters.dtype == np.float64
+            and parameters.shape == self._defaults.shape
+            and isfinite(parameters.dot(parameters))
+        ):
+            return parameters
+        return vector(f"{self.name}: parameters", parameters, self._defaults.size)
+
+    @checked(ModelError)
+    def parameters_of(self, other: "DaeSystem", values: ArrayLike) -> FloatArray:
+        """Returns the parameter vector of this system with the values that another system has.
+
+        Those are taken that have the same name and size in both, with their derivatives if they are
+        exogenous. The values have shape (k,) or (samples, k).
+        """
+        values, size = numbers("values", values), other.parameter_symbol.numel()
+        if values.ndim not in (1, 2) or values.shape[-1] != size:
+            raise ModelError(
+                f"{self.name}: values must have shape ({size},) or (samples, {size}), got "
+                f"{values.shape}"
+            )
+        parameters = np.empty((*values.shape[:-1], self._defaults.size))
+        parameters[...] = self._defaults
+        sizes, rates = {p.name: p.value.size for p in other.parameters}, other.exogenous.rates()
+        for p in self.parameters:
+            if sizes.get(p.name) != p.value.size:
+                continue
+            place = self.parameter_slice(p.name)
+            parameters[..., place] = values[..., other.parameter_slice(p.name)]
+            if p.exogenous and p.name in rates:
+                to, source = self.exogenous.rates()[p.name], rates[p.name]
+                count = min(to.stop - to.start, source.stop - source.start)
+                moved = values[..., source.start : source.start + count]
+                parameters[..., to.start : to.start + count] = moved
+        return parameters
+
+    def state_vector(self, state: ArrayLike) -> FloatArray:
+        """Checks a state and returns it as a new array of shape (n,)."""
+        return vector(f"{self.name}: a state", state, self.num_states)
+
+    def parameter_slice(self, name: str) -> slice:
+        """Returns the place of a parameter in the parameter vector."""
+        return parameter_slice(self.name, self.parameters, name)

@@ -1,0 +1,327 @@
+"""The record of a run: every signal over time, with names and units."""
+
+import html
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, BinaryIO, Self, TypeVar
+
+import numpy as np
+from pydrake.systems.framework import Context
+from pydrake.systems.primitives import VectorLogSink
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, listed, numbers
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record_columns import Recorded as Recorded
+from drake_dae.diagrams.record_columns import label, read_csv, write_csv
+from drake_dae.diagrams.versions import versions
+from drake_dae.errors import ModelError
+from drake_dae.files import MOST_RECORDED, check_file, open_file
+
+
+def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:
+    """A signal that the library itself has recorded, made without checks of the arguments."""
+    recorded = object.__new__(Recorded)
+    vars(recorded).update(values=values, signals=signals)
+    return recorded
+
+
+def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Record":
+    """A record that the library itself has computed, made without checks of the arguments."""
+    record = object.__new__(Record)
+    vars(record).update(time=time, signals=signals, about={})
+    return record
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class Record:
+    """All signals of a run at the ends of the integrator's steps.
+
+    The file `record.npz` can be read with NumPy: `numpy.load("record.npz")` has "time" in s, and
+    for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units". "about"
+    is JSON with the versions of the software and, if the command made the run, the scenario with
+    all seeds.
+
+    Attributes:
+        time: The times in s, shape (k,), strictly increasing.
+        signals: Name of a signal -> its values.
+        about: The data to repeat the run: "versions" of the library, its dependencies and the
+            machine, which `save` adds; and "scenario", if it is known.
+    """
+
+    time: FloatArray
+    signals: Mapping[str, Recorded]
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        time = numbers("the times of a record", self.time)
+        object.__setattr__(self, "time", time)
+        lengths = {"time": time.shape[:1]} | {
+            name: np.shape(recorded.values)[:1] for name, recorded in self.signals.items()
+        }
+        if time.ndim != 1 or len(set(lengths.values())) != 1:
+            text = ", ".join(f"{name} {size}" for name, size in lengths.items())
+            raise ModelError(
+                f"all signals of a record must have as many samples as time, got the sizes {text}"
+            )
+        if np.any(np.diff(self.time) <= 0.0):
+            raise ModelError("the times of a record must be strictly increasing")
+        for name, recorded in self.signals.items():
+            shape, count = np.shape(recorded.values), len(recorded.signals)
+            if len(shape) != 2 or shape[1] != count:
+                raise ModelError(f"'{name}' of a record has shape {shape}, but {count} names")
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """The values of a signal, shape (k, size).
+
+        Raises:
+            ModelError: The record has no such signal.
+        """
+        if name not in self.signals:
+            raise ModelError(f"no signal '{name}' in the record; it has {', '.join(self.signals)}")
+        return self.signals[name].values
+
+    def __contains__(self, name: object) -> bool:
+        """Whether the record has a signal of this name."""
+        return name in self.signals
+
+    def __repr__(self) -> str:
+        text = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
+        return f"Record({self._extent()}, signals={text})"
+
+    def _repr_html_(self) -> str:
+        """A table of the signals, as a notebook shows it."""
+        rows = "".join(
+            f"<tr><td>{html.escape(name)}</td><td>{len(recorded.signals)}</td>"
+            f"<td>{html.escape(listed(map(label, recorded.signals))[1:-1])}</td></tr>"
+            for name, recorded in self.signals.items()
+        )
+        return (
+            f"<p>Record: {self._extent()}</p><table><thead><tr><th>signal</th><th>size</th>"
+            f"<th>names and units</th></tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+    def _extent(self) -> str:
+        if not self.time.size:
+            return "empty"
+        return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s"
+
+    @checked(ModelError)
+    def after(self, time: float | None) -> Self:
+        """The part of the record later than a time in s; the whole record for None."""
+        if time is None:
+            return self
+        first = int(np.searchsorted(self.time, time, side="right"))
+        return self._rows(slice(first, None))
+
+    def while_finite(self) -> Self:
+        """The record up to the first time at which some signal is not finite."""
+        count = _finite_rows(self.time.size, [r.values for r in self.signals.values()])
+        if count == self.time.size:
+            return self
+        return self._rows(slice(count))
+
+    def _rows(self, rows: slice) -> Self:
+        signals = {
+            name: recorded_values(recorded.values[rows], recorded.signals)
+            for name, recorded in self.signals.items()
+        }
+        return type(self)(self.time[rows], signals, self.about)
+
+    @classmethod
+    def from_log(
+        cls,
+        log: VectorLogSink,
+        signals: Mapping[str, Sequence[Signal]],
+        context: Context,
+        after: float | None = None,
+    ) -> Self:
+        """Collects what a log has up to now.
+
+        Args:
+            log: The log of the signals, stacked.
+            signals: Name -> names and units of a signal, in the order of the log.
+            context: The context of the diagram.
+            after: Only later samples than this time are collected, in s; None for all.
+
+        Raises:
+            ModelError: The log has another number of entries than the signals.
+        """
+        samples, stops = log.FindLog(context), np.cumsum([len(each) for each in signals.values()])
+        size = int(stops[-1]) if stops.size else 0
+        if size != samples.get_input_size():
+            raise ModelError(
+                f"the signals of a log have {size} names together, but the log has "
+                f"{samples.get_input_size()} entries"
+            )
+        time = samples.sample_times()
+        first = 0 if after is None else int(np.searchsorted(time, after, side="right"))
+        rows = samples.data()[:, first:].T
+        # The last step of a failed run may have values that are not numbers.
+        finite = _finite_rows(len(rows), [rows])
+        time = time[first : first + finite]
+        # The last sample of a time is the one after the projection.
+        last = np.append(np.diff(time) > 0.0, True)[: time.size]
+        columns = np.split(rows[:finite][last], stops[:-1], axis=1)
+        return cls(
+            time[last],
+            {
+                name: recorded_values(np.ascontiguousarray(values), tuple(each))
+                for (name, each), values in zip(signals.items(), columns, strict=True)
+            },
+        )
+
+    @checked(ModelError)
+    def save(self, path: str | Path) -> None:
+        """Writes the record as one `.npz` file."""
+        arrays: dict[str, np.ndarray] = {"time": self.time}
+        for name, recorded in self.signals.items():
+            arrays[name] = recorded.values
+            arrays[f"{name}.names"] = np.array([s.name for s in recorded.signals], dtype=str)
+            arrays[f"{name}.units"] = np.array([s.unit for s in recorded.signals], dtype=str)
+        arrays["about"] = np.array(json.dumps({"versions": versions(), **self.about}))
+        np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+
+    @checked(ModelError)
+    def to_csv(self, path: str | Path) -> None:
+        """Writes the record as text: a line of names with units, then one line for each time.
+
+        The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
+        """
+        write_csv(path, self.time, self.signals)
+
+    @classmethod
+    def from_csv(cls, path: str | Path, columns: Mapping[str, str] | None = None) -> Self:
+        """Reads a file of `to_csv`, or the log of a robot.
+
+        A row has the values just before its time: a control with a zero-order hold is the one that
+        acted up to this row.
+
+        Args:
+            path: The file, with a line of names and then a line for each time.
+            columns: A column of the file -> its name in the record, "time" or "<signal>.<name>" as
+                in `to_csv`, with or without a unit in brackets; other columns are left out. None if
+                the file has these names itself.
+
+        Raises:
+            ModelError: The file cannot be read, it lacks a column, some entry is not a number, or
+                times do not increase.
+        """
+        return cls(*read_csv(path, columns))
+
+    def to_dataframe(self) -> Any:
+        """The record as a pandas DataFrame, one row for each time, "time [s]".
+
+        Its columns have two levels, the signal and the name with its unit:
+        `frame["control"]` are all controls, and `frame["control"].plot()` draws them.
+
+        Raises:
+            ModelError: pandas is not installed.
+        """
+        pandas = _optional_module("pandas", "to_dataframe")
+        pairs = [
+            (name, label(signal))
+            for name, recorded in self.signals.items()
+            for signal in recorded.signals
+        ]
+        return pandas.DataFrame(
+            np.hstack([np.zeros((self.time.size, 0)), *(r.values for r in self.signals.values())]),
+            index=pandas.Index(self.time, name="time [s]"),
+            columns=pandas.MultiIndex.from_tuples(pairs, names=["signal", "name"]),
+        )
+
+    def to_xarray(self) -> Any:
+        """The record as an xarray Dataset, one variable for each signal.
+
+        Its dimensions are "time" in s and "<signal>.name"; the units stand beside the names, as the
+        coordinate "<signal>.unit": `data["control"].sel({"control.name": "joint1_motor"})`.
+
+        Raises:
+            ModelError: xarray is not installed.
+        """
+        xarray = _optional_module("xarray", "to_xarray")
+        variables: dict[str, Any] = {}
+        coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"})}
+        for name, recorded in self.signals.items():
+            along = f"{name}.name"
+            variables[name] = (("time", along), recorded.values)
+            coordinates[along] = [signal.name for signal in recorded.signals]
+            coordinates[f"{name}.unit"] = (along, [signal.unit for signal in recorded.signals])
+        return xarray.Dataset(variables, coordinates)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads a file of `save` or of a `RecordWriter`, which may be incomplete.
+
+        Raises:
+            ModelError: The file holds something else.
+        """
+        check_file(path, ModelError, MOST_RECORDED)
+        try:
+            with open_file(path) as rows:
+                is_part = rows.read(1) == b"{"
+                rows.seek(0)
+                if is_part:
+                    return _read_rows(rows, cls)
+                file = np.load(rows, allow_pickle=False)
+                names = [key for key in file.files if f"{key}.names" in file.files]
+                signals = {name: _read(file, name) for name in names}
+                about = json.loads(str(file["about"])) if "about" in file.files else {}
+                return cls(file["time"], signals, about)
+        except Exception as error:  # zip files, NumPy's headers and JSON raise many kinds.
+            text = getattr(error, "strerror", None) or f"{error}; it may be cut off or damaged"
+            raise ModelError(f"{path} is not a record of a run: {text}") from None
+
+
+RecordAfter = Callable[[float | None], Record]
+"""From a time in s, or None, to what a run has recorded later."""
+
+
+R = TypeVar("R", bound=Record)
+
+
+def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
+    """The number of rows before the first one in which some value is not finite."""
+    finite = np.ones(count, bool)
+    for values in columns:
+        finite &= np.isfinite(values).all(axis=1)
+    return count if finite.all() else int(np.argmin(finite))
+
+
+def _optional_module(module: str, user: str) -> Any:
+    """Imports a package of the extra `data`.
+
+    Raises:
+        ModelError: It is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise ModelError(f"{user} needs {module}: pip install 'drake_dae[data]'") from None
+
+
+def _read_rows(file: BinaryIO, kind: type[R]) -> R:
+    """The rows of a `RecordWriter`; bytes after the last whole row are ignored."""
+    head = json.loads(file.readline())
+    labels = head["signals"]
+    named = {name: tuple(Signal(*label) for label in pairs) for name, pairs in labels.items()}
+    stops = np.cumsum([1, *map(len, named.values())])
+    data, width = file.read(), int(stops[-1])
+    count = len(data) // (8 * width)
+    rows = np.frombuffer(data, "<f8", count * width).reshape(count, width).astype(float)
+    # After a power failure, unsynced bytes may be zeros.
+    whole = int(np.argmin(np.append(np.diff(rows[:, 0]) > 0.0, False))) + 1
+    time, *columns = np.split(rows[:whole], stops, axis=1)[:-1]
+    pairs = zip(named.items(), columns, strict=True)
+    recorded = {name: Recorded(values, signals) for (name, signals), values in pairs}
+    return kind(time[:, 0], recorded, head.get("about", {}))
+
+
+def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:
+    labels = zip(file[f"{name}.names"], file[f"{name}.units"], strict=True)
+    signals = tuple(Signal(str(label), str(unit)) for label, unit in labels)
+    return Recorded(file[name], signals)

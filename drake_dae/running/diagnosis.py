@@ -1,0 +1,385 @@
+"""Why a run ended: one diagnosis for all ends, and stiffness while it runs."""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context, Diagram, System
+
+from drake_dae.arrays import FloatArray, show_state
+from drake_dae.blocks.failures import cannot_go_on, singular_configuration
+from drake_dae.dae import ConstraintStructure, EndCause, MotionEnd, Signal, Structure, ZeroDynamics
+from drake_dae.errors import (
+    DrakeDaeError,
+    PainleveError,
+    SimulationError,
+    SingularityError,
+    WiringError,
+)
+from drake_dae.systems.control.contract import Controller
+from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.plants.contract import Plant
+from drake_dae.trace.round_off import equilibration, smallest_singular_value
+
+SINGULAR = 1e-3
+"""The smallest singular value of A(x) or B(x), rows and columns scaled by their usual sizes, below
+which it is why a run ends. Steps become too short long before it is zero."""
+
+NEARLY = 0.05
+"""The same, at the last state that is found along a path that ends."""
+
+OFF = 0.1
+"""The distance from N*, in units of the states, up to which A(x) is judged."""
+
+PART = 0.3
+"""An output takes part in a singular direction from this share of the largest part on."""
+
+PLACES, BEYOND = 60, 0.02
+"""The times at which a reference is followed up to the end of a run, and beyond it as a share."""
+
+IMPLICIT = ("implicit", "velocity_implicit", "radau")
+"""How the names of schemes begin whose steps stiffness does not limit."""
+
+LONGEST = 1.7
+"""The product of step and rate from which explicit steps may grow: of the third order on the
+imaginary axis, where elastic joints are."""
+
+EVERY, COLLAPSED = 32, 1e-5
+"""Each so many steps their mean is compared with the longest one; below this share it collapsed."""
+
+PACE, MANY = 2000, 100_000
+"""The steps after which the pace of a run is looked at; as many as this in all are told of."""
+
+
+def blocks_of(system: System) -> Iterator[System]:
+    """The blocks of a diagram; a plant or a controller that is a diagram is one block."""
+    if isinstance(system, Diagram) and not isinstance(system, Plant | Controller):
+        for block in system.GetSystems():
+            yield from blocks_of(block)
+    else:
+        yield system
+
+
+def explained(
+    error: SimulationError,
+    plant: Plant,
+    structure: Structure | None = None,
+    reference: Callable[[float], FloatArray] | None = None,
+    start: tuple[float, FloatArray] | None = None,
+    parameters: FloatArray | None = None,
+) -> SimulationError:
+    """The error of a run with its cause, if A(x) or B(x) is singular, or a path leaves its reach.
+
+    Args:
+        error: The error, with time and state.
+        plant: The plant.
+        structure: The structure of the law's system; None without a law.
+        reference: The function t -> R(t) that the law follows; None without one.
+        start: The time in s and the state of the plant at which the run began.
+        parameters: The parameters of the plant; the defaults if None.
+    """
+    name, state = plant.dae.name, error.state
+    if isinstance(error, PainleveError) or (
+        isinstance(error, SingularityError) and error.constraints
+    ):
+        return error
+    if state.size != plant.dae.num_states or not np.isfinite(state).all():
+        state = np.zeros(0)
+    own = getattr(plant, "structure", None)
+    if state.size and plant.is_ideal and isinstance(own, ConstraintStructure):
+        values = plant.dae.parameter_values if parameters is None else parameters
+        margin, _ = _margin(own, own.elimination.constraint_matrix, state, values)
+        if margin < SINGULAR and _is_near_manifold(own, state, values):
+            names = own.dependent_constraints(state, values)
+            return singular_configuration(name, error.time, state, names)
+    if structure is None:
+        return error
+    system, ending = structure.system, None
+    if reference is not None and start is not None and not system.exogenous.moving:
+        ending = _end_of_path(structure, reference, start, error.time)
+    outputs: tuple[str, ...] = ()
+    constraints: tuple[str, ...] = ()
+    limit = SINGULAR
+    if ending is not None and ending.state is not None and ending.matrix:
+        # Singular where the path ends, and nearly so where the run did.
+        state, limit = ending.state, NEARLY
+    if state.size == system.num_states:
+        signals = system.output_signals
+        outputs = _dependent(structure, structure.control_matrix, signals, state, limit)
+        signals = (*system.constraint_output_signals, *signals)
+        gradients = ca.jacobian(ca.vertcat(system.k, system.l), system.state)
+        names = _dependent(structure, gradients, signals, state, limit) if outputs else ()
+        constraints = tuple(s.name for s in system.constraint_output_signals if s.name in names)
+    if not outputs and ending is None:
+        return error
+    told = (
+        f"{name}: B(x) of Assumption (5) is singular at t = {error.time:.6g} s, state "
+        f"{show_state(state)}"
+    )
+    told = told if ending is None else str(ending)
+    if outputs:
+        held = f" beside {', '.join(constraints)}" if constraints else ""
+        told = f"{told}. There the drives cannot steer {', '.join(outputs)}{held}"
+    told = (
+        f"{told}. Keep the reference away from there, or choose another posture or other outputs. "
+        f"The run ended at t = {error.time:.6g} s, state {show_state(error.state)}"
+    )
+    if not outputs and not (ending is not None and ending.matrix):
+        return SimulationError(told, error.time, error.state)
+    singular = SingularityError(told, error.time, error.state)
+    singular.constraints = constraints
+    return singular
+
+
+def _dependent(
+    structure: Structure,
+    matrix: ca.SX,
+    signals: Sequence[Signal],
+    state: FloatArray,
+    limit: float,
+) -> tuple[str, ...]:
+    """The signals whose rows in a matrix depend on each other at a state, but for rows of 0."""
+    rows = [i for i in range(matrix.rows()) if matrix[i, :].nnz()]
+    values = structure.system.parameter_values
+    margin, part = _margin(structure, matrix[rows, :], state, values)
+    if not margin < limit:
+        return ()
+    return tuple(signals[rows[i]].name for i in np.flatnonzero(part > PART * part.max()))
+
+
+def _is_near_manifold(
+    structure: ConstraintStructure, state: FloatArray, parameters: FloatArray
+) -> bool:
+    """Whether a state is no farther off N* than a few steps lead; elsewhere A(x) says nothing."""
+    manifold, scale = structure.manifold, structure.scale
+    usual = np.linalg.norm(manifold.gradients(structure.states[0]) * scale, axis=1)
+    return bool(np.all(np.abs(manifold.residual(state, parameters)) <= OFF * usual))
+
+
+def _margin(
+    structure: ConstraintStructure, matrix: ca.SX, state: FloatArray, parameters: FloatArray
+) -> tuple[float, FloatArray]:
+    """The smallest singular value of a scaled matrix, and the parts of its rows in it."""
+    if not matrix.numel():
+        return np.inf, np.zeros(0)
+    function = structure.system.trace("margin", {"matrix": matrix}, often=False)
+
+    def at(x: FloatArray) -> FloatArray:
+        return function(x, parameters)[0].reshape(matrix.shape).copy()
+
+    sizes = np.mean([np.abs(at(x)) for x in structure.states], axis=0)
+    rows, columns = equilibration(sizes)
+    value = at(state) / rows[:, None] / columns
+    if not np.isfinite(value).all():
+        return 0.0, np.ones(len(rows))
+    return smallest_singular_value(value), np.abs(np.linalg.svd(value)[0][:, -1])
+
+
+def _end_of_path(
+    structure: Structure,
+    reference: Callable[[float], FloatArray],
+    start: tuple[float, FloatArray],
+    time: float,
+) -> MotionEnd | None:
+    """Where the reference leaves what the system can reach, or a singular state, up to a time."""
+    begin, guess = start
+    if not time > begin:
+        return None
+    times = np.linspace(begin, time + BEYOND * (time - begin), PLACES)
+    try:
+        ending = (
+            ZeroDynamics(structure.system, structure=structure)
+            .motion(reference, times, guess)
+            .ending
+        )
+    except DrakeDaeError:
+        return None
+    told = (EndCause.OUT_OF_REACH, EndCause.SINGULAR, EndCause.NO_WAY_ON)
+    return ending if ending is not None and ending.cause in told else None
+
+
+class RunDiagnosis:
+    """What is needed to say why a simulation of a diagram ends.
+
+    Args:
+        diagram: The diagram.
+        context: Its context at the start; it is not kept.
+        config: The integrator settings.
+        duration: The duration of the run, in s.
+    """
+
+    def __init__(
+        self, diagram: System, context: Context, config: SimulatorConfig, duration: float
+    ) -> None:
+        self._diagram, self._config, self._time = diagram, config, context.get_time()
+        self._end = self._time + duration
+        blocks = list(blocks_of(diagram))
+        plants = [block for block in blocks if isinstance(block, Plant)]
+        self._plant = plants[0] if len(plants) == 1 else None
+        self._law = next((b.law for b in blocks if isinstance(b, Controller)), None)
+        self._generator = next((b for b in blocks if isinstance(b, ReferenceGenerator)), None)
+        self._limits = next((b for b in blocks if isinstance(b, ControlLimits)), None)
+        self._start = context.get_continuous_state_vector().CopyToVector()
+        self._steps, self._mark, self._is_watched = 0, self._time, config.use_error_control
+        self._seen, self._longest, self._collapsed = (self._time, 0), 0.0, np.inf
+        self._is_watched &= not config.integration_scheme.startswith(IMPLICIT)
+        self._state = np.zeros(0)
+        if self._plant is not None:
+            self._state = self._plant.state(self._plant.GetMyContextFromRoot(context))
+
+    def explain(self, error: DrakeDaeError | RuntimeError, context: Context) -> DrakeDaeError:
+        """The error with its cause.
+
+        Looked for in this order: ports without wires, a singular A(x) or B(x) and the reach of the
+        path, drives at their limits, and steps that are too long for a stiff loop.
+        """
+        if not isinstance(error, DrakeDaeError) and (ports := self._without_wires(context, error)):
+            return WiringError(f"no wire to {', '.join(ports)}: connect or fix each input port")
+        if isinstance(error, WiringError):
+            return error  # It names its cause.
+        state = context.get_continuous_state_vector().CopyToVector()
+        if self._plant is not None:
+            state = self._plant.state(self._plant.GetMyContextFromRoot(context))
+        told = error
+        if not isinstance(told, SimulationError):
+            told = cannot_go_on(context.get_time(), state, str(error))
+        elif not told.state.size:
+            told = told.retold(str(told), told.time, state)
+        if self._plant is not None:
+            found = self._explained(told)
+            if found is not told:
+                return found
+        if names := self._cut_off(context):
+            text = f"{', '.join(names)} cut off at their limits: slower references need less"
+            return told.retold(f"{text}. {told}", told.time, told.state)
+        return too_long(told, self._diagram, context, self._config, (self._time, self._start))
+
+    def _explained(self, error: SimulationError) -> SimulationError:
+        assert self._plant is not None
+        structure = None if self._law is None else self._law.structure
+        reference = None if self._generator is None else self._generator.reference
+        return explained(error, self._plant, structure, reference, (self._time, self._state))
+
+    def _without_wires(self, context: Context, error: RuntimeError) -> list[str]:
+        """The input ports without a value that Drake misses."""
+        return [
+            f"'{port.get_name()}' of '{block.get_name()}'"
+            for block in blocks_of(self._diagram)
+            for port in map(block.get_input_port, range(block.num_input_ports()))
+            if f"({port.get_name()})" in str(error)
+            and not port.HasValue(block.GetMyContextFromRoot(context))
+        ]
+
+    def _cut_off(self, context: Context) -> Sequence[str]:
+        """The controls beyond the limits of the drives."""
+        if self._limits is None or self._plant is None:
+            return []
+        try:
+            excess = self._limits.GetOutputPort("excess").Eval(
+                self._limits.GetMyContextFromRoot(context)
+            )
+        except (DrakeDaeError, RuntimeError):
+            return []
+        signals = self._plant.dae.control_signals
+        return [signals[i].name for i in np.flatnonzero(excess)]
+
+    def look(self, context: Context, steps: int) -> None:
+        """Looks at the pace of a run under error control, from time to time.
+
+        Warns:
+            UserWarning: The loop is stiff: stability, not accuracy, makes the steps so short that
+                they are very many.
+
+        Raises:
+            SimulationError: Steps have collapsed, and the cause is known. Thousands of ever shorter
+                ones would lead to the same.
+        """
+        before, self._steps = self._steps, self._steps + steps
+        if self._steps // EVERY > before // EVERY:
+            self._check_collapse(context)
+        if not self._is_watched or before // PACE == self._steps // PACE:
+            return
+        time = context.get_time()
+        pace, self._mark = (time - self._mark) / PACE, time
+        if not pace > 0.0 or self._steps + (self._end - time) / pace < MANY:
+            return
+        state = context.get_continuous_state_vector().CopyToVector()
+        rate = fastest_rate(self._diagram, context, time, state)
+        if rate * pace > 1.0:
+            self._is_watched = False
+            warnings.warn(
+                f"the loop is stiff: its fastest rate of {rate:.3g} 1/s, not the accuracy, makes "
+                f"explicit steps of {pace:.2g} s, of which this run needs about "
+                f"{self._steps + (self._end - time) / pace:.2g}. Choose integration_scheme "
+                "'radau3' or 'implicit_euler', or a slower model",
+                stacklevel=2,
+            )
+
+    def _check_collapse(self, context: Context) -> None:
+        time, pace = context.get_time(), self._steps - self._seen[1]
+        step = (time - self._seen[0]) / pace
+        self._seen, self._longest = (time, self._steps), max(self._longest, step)
+        if self._plant is None or step > min(COLLAPSED * self._longest, 0.01 * self._collapsed):
+            return
+        self._collapsed = step
+        state = self._plant.state(self._plant.GetMyContextFromRoot(context))
+        short = SimulationError("steps have become too short", time, state)
+        if (found := self._explained(short)) is not short:
+            raise found
+
+
+def too_long(
+    error: SimulationError,
+    diagram: System,
+    context: Context,
+    config: SimulatorConfig,
+    start: tuple[float, FloatArray],
+) -> SimulationError:
+    """The error of a run, with fixed steps that are too long for the fastest rate at its start."""
+    step, scheme = config.max_step_size, config.integration_scheme
+    if config.use_error_control or scheme.startswith(IMPLICIT) or not start[1].size:
+        return error
+    begun, rates = context.Clone(), [fastest_rate(diagram, context, *start)]
+    begun.SetTimeAndContinuousState(*start)
+    # A law that cancels springs takes their rates out of the loop, and not out of its steps.
+    for plant in (block for block in blocks_of(diagram) if isinstance(block, Plant)):
+        alone = plant.CreateDefaultContext()
+        for i in range(plant.num_input_ports()):
+            if size := plant.get_input_port(i).size():
+                plant.get_input_port(i).FixValue(alone, np.zeros(size))
+        state = plant.state(plant.GetMyContextFromRoot(begun))
+        if alone.num_continuous_states() == state.size:
+            rates.append(fastest_rate(plant, alone, start[0], state))
+    rate = float(np.max(np.nan_to_num(rates)))
+    if not rate * step > LONGEST:
+        return error
+    text = (
+        f"the fixed steps of {step:.3g} s are too long for the fastest rate of the loop, "
+        f"{rate:.3g} 1/s, such as that of elastic joints: take steps of at most "
+        f"{LONGEST / rate:.2g} s, or error control"
+    )
+    return error.retold(f"{text}. {error}", error.time, error.state)
+
+
+def fastest_rate(diagram: System, context: Context, time: float, state: FloatArray) -> float:
+    """The largest |eigenvalue| of the derivative of a diagram's continuous state, in 1/s.
+
+    By central differences, in a copy of the context; nan where the derivative has no value.
+    """
+    copy = context.Clone()
+    columns = []
+    try:
+        for i, step in enumerate(1e-6 * np.maximum(1.0, np.abs(state))):
+            slopes = []
+            for sign in (1.0, -1.0):
+                moved = state.copy()
+                moved[i] += sign * step
+                copy.SetTimeAndContinuousState(time, moved)
+                slopes.append(diagram.EvalTimeDerivatives(copy).CopyToVector())
+            columns.append((slopes[0] - slopes[1]) / (2.0 * step))
+        return float(np.max(np.abs(np.linalg.eigvals(np.array(columns).T)), initial=0.0))
+    except (DrakeDaeError, RuntimeError, np.linalg.LinAlgError):
+        return np.nan

@@ -1,0 +1,399 @@
+"""Judges a run: do outputs reach their references, are all limits kept, is it as predicted?"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from drake_dae.analysis.limits import LimitKind, SignalRange
+from drake_dae.arrays import FloatArray, by_columns
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record
+from drake_dae.systems.control.contract import PhaseChange
+
+SHARE = 0.01
+"""The default tolerance of an output, as a fraction of the range of references in its unit."""
+
+GRACE = 0.1
+"""The permitted delay relative to the prediction, as a fraction of the run."""
+
+NEAR, STEPS = 1e-2, 10.0
+"""The deviation from the prediction, as a fraction of an output's size, from which it needs a
+reason; or so many times the accuracy of the integrator, if that is more."""
+
+ROUND_OFF = 1e-13
+"""A number below this, relative to the largest one in its unit, is round-off."""
+
+
+PURE = {"": 1.0, "rad": 1.0}
+"""The least size of numbers without a unit, and of angles."""
+
+
+class Outcome(StrEnum):
+    """Whether a run succeeded."""
+
+    GOOD = "good"
+    BAD = "bad"
+    UNDECIDED = "undecided"
+
+
+class FindingKind(StrEnum):
+    """What a finding on a run is about."""
+
+    ENDED = "ended early"
+    TASK = "task"
+    REFERENCE = "reference"
+    LIMIT = "limit"
+    CONTACT = "contact"
+    BEHIND = "link behind a surface"
+    PREDICTION = "prediction"
+
+
+@dataclass(frozen=True)
+class RunFinding:
+    """What a run shows, as data.
+
+    Attributes:
+        kind: What it is about.
+        text: It in words.
+        decides: The outcome that it leads to; None for a remark.
+        signal: The output, control, force, joint or link, with the unit of the numbers.
+        value, limit: The number found, and the one allowed.
+        time: When, in s.
+        cause: The likely cause, or what to change.
+    """
+
+    kind: FindingKind
+    text: str
+    decides: Outcome | None = None
+    signal: Signal | None = None
+    value: float | None = None
+    limit: float | None = None
+    time: float | None = None
+    cause: str = ""
+
+
+@dataclass(frozen=True)
+class OutputQuality:
+    """How well an output followed its reference, in its unit.
+
+    Attributes:
+        signal: The output.
+        start, largest, final: z - r at the start, the largest |z - r|, and z - r at the end.
+        late_rms: The root mean square of z - r in the second half of the run.
+        off_prediction: The largest deviation of z - r from the predicted error (30).
+        tolerance: The tolerated |z - r|.
+        within_since: The time from which |z - r| stayed within the tolerance, in s; None if it was
+            outside at the end.
+    """
+
+    signal: Signal
+    start: float
+    largest: float
+    final: float
+    late_rms: float
+    off_prediction: float
+    tolerance: float
+    within_since: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Whether a run succeeded, and why.
+
+    Attributes:
+        outcome: Good, bad, or undecided if the run is too short to tell, or is off the prediction
+            for no known reason.
+        findings: What decided first, then what else was found.
+        outputs: The quality of each output.
+        ranges: The forces, controls and joints of the robot beside their limits.
+    """
+
+    outcome: Outcome
+    findings: tuple[RunFinding, ...]
+    outputs: tuple[OutputQuality, ...] = ()
+    ranges: tuple[SignalRange, ...] = ()
+
+    def __str__(self) -> str:
+        reason = "there is no output, and nothing is violated"
+        if self.findings:
+            reason = self.findings[0].text
+        return f"{self.outcome.name}: {reason}"
+
+
+def judge(
+    record: Record,
+    predicted: FloatArray,
+    ranges: Sequence[SignalRange] = (),
+    *,
+    tolerances: Mapping[str, float] | None = None,
+    changes: Sequence[PhaseChange] = (),
+    ended: str = "",
+    accuracy: float | None = None,
+    reasons: Sequence[str] = (),
+    more: Iterable[RunFinding] = (),
+) -> Judgement:
+    """Judges whether a run succeeded.
+
+    Without phases, each output must be within its tolerance from the first half of the run on, or
+    from the time at which the predicted error is. If the predicted error exceeds the tolerance even
+    at the end, and the run follows it, the run is undecided. With phases, the last one must end.
+
+    Args:
+        record: A record with state, desired_output, tracking_error, constraint_force and control.
+        predicted: The tracking error by theory, shape (k, p).
+        ranges: The signals with limits, along the record.
+        tolerances: Output name -> tolerated |z - r|. For the others it is 1 % of the range of the
+            references in their unit, or of their largest value where they do not move.
+        changes: The starts of phases of a task.
+        ended: Why the run ended early; empty if it is complete.
+        accuracy: The accuracy of error control; None with fixed steps.
+        reasons: Why errors may be off the prediction, such as "the law is sampled".
+        more: Further findings.
+    """
+    outputs, found = qualities(record, predicted, tolerances or {}), list[RunFinding]()
+    if ended:
+        end = float(record.time[-1])
+        text = f"the run broke off at {end:.4g} s: {ended}"
+        found.append(RunFinding(FindingKind.ENDED, text, Outcome.BAD, time=end))
+    # Of a compliant contact the whole force is recorded, which cannot pull.
+    kinds = {*LimitKind} - ({LimitKind.FORCE} if "contact_force" in record else set())
+    beyond = [r.excess for r in ranges if r.kind in kinds and r.excess is not None]
+    for excess in sorted(beyond, key=lambda e: -abs(e.value / e.limit) if e.limit else -np.inf):
+        numbers = excess.signal, excess.value, excess.limit, excess.time
+        found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *numbers))
+    found += more
+    if changes:
+        found += _of_task(changes)
+    elif not ended:  # Else it has not had the time.
+        pushing = {r.signal.name for r in ranges if r.kind is LimitKind.FORCE and r.low == 0.0}
+        found += _of_contacts(record, pushing)
+        found += _of_outputs(record, predicted, outputs, reasons)
+        if outputs:
+            found += _of_prediction(record, predicted, accuracy, reasons)
+    order = (Outcome.BAD, Outcome.UNDECIDED, None)
+    first = (FindingKind.TASK, FindingKind.REFERENCE)  # Of the remarks.
+    found.sort(key=lambda f: (order.index(f.decides), not f.decides and f.kind not in first))
+    outcome = (found[0].decides if found else None) or Outcome.GOOD
+    return Judgement(outcome, tuple(found), tuple(outputs), tuple(ranges))
+
+
+def _of_task(changes: Sequence[PhaseChange]) -> Iterator[RunFinding]:
+    """Whether a task was done, given up, or had not ended yet; and which failures it got over."""
+    last, decides = changes[-1], None
+    # After "leave" the change that led there has the reason.
+    failures = [change for change in changes if change.failed and change.phase != "held"]
+    if last.failed and last.phase in ("held", "leave"):
+        left = ""
+        if last.phase == "held" and failures and changes[-2].phase == "leave":
+            last, left = failures[-1], ", and has left the contact"
+        text, decides = (
+            f"the task was given up at {last.time:.4g} s{left}: {last.reason}",
+            Outcome.BAD,
+        )
+        failures = []
+    elif last.phase == "held":
+        text, failures = f"the task ended as chosen at {last.time:.4g} s: {last.reason}", []
+    elif last.phase == "done":
+        again = len(changes) - len({change.place for change in changes})
+        phases = f"{len(changes) - 1} phases" if len(changes) > 2 else "1 phase"
+        repeated = f", {again} of them again" if again else ""
+        text = f"the task was done at {last.time:.4g} s, in {phases}{repeated}"
+    else:
+        where = f"phase {last.place + 1}, {last.phase}, which began at {last.time:.4g} s"
+        text, decides = f"the run ended during {where}", Outcome.UNDECIDED
+    yield RunFinding(FindingKind.TASK, text, decides, time=last.time)
+    for change in failures:
+        text = f"at {change.time:.4g} s {change.reason}, and {change.phase} followed, as chosen"
+        yield RunFinding(FindingKind.TASK, text, time=change.time)
+
+
+def _of_contacts(record: Record, pushing: set[str]) -> Iterator[RunFinding]:
+    """Lost contacts, which are problems in the second half of the run."""
+    times, forces = record.time, record.signals["constraint_force"]
+    for signal, values in zip(forces.signals, forces.values.T, strict=True):
+        if signal.name not in pushing:
+            continue
+        touches, first = np.flatnonzero(values > 0.0), float(times[0])
+        decides: Outcome | None = Outcome.BAD
+        text = f"{signal.name} is 0 all the time"
+        if touches.size:
+            lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
+            if not lost.size:
+                continue
+            first, lasted = float(times[lost[0]]), np.diff(times)[lost].sum()
+            text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
+            is_late = times[lost[-1]] >= 0.5 * (times[0] + times[-1])
+            decides = Outcome.BAD if is_late else None
+        elif values.size < 2 or values.any():
+            continue
+        yield RunFinding(FindingKind.CONTACT, text, decides, signal, 0.0, time=first)
+
+
+def _of_outputs(
+    record: Record,
+    predicted: FloatArray,
+    outputs: Sequence[OutputQuality],
+    reasons: Sequence[str],
+) -> Iterator[RunFinding]:
+    """Which outputs are off their references, or cannot be there yet."""
+    times, error = record.time, record["tracking_error"]
+    middle, grace = 0.5 * (times[0] + times[-1]), GRACE * (times[-1] - times[0])
+    late, settled, are_bad = times >= middle, [], False
+    for i, output in enumerate(outputs):
+        signal, since, tolerance = output.signal, output.within_since, output.tolerance
+        name, unit = signal.name, f" {signal.unit}".rstrip()
+        wanted = within_since(times, predicted[:, i], tolerance)
+        due = None if wanted is None else max(middle, wanted + grace)
+        if since is not None:
+            rest = late & (times >= since)
+            most = float(np.max(np.abs(error[rest, i]), initial=0.0))
+            settled.append((most / tolerance, most, output))
+            if due is None or since <= due:
+                continue
+        numbers = signal, float(np.max(np.abs(error[late, i]))), tolerance, since
+        if due is None and np.all(np.abs(error - predicted)[late, i] <= tolerance):
+            text = f"the run is too short: {name} cannot yet be at its reference, by the gains"
+            cause = "a longer duration"
+            yield RunFinding(FindingKind.REFERENCE, text, Outcome.UNDECIDED, *numbers, cause)
+            continue
+        are_bad, until = True, "ends off" if since is None else f"until {since:.3g} s is off"
+        text = (
+            f"{name} {until} its reference, by up to {numbers[1]:.2g}{unit} in the second half of "
+            f"the run ({tolerance:.2g}{unit} tolerated)"
+        )
+        cause = f"{name} is off likely because {', '.join(reasons)}" if reasons else ""
+        yield RunFinding(FindingKind.REFERENCE, text, Outcome.BAD, *numbers, cause)
+    if settled and not are_bad:
+        since = max(output.within_since or 0.0 for *_, output in settled)
+        _, most, worst = max(settled, key=lambda each: each[0])
+        which = "every output" if len(settled) == len(outputs) else "every other output"
+        unit = f" {worst.signal.unit}".rstrip()
+        text = (
+            f"{which} is at its reference from {since:.3g} s on; {worst.signal.name} comes closest "
+            f"to its tolerance, with {most:.2g} of {worst.tolerance:.2g}{unit}"
+        )
+        numbers = worst.signal, most, worst.tolerance, since
+        yield RunFinding(FindingKind.REFERENCE, text, None, *numbers)
+
+
+def _of_prediction(
+    record: Record, predicted: FloatArray, accuracy: float | None, reasons: Sequence[str]
+) -> Iterator[RunFinding]:
+    """The output that is farthest off the prediction, if that is more than an integrator leaves."""
+    off = np.abs(record["tracking_error"] - predicted)
+    shares, allowed = off / output_sizes(record, predicted), max(NEAR, STEPS * (accuracy or 0.0))
+    column = int(np.argmax(shares.max(axis=0)))
+    if not shares[:, column].max() > allowed:
+        return
+    signal, largest = record.signals["tracking_error"].signals[column], float(off[:, column].max())
+    time = float(record.time[np.argmax(shares[:, column] > allowed)])
+    text = (
+        f"from {time:.3g} s on the error of {signal.name} is off the predicted one, by up to "
+        f"{largest:.2g} {signal.unit}".rstrip()
+    )
+    decides, cause = None, ", ".join(reasons)
+    if not reasons:
+        decides, text = Outcome.UNDECIDED, f"{text}, and nothing in the scenario explains it"
+        finer = "smaller steps" if accuracy is None else f"an accuracy finer than {accuracy:g}"
+        cause = f"if {finer} changes nothing, plant and law differ"
+    numbers = signal, largest, None, time
+    yield RunFinding(FindingKind.PREDICTION, text, decides, *numbers, cause)
+
+
+def qualities(
+    record: Record, predicted: FloatArray, tolerances: Mapping[str, float]
+) -> list[OutputQuality]:
+    """How well each output of a record followed its reference; arguments as of `judge`."""
+    error, times, signals = record["tracking_error"], record.time, record.signals["tracking_error"]
+    if not error.size:
+        return []
+    late, default = late_rms(times, error), SHARE * _ranges(record, predicted)
+    found = []
+    for i, signal in enumerate(signals.signals):
+        values, tolerance = error[:, i], tolerances.get(signal.name, float(default[i]))
+        found.append(
+            OutputQuality(
+                signal,
+                start=float(values[0]),
+                largest=float(np.max(np.abs(values))),
+                final=float(values[-1]),
+                late_rms=float(late[i]),
+                off_prediction=float(np.max(np.abs(values - predicted[:, i]))),
+                tolerance=tolerance,
+                within_since=within_since(times, values, tolerance),
+            )
+        )
+    return found
+
+
+def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
+    """The range of the references in the unit of each output, shape (p,), positive."""
+    desired, sizes = record["desired_output"], output_sizes(record, predicted)
+    ranges, largest = np.ptp(desired, axis=0), np.abs(desired).max(axis=0)
+    ranges[ranges <= ROUND_OFF * sizes] = 0.0
+    units = np.array([signal.unit for signal in record.signals["desired_output"].signals])
+    for i, unit in enumerate(units.tolist()):
+        span = ranges[units == unit].max()
+        is_pure = unit in ("", "rad")
+        sizes[i] = max(span, 1.0) if is_pure else span or largest[units == unit].max() or sizes[i]
+    return sizes
+
+
+def unit_sizes(
+    *groups: tuple[Sequence[Signal], FloatArray], least: Mapping[str, float] = PURE
+) -> dict[str, float]:
+    """Unit -> the largest finite number in it, of signals with rows of values."""
+    sizes = dict(least)
+    for signals, values in groups:
+        largest = np.max(np.nan_to_num(np.abs(values), posinf=0.0), axis=0, initial=0.0)
+        for signal, size in zip(signals, largest.tolist(), strict=False):
+            sizes[signal.unit] = max(sizes.get(signal.unit, 0.0), size)
+    return sizes
+
+
+def record_sizes(record: Record) -> dict[str, float]:
+    """Unit -> the largest number in it of states, controls, forces and references."""
+    names = ("state", "control", "constraint_force", "desired_output")
+    every = [record.signals[name] for name in names if name in record]
+    return unit_sizes(*((one.signals, one.values) for one in every))
+
+
+def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
+    """The sizes of the outputs of a run, shape (p,), positive.
+
+    The size of an output is the largest value of references and predicted errors in its unit, so
+    that an output with a reference of 0 has the size of others. If all are zero, it is the largest
+    value of the record in that unit, or 1.
+    """
+    desired, of_all = record.signals["desired_output"], record_sizes(record)
+    sizes = unit_sizes((desired.signals, np.vstack([desired.values, predicted])))
+    for unit, size in sizes.items():
+        if size <= ROUND_OFF * of_all.get(unit, 0.0):
+            sizes[unit] = of_all[unit] or 1.0
+    return np.array([sizes[signal.unit] or 1.0 for signal in desired.signals])
+
+
+def within_since(times: FloatArray, error: FloatArray, tolerance: float) -> float | None:
+    """The first time from which |error| stays within the tolerance; None if the last is outside."""
+    outside = np.flatnonzero(~(np.abs(error) <= tolerance))
+    if not outside.size:
+        return float(times[0])
+    return float(times[outside[-1] + 1]) if outside[-1] + 1 < times.size else None
+
+
+def late_rms(times: FloatArray, errors: FloatArray) -> FloatArray:
+    """Root mean squares over the second half of the times, of errors linear between them."""
+    values, middle = by_columns(errors), 0.5 * (times[0] + times[-1])
+    first = int(np.searchsorted(times, middle, side="right"))
+    if first == times.size:
+        return np.abs(values[..., -1])
+    before, after = values[..., first - 1], values[..., first]
+    begin = (after - before) / (times[first] - times[first - 1]) * (middle - times[first - 1])
+    lines = np.concatenate([(before + begin)[..., None], values[..., first:]], axis=-1)
+    steps = np.diff(np.concatenate([[middle], times[first:]]))
+    begins, ends = lines[..., :-1], lines[..., 1:]
+    squares = (begins**2 + begins * ends + ends**2) / 3.0
+    sizes: FloatArray = np.sqrt(squares @ steps / steps.sum())
+    return sizes

@@ -1,0 +1,224 @@
+"""Constraint forces and moments as arrows in Meshcat."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, EventStatus, LeafSystem
+
+from drake_dae.arrays import FloatArray
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
+from drake_dae.robots import (
+    Constraint,
+    ConstraintWrenches,
+    RobotModel,
+    Wrenches,
+    axes_along,
+    own_values,
+)
+
+FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
+MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
+
+PATH_COLOR = Rgba(0.1, 0.2, 0.8, 1.0)
+
+_PIECE = 32
+"""The number of points in a piece of a growing path."""
+
+_NEGLIGIBLE = 1e-6
+"""A moment is negligible below this fraction of the largest force times the length of the longest
+arrow."""
+
+LEAST_SCALE = 1e-3
+"""The scale of an arrow without force; Meshcat cannot draw a scale of 0."""
+
+
+class ForceArrows:
+    """Draws each constraint force on a robot as an arrow whose tip is at the point of application.
+
+    The arrow has the direction of the force on the robot. A moment is an arrow with two heads,
+    along its axis. The longest arrow is that of the largest force until now.
+
+    Args:
+        meshcat: The Meshcat to draw in.
+        model: The robot.
+        length: The length of the longest arrow, m.
+
+    Attributes:
+        largest_force, largest_moment: The force and moment of the longest arrows, N and N m.
+        has_moment: Whether some moment has not been negligible compared with the forces.
+    """
+
+    def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
+        self.largest_force = self.largest_moment = 1e-6
+        self.has_moment, self._length = False, length
+        self._meshcat, self._model = meshcat, model
+        self._wrenches = ConstraintWrenches(model)
+        pairs = zip(self._wrenches.constraints, self._wrenches.with_moment, strict=True)
+        for constraint, with_moment in pairs:
+            _add_arrow(meshcat, path_of(constraint, "force"), length, 1, FORCE_COLOR)
+            if with_moment:
+                _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, MOMENT_COLOR)
+
+    def draw(self, wrenches: Wrenches, time: float) -> None:
+        """Draws the arrows, with a new scale if a force or moment is the largest until now.
+
+        Args:
+            wrenches: The present wrenches.
+            time: The time in a recording, s.
+        """
+        self.measure([wrenches])
+        pairs = zip(self._wrenches.constraints, self._wrenches.with_moment, strict=True)
+        for row, (constraint, with_moment) in enumerate(pairs):
+            point, force, moment = wrenches.points[row], wrenches.forces[row], wrenches.moments[row]
+            self._draw_arrow(path_of(constraint, "force"), point, force / self.largest_force, time)
+            if with_moment:
+                arrow = moment / self.largest_moment
+                self._draw_arrow(path_of(constraint, "moment"), point, arrow, time)
+
+    def place(self, parameters: FloatArray, time: float) -> None:
+        """Moves surfaces with exogenous parameters to their present poses.
+
+        Args:
+            parameters: The values of all parameters.
+            time: The time in a recording, s.
+        """
+        dae = self._model.dae
+        moving = {p.name for p in dae.exogenous.moving}
+        for constraint in self._model.constraints:
+            if not moving.isdisjoint(p.name for p in constraint.parameters):
+                pose = constraint.placement(own_values(constraint, dae, parameters))
+                self._meshcat.SetTransform(path_of(constraint, "surface"), pose, time)
+
+    def measure(self, course: Sequence[Wrenches]) -> None:
+        """Enlarges the scale so that these wrenches fit."""
+        for wrenches in course:
+            force, moment = (
+                float(np.max(np.linalg.norm(rows, axis=1), initial=0.0))
+                for rows in (wrenches.forces, wrenches.moments)
+            )
+            self.largest_force = max(self.largest_force, force)
+            negligible = _NEGLIGIBLE * self._length * self.largest_force
+            self.has_moment = self.has_moment or moment > negligible
+            self.largest_moment = max(self.largest_moment, moment, negligible)
+
+    def _draw_arrow(self, path: str, point: FloatArray, arrow: FloatArray, time: float) -> None:
+        size = float(np.linalg.norm(arrow))
+        direction = arrow / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
+        pose = RigidTransform(RotationMatrix(axes_along(direction)), point)
+        self._meshcat.SetTransform(path, pose, time)
+        scale = max(size, LEAST_SCALE)
+        self._meshcat.SetProperty(f"{path}/arrow", "scale", [scale] * 3, time)
+
+
+class GrowingPaths:
+    """Draws the paths of the constraints' points of application while the robot runs.
+
+    Args:
+        meshcat: The Meshcat to draw in.
+        constraints: The constraints that act at a point.
+    """
+
+    def __init__(self, meshcat: Meshcat, constraints: Sequence[Constraint]) -> None:
+        self._meshcat, self._constraints = meshcat, constraints
+        self._piece: list[FloatArray] = []
+        self._number, self._time = 0, -np.inf
+
+    def add(self, points: FloatArray, time: float) -> None:
+        """Appends the present points; a time before the last one clears the paths first.
+
+        Args:
+            points: The points of application, m, shape (k, 3).
+            time: The time in s.
+        """
+        if time < self._time:
+            self._meshcat.Delete("/paths")
+            self._piece, self._number = [], 0
+        self._time = time
+        self._piece.append(points)
+        line = np.array(self._piece)
+        for row, constraint in enumerate(self._constraints):
+            path = f"/paths/{constraint.name}/actual/{self._number}"
+            self._meshcat.SetLine(path, np.asfortranarray(line[:, row].T), 4.0, PATH_COLOR)
+        # In pieces, since Meshcat sends a whole line again with each new point.
+        if len(self._piece) > _PIECE:
+            self._piece, self._number = [points], self._number + 1
+
+
+class ConstraintForceVisualizer(LeafSystem):
+    """Draws the constraint forces and the paths of their points while a robot runs.
+
+    Input ports:
+        link_state: (q, v).
+        constraint_force: lambda, shape (m,).
+        exogenous: The exogenous signals, as the plant's port of the same name.
+
+    Args:
+        arrows: The force arrows.
+        meshcat: The Meshcat that draws the paths.
+        model: The robot.
+        places: The index among all parameters of each entry of `exogenous`.
+        period: The time between pictures in s.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(
+        self,
+        arrows: ForceArrows,
+        meshcat: Meshcat,
+        model: RobotModel,
+        places: Sequence[int],
+        period: float,
+    ) -> None:
+        super().__init__()
+        self.set_name("constraint_force_visualizer")
+        self._model = model
+        self._arrows, self._wrenches = arrows, ConstraintWrenches(model)
+        self._paths = GrowingPaths(meshcat, self._wrenches.constraints)
+        self._values, self._places = model.dae.parameter_values, list(places)
+        size = model.links.q.numel() + model.links.v.numel()
+        self._link_state = self.DeclareVectorInputPort("link_state", size)
+        self._force = self.DeclareVectorInputPort("constraint_force", len(model.dae.force_signals))
+        self._exogenous = self.DeclareVectorInputPort("exogenous", len(self._places))
+        self.DeclarePeriodicPublishEvent(period, 0.0, weakly(self._publish))
+        self.DeclareForcedPublishEvent(weakly(self._publish))
+
+    def _publish(self, context: Context) -> EventStatus:
+        time = context.get_time()
+        if self._places and self._exogenous.HasValue(context):
+            self._values[self._places] = self._exogenous.Eval(context)
+            self._arrows.place(self._values, time)
+        state, force = self._link_state.Eval(context), self._force.Eval(context)
+        wrenches = self._wrenches(state, force, self._values)
+        self._arrows.draw(wrenches, time)
+        self._paths.add(wrenches.points, time)
+        return EventStatus.Succeeded()
+
+
+def path_of(constraint: Constraint, what: str) -> str:
+    """Returns the Meshcat path of a constraint's "surface", "force", "moment" and the like."""
+    return f"/contact/{constraint.name}/{what}"
+
+
+def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rgba) -> None:
+    """Adds an arrow along z whose tip is at the origin, with one or two heads in a row."""
+    # A MeshcatCone opens along +z from its tip at the origin: turned, it points along +z.
+    half_turn = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
+    head, names = 0.2 * length, ["head", "second_head"][:heads]
+    for number, name in enumerate(names):
+        cone = f"{path}/arrow/{name}"
+        meshcat.SetObject(cone, MeshcatCone(head, 0.4 * head, 0.4 * head), color)
+        meshcat.SetTransform(cone, RigidTransform(half_turn, [0.0, 0.0, -number * head]))
+    shaft = length - heads * head
+    meshcat.SetObject(f"{path}/arrow/shaft", Cylinder(0.16 * head, shaft), color)
+    middle = np.array([0.0, 0.0, shaft / 2 - length])
+    meshcat.SetTransform(f"{path}/arrow/shaft", RigidTransform(middle))
+    # The arrow is drawn over everything, since a force in a joint acts inside bodies.
+    for part in (*names, "shaft"):
+        mesh = f"{path}/arrow/{part}/<object>"
+        meshcat.SetProperty(mesh, "material.depthTest", False)
+        meshcat.SetProperty(mesh, "material.transparent", True)
+        meshcat.SetProperty(mesh, "renderOrder", 1.0)

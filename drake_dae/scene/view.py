@@ -1,0 +1,218 @@
+"""A constrained robot in Drake's Meshcat: links, surfaces and constraint forces."""
+
+import errno
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.geometry import (
+    Meshcat,
+    MeshcatParams,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    Rgba,
+    SceneGraph,
+)
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.errors import ModelError
+from drake_dae.robots import ConstraintWrenches
+from drake_dae.scene.arrows import ConstraintForceVisualizer, ForceArrows, path_of
+from drake_dae.scene.floor import Floor, floor_below
+from drake_dae.scene.framing import ViewAngles, direction_of, framed
+from drake_dae.scene.small_meshes import shrink_meshes
+from drake_dae.scene.surroundings import (
+    DrawnSurface,
+    scene_extent,
+    scene_points,
+    surroundings,
+)
+from drake_dae.systems.plants.contract import Plant
+
+FRAME_RATE = 32.0
+"""Frames per second of the live view and of the recording."""
+
+_ON_REQUEST = 1e9
+"""A publish period, in s, so long that only a forced publish draws."""
+
+CAMERA_ANGLE = 0.7
+"""The vertical angle of view, in rad."""
+
+ASPECT = 4.0 / 3.0
+"""The width of a window divided by its height, from which the camera's position is computed; a
+wider window shows more."""
+
+PIECE = 0.6
+"""The side of a drawn piece of an unbounded surface, as a fraction of the scene's size."""
+
+ARROW = 0.2
+"""The length of the longest arrow, as a fraction of the scene's size."""
+
+_FLOOR_COLOR = Rgba(0.8, 0.8, 0.8, 1.0)
+
+_SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
+
+
+@checked(ModelError)
+def start_meshcat(host: str = "localhost") -> Meshcat:
+    """Starts a Meshcat server, which by default only this computer can reach.
+
+    Args:
+        host: The network interface that the server listens on, as "localhost" or "*" for all.
+
+    Raises:
+        OSError: There is no free port.
+    """
+    try:
+        meshcat = Meshcat(MeshcatParams(host=host))
+    except RuntimeError as error:
+        raise OSError(errno.EADDRINUSE, f"no port for Meshcat: {error}") from None
+    meshcat.SetProperty("/Background", "visible", False)
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    return meshcat
+
+
+def start_unwatched_meshcat() -> Meshcat:
+    """Starts a Meshcat server that only writes a page: Drake does not print its address.
+
+    Raises:
+        OSError: There is no free port.
+    """
+    log = logging.getLogger("drake")
+    level = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        return start_meshcat()
+    finally:
+        log.setLevel(level)
+
+
+def add_live_view(
+    builder: DiagramBuilder,
+    plant: Plant,
+    scene_graph: SceneGraph | None,
+    meshcat: Meshcat,
+    exogenous: OutputPort | None = None,
+) -> None:
+    """Adds the live view of a robot, drawn `FRAME_RATE` times a second.
+
+    Args:
+        builder: The builder of the diagram, with the plant in it.
+        plant: The plant; nothing is drawn if it is not a robot.
+        scene_graph: The geometry of the links' MultibodyPlant, or None.
+        meshcat: The Meshcat to draw in.
+        exogenous: The port that is connected to the plant's input `exogenous`, if any.
+    """
+    if plant.model is None:
+        return
+    period = 1.0 / FRAME_RATE
+    arrows = draw_scene(plant, meshcat, scene_graph)
+    forces = builder.AddSystem(
+        ConstraintForceVisualizer(arrows, meshcat, plant.model, plant.exogenous_places, period)
+    )
+    for name in ("link_state", "constraint_force"):
+        builder.Connect(plant.GetOutputPort(name), forces.GetInputPort(name))
+    if exogenous is not None:
+        builder.Connect(exogenous, forces.GetInputPort("exogenous"))
+    links = view_of_links(plant, scene_graph, meshcat, period)
+    if links is not None:
+        builder.AddSystem(links)
+        builder.Connect(plant.GetOutputPort("link_state"), links.get_input_port())
+    plant.add_own_view(builder, meshcat)
+
+
+def draw_scene(
+    plant: Plant, meshcat: Meshcat, scene_graph: SceneGraph | None = None
+) -> ForceArrows:
+    """Draws the static parts of a robot's scene, and returns the force arrows.
+
+    Args:
+        plant: The robot.
+        meshcat: The Meshcat to draw in.
+        scene_graph: The geometry of its links, or None.
+
+    Raises:
+        ModelError: The plant is not a robot.
+    """
+    model, dae = plant.robot("a view"), plant.dae
+    state = plant.structure.manifold.project(dae.nominal_state)
+    wrenches = ConstraintWrenches(model)
+    _, size = scene_extent(model, wrenches, state, scene_graph)
+    points = wrenches(state, np.zeros(len(dae.force_signals))).points[None]
+    surfaces = surroundings(model, wrenches, points, dae.parameter_values, PIECE * size)
+    draw_surroundings(meshcat, surfaces)
+    robot = scene_points(model, wrenches, state[None], scene_graph)
+    draw_floor(meshcat, floor_below(robot, surfaces))
+    direction = direction_of(robot, points[0], np.zeros_like(points[0]))
+    look_at(meshcat, *framed(robot, direction, ViewAngles.of(CAMERA_ANGLE, ASPECT)))
+    return ForceArrows(meshcat, model, ARROW * size)
+
+
+def look_at(meshcat: Meshcat, eye: FloatArray, at: FloatArray) -> None:
+    """Sets the pose of the camera.
+
+    Args:
+        meshcat: The Meshcat.
+        eye: The position of the camera, m, shape (3,).
+        at: The point that the camera looks at, m, shape (3,).
+    """
+    meshcat.SetProperty("/Cameras/default/rotated/<object>", "fov", float(np.rad2deg(CAMERA_ANGLE)))
+    meshcat.SetCameraPose(eye, at)
+
+
+def draw_floor(meshcat: Meshcat, floor: Floor) -> None:
+    """Draws the grid below a robot."""
+    begin, end = (np.asfortranarray(points.T) for points in floor.lines)
+    meshcat.SetLineSegments("/floor", begin, end, 1.0, _FLOOR_COLOR)
+
+
+def view_of_links(
+    plant: Plant, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
+) -> Diagram | None:
+    """Returns a diagram that draws a robot's links in Meshcat for its input, the link state (q, v).
+
+    The links' MultibodyPlant computes the poses of the links, and is not simulated. What is drawn
+    on request goes into a page, with coarser meshes if these are large.
+
+    Args:
+        plant: The robot.
+        scene_graph: The geometry of the links' MultibodyPlant, or None. The diagram has a copy.
+        meshcat: The Meshcat to draw in.
+        period: The time between pictures in s; by default only a forced publish draws.
+
+    Returns:
+        The diagram, or None if the links have no geometry.
+    """
+    links = plant.robot("a view").links.plant
+    if scene_graph is None or links is None or links.get_source_id() is None:
+        return None
+    builder = DiagramBuilder()
+    scene = builder.AddSystem(scene_graph.Clone())
+    if period == _ON_REQUEST:
+        shrink_meshes(scene, links.get_source_id())
+    pose = builder.AddSystem(MultibodyPositionToGeometryPose(links, input_multibody_state=True))
+    builder.ExportInput(pose.get_input_port(), "link_state")
+    builder.Connect(pose.get_output_port(), scene.get_source_pose_port(links.get_source_id()))
+    parameters = MeshcatVisualizerParams(publish_period=period)
+    MeshcatVisualizer.AddToBuilder(builder, scene, meshcat, parameters)
+    diagram = builder.Build()
+    diagram.set_name("view_of_links")
+    return diagram
+
+
+def draw_surroundings(meshcat: Meshcat, surfaces: Sequence[DrawnSurface]) -> None:
+    """Draws the surfaces that a robot touches.
+
+    Args:
+        meshcat: The Meshcat to draw in.
+        surfaces: The surfaces.
+    """
+    for surface in surfaces:
+        path = path_of(surface.constraint, "surface")
+        meshcat.SetObject(f"{path}/form", surface.picture.form, rgba=_SURFACE_COLOR)
+        meshcat.SetTransform(f"{path}/form", surface.picture.pose)
+        meshcat.SetTransform(path, surface.pose)

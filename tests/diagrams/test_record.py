@@ -1,0 +1,306 @@
+"""The record of a run, in memory and on disk."""
+
+import csv
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem, TriggerType
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer
+from runs import run_scenario, same_records, scenario
+
+from drake_dae import (
+    NormalForm,
+    Record,
+    ZeroDynamics,
+    build_scenario,
+    load_scenario,
+    poles,
+    simulate,
+)
+from drake_dae.arrays import listed
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Recorded
+from drake_dae.errors import ModelError
+from drake_dae.scenario.shipped import find_scenario
+
+
+@pytest.fixture(scope="module")
+def run():
+    return run_scenario(scenario("two_link_wall", "duration=0.5"))
+
+
+def small():
+    """Two signals, one of size 0, as of a robot without contact."""
+    return Record(
+        np.array([0.0, 0.1, 0.3]),
+        {
+            "state": Recorded(
+                np.arange(6.0).reshape(3, 2) / 7.0, (Signal("q", "rad"), Signal("ß,'", ""))
+            ),
+            "constraint_force": Recorded(np.zeros((3, 0)), ()),
+        },
+    )
+
+
+def test_every_signal_with_name_and_unit(run):
+    _, _, record = run
+    named = {name: [(s.name, s.unit) for s in r.signals] for name, r in record.signals.items()}
+    assert named == {
+        "state": [
+            ("joint1", "rad"),
+            ("joint2", "rad"),
+            ("joint1_w", "rad/s"),
+            ("joint2_w", "rad/s"),
+        ],
+        "constraint_force": [("wall.force", "N")],
+        "constraint_residual": [("wall.distance", "m"), ("wall.distance'", "m/s")],
+        "controlled_output": [("tool.z", "m"), ("wall.force", "N")],
+        "control": [("joint1_motor", "N m"), ("joint2_motor", "N m")],
+        "reference": [
+            ("tool.z", "m"),
+            ("tool.z'", "m/s"),
+            ("tool.z''", "m/s^2"),
+            ("wall.force", "N"),
+        ],
+        "desired_output": [("tool.z", "m"), ("wall.force", "N")],
+        "tracking_error": [("tool.z", "m"), ("wall.force", "N")],
+    }
+    for name, recorded in record.signals.items():
+        assert recorded.values.shape == (record.time.size, len(recorded.signals)), name
+
+
+def test_signals_belong_together(run):
+    """Each row is one moment: what the ports say at the recorded time and state."""
+    loop, context, record = run
+    replay = context.Clone()
+    assert np.all(np.diff(record.time) > 0.0)
+    assert (record.time[0], record.time[-1]) == (0.0, 0.5)
+    for row in (0, record.time.size // 2, -1):
+        replay.SetTime(record.time[row])
+        loop.plant.set_state(loop.plant.GetMyContextFromRoot(replay), record["state"][row])
+        for name in loop.signals:
+            value = loop.diagram.GetOutputPort(name).Eval(replay)
+            np.testing.assert_array_equal(record[name][row], value, err_msg=name)
+        error = loop.diagram.GetOutputPort("tracking_error").Eval(replay)
+        # The controller finds the force by another way: round-off of 20 N.
+        np.testing.assert_allclose(record["tracking_error"][row], error, atol=1e-12)
+    difference = record["controlled_output"] - record["desired_output"]
+    np.testing.assert_array_equal(record["tracking_error"], difference)
+
+
+def test_rows_before_a_change_of_parameters_keep_the_old_ones():
+    """Only the state is logged: gains and masses are those that the blocks had at each moment."""
+    loop, context = build_scenario(scenario("two_link_wall"))
+    config = scenario("two_link_wall").integrator
+    own, law = (
+        block.GetMyMutableContextFromRoot(context) for block in (loop.plant, loop.controller)
+    )
+    simulate(loop.diagram, context, 0.2, config)
+    replays = [context.Clone()]
+    name = loop.plant.dae.parameters[0].name
+    loop.plant.set_parameter(own, name, 1.01 * loop.plant.get_parameter(own, name))
+    loop.controller.set_gains(law, poles(-6.0))
+    config.start_time = context.get_time()
+    simulate(loop.diagram, context, 0.1, config)
+    replays.append(context.Clone())
+    record = loop.record(context)
+    assert np.sum(record.time > 0.2) > 3
+    for row, time in enumerate(record.time):
+        # The run goes on at 0.2 s, and logs what it begins with.
+        replay = replays[int(time >= 0.2)]
+        replay.SetTime(time)
+        loop.plant.set_state(loop.plant.GetMyContextFromRoot(replay), record["state"][row])
+        for signal in ("control", "constraint_force"):
+            value = loop.diagram.GetOutputPort(signal).Eval(replay)
+            np.testing.assert_array_equal(record[signal][row], value)
+    # What is asked for later is the same, whatever was changed since.
+    loop.controller.set_gains(law, poles(-2.0))
+    same_records(loop.record(context), record)
+    later = loop.record(context, 0.2)
+    np.testing.assert_array_equal(later.time, record.time[record.time > 0.2])
+    np.testing.assert_array_equal(later["control"], record["control"][record.time > 0.2])
+
+
+def test_the_last_row_is_after_the_projection(run):
+    _, _, record = run
+    residual = np.abs(record["constraint_residual"])
+    # Round-off of 1 m; the steps before leave 1e-10 at an accuracy of 1e-8.
+    assert np.max(residual[-1]) < 1e-14
+    assert np.max(residual[1:-1]) > 1e-12
+
+
+def test_saved_and_loaded(run, tmp_path):
+    for name, record in {"run": run[2], "small": small()}.items():
+        record.save(tmp_path / f"{name}.npz")
+        same_records(Record.load(tmp_path / f"{name}.npz"), record)
+
+
+def test_numpy_alone_reads_it(tmp_path):
+    small().save(tmp_path / "record.npz")
+    program = """
+import sys, numpy
+record = numpy.load("record.npz")
+print(record["time"].tolist(), (record["state"] * 7).tolist(), record["state.names"].tolist(),
+      record["state.units"].tolist(), record["constraint_force"].shape)
+assert not any(name.startswith(("drake_dae", "pydrake")) for name in sys.modules)
+"""
+    command = [sys.executable, "-W", "error", "-X", "utf8", "-c", program]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, encoding="utf-8")
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == (
+        "[0.0, 0.1, 0.3] [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]] ['q', \"ß,'\"] ['rad', ''] (3, 0)"
+    )
+
+
+def test_what_is_no_record(tmp_path):
+    assert "state" in small()
+    assert "sate" not in small()
+    with pytest.raises(ModelError, match="'sate'"):
+        small()["sate"]
+    (tmp_path / "text.npz").write_text("hello")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    for name in ("text.npz", "array.npy", "other.npz", "gone.npz"):
+        with pytest.raises(ModelError, match=name):
+            Record.load(tmp_path / name)
+
+
+class Failing(LeafSystem):
+    """Two outputs; the second fails after a number of evaluations."""
+
+    def __init__(self, good):
+        super().__init__()
+        self.good = good
+        self.DeclareContinuousState(1)
+        self.DeclareVectorOutputPort("first", 1, lambda c, out: out.SetFromVector([c.get_time()]))
+        self.DeclareVectorOutputPort("second", BasicVector(2), self.second)
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        derivatives.get_mutable_vector().SetFromVector([1.0])
+
+    def second(self, context, output):
+        self.good -= 1
+        if self.good < 0:
+            raise ArithmeticError
+        output.SetFromVector([1.0, context.get_time()])
+
+
+@pytest.mark.parametrize("good", [0, 1, 3])
+def test_of_a_run_that_failed_while_it_was_logged(good):
+    """The sample in which a signal failed is left out."""
+    builder = DiagramBuilder()
+    system = builder.AddSystem(Failing(good))
+    ports = [system.GetOutputPort(name) for name in ("first", "second")]
+    stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
+    for index, port in enumerate(ports):
+        builder.Connect(port, stacked.get_input_port(index))
+    log = LogVectorOutput(stacked.get_output_port(), builder, {TriggerType.kPerStep})
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    config = load_scenario(find_scenario("two_link_wall")).integrator
+    config.use_error_control, config.max_step_size = False, 0.25
+    with pytest.raises(ArithmeticError):
+        simulate(diagram, context, 2.0, config)
+    signals = {"first": [Signal("a")], "second": [Signal("b"), Signal("c")]}
+    record = Record.from_log(log, signals, context)
+    np.testing.assert_array_equal(record.time, np.arange(good) / 4)
+    np.testing.assert_array_equal(record["first"][:, 0], record.time)
+    assert record["second"].shape == (good, 2)
+    with pytest.raises(ModelError, match=r"2.*3"):
+        Record.from_log(log, {"second": signals["second"]}, context)
+
+
+def test_of_nothing():
+    loop, context = build_scenario(load_scenario(find_scenario("two_link_wall")))
+    record = loop.record(context)
+    assert record.time.size == 0
+    assert record["tracking_error"].shape == (0, 2)
+
+
+# For other tools, and to look at.
+
+
+def test_a_dataframe_has_the_numbers_below_names_and_units(run):
+    _, _, record = run
+    frame = record.to_dataframe()
+    assert frame.index.name == "time [s]"
+    np.testing.assert_array_equal(frame.index, record.time)
+    assert list(frame.columns.levels[0]) == sorted(record.signals)
+    assert list(frame["control"].columns) == ["joint1_motor [N m]", "joint2_motor [N m]"]
+    assert list(frame["controlled_output"].columns) == ["tool.z [m]", "wall.force [N]"]
+    for name in record.signals:
+        np.testing.assert_array_equal(frame[name], record[name])
+    assert small().to_dataframe().shape == (3, 2)
+
+
+@pytest.mark.slow
+def test_a_dataset_has_the_numbers_with_names_and_units(run):
+    _, _, record = run
+    data = record.to_xarray()
+    np.testing.assert_array_equal(data["time"], record.time)
+    assert data["time"].attrs == {"units": "s"}
+    assert set(data.data_vars) == set(record.signals)
+    for name, recorded in record.signals.items():
+        assert data[name].dims == ("time", f"{name}.name")
+        np.testing.assert_array_equal(data[name], recorded.values)
+        assert list(data[f"{name}.unit"].values) == [s.unit for s in recorded.signals]
+    motor = data["control"].sel({"control.name": "joint1_motor"})
+    np.testing.assert_array_equal(motor, record["control"][:, 0])
+    assert small().to_xarray()["constraint_force"].shape == (3, 0)
+
+
+def test_csv_reads_back_to_the_last_digit(tmp_path):
+    small().to_csv(tmp_path / "record.csv")
+    with open(tmp_path / "record.csv", encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["time [s]", "state.q [rad]", "state.ß,'"]
+    np.testing.assert_array_equal(
+        np.array(rows, dtype=float), np.column_stack([small().time, small()["state"]])
+    )
+
+
+@pytest.mark.parametrize(("module", "method"), [("pandas", "dataframe"), ("xarray", "xarray")])
+def test_without_the_extra_it_says_what_to_install(module, method, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ModelError, match=rf"{module}.*\[data\]"):
+        getattr(small(), f"to_{method}")()
+
+
+def test_what_a_notebook_shows():
+    record = small()
+    assert repr(record) == (
+        "Record(3 times from 0 to 0.3 s, signals=[state (2), constraint_force (0)])"
+    )
+    page = record._repr_html_()
+    assert "<td>state</td><td>2</td><td>q [rad], ß,&#x27;</td>" in page
+    assert repr(Record(np.zeros(0), {})) == "Record(empty, signals=[])"
+
+
+def test_one_line_says_names_and_sizes(run):
+    """The hidden words of a notebook: what the last line of a cell shows."""
+    loop, _, _ = run
+    plant, controller = loop.plant, loop.controller
+    outputs = "outputs=[tool.z, wall.force]"
+    assert repr(plant.model) == (
+        f"RobotModel('two_link_arm', positions=2, constraints=[wall], {outputs})"
+    )
+    assert repr(controller.law) == f"TrackingLaw('two_link_arm', {outputs}, degrees=[2, 0])"
+    assert repr(plant).startswith("RobotPlant('two_link_arm', inputs=[control (2)]")
+    assert "constraint_force (1)" in repr(plant)
+    assert "inputs=[estimated_state (4), reference (4)" in repr(controller)
+    assert repr(loop.reference) == (
+        "ReferenceGenerator('reference', inputs=[], outputs=[reference (4)])"
+    )
+    assert repr(scenario("two_link_wall")) == (
+        f"Scenario('{scenario('two_link_wall').description}', robot='two_link_arm.urdf', "
+        "constraints=[wall], duration=10 s)"
+    )
+    structure = controller.law.structure
+    zero = ZeroDynamics(plant.dae, structure=structure)
+    assert repr(zero) == "ZeroDynamics('two_link_arm', dimension=0)"
+    form = NormalForm(plant.dae, structure=structure)
+    names = "[wall.distance, wall.distance', tool.z, tool.z']"
+    assert repr(form) == f"NormalForm('two_link_arm', coordinates={names})"
+    assert listed("abcdefghij", 3) == "[a, b, c, ... 7 more]"

@@ -1,0 +1,246 @@
+"""Runs that diverge end with what grew; those that do something violent go on."""
+
+import warnings
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import SimulatorConfig
+from runs import some
+
+from drake_dae import DaePlant, DaeSystem, TrackingLaw, make_closed_loop, poles
+from drake_dae.arrays import show_state
+from drake_dae.dae import Signal
+from drake_dae.diagrams.record import Record, Recorded
+from drake_dae.errors import NonMinimumPhaseWarning, SimulationError
+from drake_dae.running.divergence import DivergenceWatch
+from drake_dae.running.simulate import simulate
+from drake_dae.scenario.build import build_scenario
+from drake_dae.scenario.rolled import roll_scenario
+from tests.support.runs import scenario
+
+
+def run(name, *settings):
+    """Simulates a shipped scenario with settings."""
+    case = scenario(name, *settings)
+    loop, context = build_scenario(case)
+    return simulate(
+        loop.diagram,
+        context,
+        case.duration,
+        case.integrator,
+        may_diverge=case.judgement.may_diverge,
+    )
+
+
+LATE = "sampling={period: %g, delay: %g}"
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "grew"),
+    [
+        # Read late: the law answers an error of long ago.
+        (
+            "two_link_wall",
+            ("law.gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001)),
+            "wall.force",
+        ),
+        pytest.param(
+            "five_bar",
+            ("law.gains=!Poles {all: [-1500.0]}", LATE % (0.002, 0.002)),
+            "pin.f",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "seven_joint_dome",
+            ("law.gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004)),
+            "dome.force",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_a_loop_that_diverges_ends_with_what_grew_and_since_when(name, settings, grew):
+    with pytest.raises(SimulationError, match="may_diverge") as caught:
+        run(name, *settings)
+    text = str(caught.value)
+    assert grew in text
+    # Far before numbers end: the reported numbers can be read.
+    assert np.isfinite(caught.value.state).all()
+    assert caught.value.time < 1.0
+
+
+FIXED = (
+    "integrator.use_error_control=false",
+    "integrator.integration_scheme=runge_kutta3",
+    "integrator.max_step_size=1e-4",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fixed", [(), FIXED])
+@pytest.mark.parametrize("compiled", some(["true", "false"]))
+def test_rollouts_diverge_as_simulations_do(fixed, compiled):
+    settings = ("law.gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001), *fixed)
+    case = scenario("two_link_wall", *settings, f"compiled={compiled}")
+    loop, context = build_scenario(case)
+    found = roll_scenario(case, loop, context)
+    assert found.failure is not None
+    assert "wall.force" in str(found.failure)
+    # What was recorded is kept, up to where it says so.
+    assert found.record.time[-1] == found.failure.time < 0.1
+    assert found.record.time.size > 1
+    errors = np.abs(found.record["tracking_error"][:, -1])
+    assert errors[-1] > 1e3 * 20.0
+    if fixed:  # Under error control what may diverge takes shorter and shorter steps.
+        may = scenario(
+            "two_link_wall", *settings, f"compiled={compiled}", "judgement.may_diverge=true"
+        )
+        later = roll_scenario(may, *build_scenario(may)).failure  # Numbers end.
+        assert "the run diverges" not in str(later)
+        assert later.time > found.failure.time
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_tasks_diverge_by_their_own_outputs():
+    """By simulate; rollouts, which are looked at before they have a row, end at least."""
+    free = 'task.gains=!Poles {outputs: {wall.distance: [-5.0], "*": [-25.0]}}'
+    touch = ("task.phases.1.speed=0.03", "task.phases.2.over=0.5")
+    gains = ("law.gains=!Poles {all: [-400.0]}", free)
+    settings = ("wall_polish", *gains, *touch, LATE % (0.004, 0.004))
+    with pytest.raises(SimulationError, match=r"wall\.force") as caught:
+        run(*settings)
+    assert 3.0 < caught.value.time < 4.0
+    case = scenario(*settings, "compiled=false")
+    found = roll_scenario(case, *build_scenario(case)).failure
+    assert found is not None  # Between two of its rows, by impacts without end.
+    assert found.time == pytest.approx(caught.value.time, abs=0.05)
+
+
+@pytest.mark.slow
+def test_a_run_may_diverge_where_that_is_asked_for():
+    late = ("two_link_wall", "law.gains=!Poles {all: [-300.0]}", LATE % (0.005, 0.005))
+    short = "duration=0.05"
+    with pytest.raises(SimulationError, match="may_diverge"):
+        run(*late, short)
+    assert run(*late, short, "judgement.may_diverge=true").simulated_time == pytest.approx(0.05)
+
+
+def unstable_inside(size, period):
+    """A loop whose output is held while x_2' = x_2 / period - x_1 runs off, with its context.
+
+    Lengths are counted in 1 / size m, and times in period s.
+    """
+    system = DaeSystem.from_functions(
+        ["a", "b"],
+        f=lambda x: [0, (x[1] - x[0]) / period],
+        h=lambda x: [1 / period, 0],
+        l=lambda x: [x[0]],
+        nominal_state=[0.1 * size, 0.1 * size],
+        state_scale=[size, size],
+        name="runaway",
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NonMinimumPhaseWarning)
+        law = TrackingLaw(system, poles(-2.0 / period))
+        loop = make_closed_loop(DaePlant(system), law, {"z0": 0.1 * size})
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, [0.1 * size, 0.1 * size * (1.0 + 1e-3)])
+    return loop, context
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("size", "period"), some([(1.0, 1.0), (1e3, 1.0), (1e-3, 60.0), (1e6, 1e-3)])
+)
+def test_when_it_ends_does_not_depend_on_units(size, period):
+    """b - a = 1e-4 size e^(t / period) is 1e9 size after 13 ln 10 = 29.9 periods.
+
+    It is looked at every eighth step, of period / 50 here.
+    """
+    loop, context = unstable_inside(size, period)
+    config = SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=period / 50.0, use_error_control=False
+    )
+    with pytest.raises(SimulationError, match=r"\bb\b") as caught:
+        simulate(loop.diagram, context, 40.0 * period, config)
+    expected = 13.0 * np.log(10.0)
+    assert expected <= caught.value.time / period <= expected + 9 / 50
+
+
+def test_a_start_far_away_is_no_divergence():
+    """The error begins at a thousand times the reference, and decays."""
+    system = DaeSystem.from_functions(
+        ["a"], f=lambda x: [0], h=lambda x: [1], l=lambda x: [x[0]], name="far"
+    )
+    law = TrackingLaw(system, poles(-2.0))
+    loop = make_closed_loop(DaePlant(system), law, {"z0": 1.0})
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, [1e3])
+    simulate(loop.diagram, context, 10.0, SimulatorConfig())
+    # Of 999 e^-20 = 2e-6 that is left.
+    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
+    assert state == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_diverged_state_is_reported_by_its_size():
+    assert show_state([1.0, -0.25]) == "[ 1.  , -0.25]"
+    assert show_state([1.0, -3e192, np.inf]) == "grown to 3e+192"
+
+
+def test_a_control_that_leaves_all_measure_ends_a_run_whose_errors_are_small():
+    """z = x_1 is held while x_2 = tan t: just before pi / 2 it is 1e3, and u = -x_2^4 is -1e12."""
+    system = DaeSystem.from_functions(
+        ["a", "b"],
+        f=lambda x: [x[1] ** 4, x[1] ** 2 + 1.0],
+        h=lambda x: [1, 0],
+        l=lambda x: [x[0]],
+        state_scale=[1.0, 1e3],
+        name="escape",
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NonMinimumPhaseWarning)
+        law = TrackingLaw(system, poles(-2.0))
+        loop = make_closed_loop(DaePlant(system), law, {"z0": 1.0})
+    context = loop.diagram.CreateDefaultContext()
+    loop.set_state(context, [1.0, 0.0])
+    duration = np.pi / 2 - 1e-3
+    with pytest.raises(SimulationError, match="u0"):
+        simulate(loop.diagram, context, duration)
+    loop.set_state(context, [1.0, 0.0])
+    simulate(loop.diagram, context, duration, may_diverge=True)
+    record = loop.record(context)
+    assert np.max(np.abs(record["tracking_error"])) < 10.0
+    with pytest.raises(SimulationError, match="u0") as caught:
+        DivergenceWatch(loop.plant, duration).look(record, is_last=True)
+    first = np.argmax(np.abs(record["control"]) > 1e9)
+    assert caught.value.time == record.time[first]
+    # Before, a run ends by itself, and tells why.
+    DivergenceWatch(loop.plant, duration).look(record)
+
+
+def test_many_rows_at_once_end_where_rows_one_by_one_do():
+    """Errors up to 50 sizes, which are no divergence, and then a part that diverges."""
+    random, signals = np.random.default_rng(0), [Signal("tool.z", "m"), Signal("wall.force", "N")]
+    times = np.cumsum(random.uniform(0.001, 0.01, 400))
+    errors = np.exp(random.uniform(-2.0, np.log(50.0), (400, 2)))
+    errors[:, 1] *= times < 1.0
+    errors[300:] *= 40.0
+    errors[0] = 1.0
+    plant = DaePlant(DaeSystem.from_functions(["a"], f=lambda x: [0], h=lambda x: [1]))
+
+    def ends(parts):
+        watch = DivergenceWatch(plant, 5.0)
+        for part in parts:
+            rows = {"controlled_output": errors[part], "desired_output": 0.0 * errors[part]}
+            rows = {name: Recorded(values, tuple(signals)) for name, values in rows.items()}
+            rows["state"] = Recorded(0.0 * errors[part][:, :1], plant.dae.state_signals)
+            try:
+                watch.look(Record(times[part], rows))
+            except SimulationError as error:
+                return error
+        return None
+
+    together = ends([slice(0, 300), slice(300, 400)])
+    assert "tool.z" in str(together)
+    assert times[300] <= together.time
+    assert str(ends([slice(i, i + 1) for i in range(400)])) == str(together)

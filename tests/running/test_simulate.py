@@ -1,0 +1,414 @@
+"""Running a diagram: settings, statistics, progress, interruption, failure."""
+
+import io
+import itertools
+import os
+import signal
+import sys
+import threading
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+from pydrake.trajectories import PiecewisePolynomial
+from runs import scenario
+
+from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
+from drake_dae.errors import InconsistentStateError, ModelError, SimulationError
+from drake_dae.running import simulate as module
+from drake_dae.running.interruption import ENDING_SIGNALS
+from drake_dae.running.simulate import check_config, check_duration, simulate
+from drake_dae.scenario.shipped import find_scenario
+from drake_dae.systems.control.sampling import ControlHold, Sampling
+
+
+class Ramp(LeafSystem):
+    """x' = 1, and what is to happen once x passes a mark."""
+
+    def __init__(self, mark=np.inf, happening=None):
+        super().__init__()
+        self.mark, self.happening = mark, happening
+        self.DeclareStateOutputPort("x", self.DeclareContinuousState(1))
+
+    def DoCalcTimeDerivatives(self, context, derivatives):
+        if context.get_continuous_state_vector()[0] > self.mark:
+            self.happening()
+        derivatives.get_mutable_vector().SetFromVector([1.0])
+
+
+def ramp(mark=np.inf, happening=None):
+    builder = DiagramBuilder()
+    system = builder.AddSystem(Ramp(mark, happening))
+    logger = LogVectorOutput(system.get_output_port(), builder)
+    diagram = builder.Build()
+    return diagram, diagram.CreateDefaultContext(), logger
+
+
+def fixed(step=0.125):
+    return SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=step, use_error_control=False
+    )
+
+
+def test_statistics_and_end_state():
+    diagram, context, logger = ramp()
+    run = simulate(diagram, context, 2.0, fixed())
+    assert (run.simulated_time, run.steps, run.interrupted) == (2.0, 16, None)
+    assert run.times_real_time == pytest.approx(2.0 / run.wall_time)
+    assert context.get_time() == 2.0
+    assert context.get_continuous_state_vector()[0] == pytest.approx(2.0, abs=1e-14)
+    # The last one is logged again after the pending events, such as a projection.
+    times = logger.FindLog(context).sample_times()
+    np.testing.assert_array_equal(times, [*np.arange(17) / 8, 2.0])
+
+
+def test_settings_reach_the_integrator():
+    diagram, context, _ = ramp()
+    config = SimulatorConfig(start_time=-3.0, accuracy=1e-5, max_step_size=0.5)
+    run = simulate(diagram, context, 1.0, config)
+    assert context.get_time() == -2.0
+    assert run.simulated_time == 1.0
+    assert context.get_accuracy() == 1e-5
+
+
+def test_a_second_run_goes_on_from_the_first():
+    diagram, context, _ = ramp()
+    simulate(diagram, context, 1.0, fixed())
+    config = fixed()
+    config.start_time = 1.0
+    simulate(diagram, context, 1.0, config)
+    assert context.get_continuous_state_vector()[0] == pytest.approx(2.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, np.nan, np.inf])
+def test_duration_is_checked(duration):
+    with pytest.raises(ModelError, match="duration"):
+        check_duration(duration)
+    diagram, context, _ = ramp()
+    with pytest.raises(ModelError, match="duration"):
+        simulate(diagram, context, duration, fixed())
+    assert context.get_time() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"integration_scheme": "rk45"}, "'rk45'"),
+        ({"integration_scheme": "radau"}, "'radau'"),
+        ({"integration_scheme": "cenic"}, "'cenic'"),
+        ({"accuracy": 0.0}, r"accuracy.*0.0"),
+        ({"max_step_size": 0.0}, r"max_step_size.*0.0"),
+        ({"target_realtime_rate": -1.0}, "target_realtime_rate"),
+        ({"integration_scheme": "explicit_euler"}, "use_error_control: explicit_euler"),
+    ],
+)
+def test_settings_are_checked(settings, message):
+    """Drake takes each of these, and then hangs, ends in the middle, or ignores it."""
+    with pytest.raises(ModelError, match=message):
+        check_config(SimulatorConfig(use_error_control=True, **settings))
+    diagram, context, _ = ramp()
+    with pytest.raises(ModelError, match=message):
+        simulate(diagram, context, 1.0, SimulatorConfig(use_error_control=True, **settings))
+
+
+def test_every_other_scheme_passes():
+    for scheme in set(GetIntegrationSchemes()) - {"cenic"}:
+        check_config(SimulatorConfig(integration_scheme=scheme, use_error_control=False))
+
+
+def test_endless_by_request():
+    """Ten billion steps, of which this takes some: neither silent nor a state without bound."""
+    count = itertools.count(1)
+
+    def enough(context):
+        if next(count) == 2500:
+            raise StopIteration
+
+    diagram, context, _ = ramp()
+    warned = pytest.warns(UserWarning, match=r"1e-09 s.*1e\+10")
+    with warned, pytest.raises(StopIteration):
+        simulate(diagram, context, 10.0, fixed(1e-9), after_step=enough)
+    assert context.get_time() == pytest.approx(2500e-9)
+
+
+def test_samples_without_end_are_reported_like_steps():
+    """Whatever samples: a held law, a force sensor, Drake's own plant."""
+    stopped = pytest.raises(StopIteration)
+
+    def stop(context):
+        raise StopIteration
+
+    for period, what in ((1e-12, "the sample period of 'control_hold',"), (1e-3, "")):
+        builder, hold = DiagramBuilder(), ControlHold(1, Sampling(period))
+        builder.AddSystem(hold)
+        builder.Connect(builder.AddSystem(ConstantVectorSource([1.0])).get_output_port(),
+                        hold.get_input_port())  # fmt: skip
+        diagram = builder.Build()
+        with warnings.catch_warnings(record=True) as told, stopped:
+            warnings.simplefilter("always")
+            simulate(diagram, diagram.CreateDefaultContext(), 1.0, fixed(0.1), after_step=stop)
+        assert [str(one.message).split(" takes")[0] for one in told] == (
+            [f"{what} 1e-12 s"] if what else []
+        )
+
+
+def test_drakes_settings_are_taken_where_none_are_given():
+    diagram, context, _ = ramp()
+    assert simulate(diagram, context, 1.0).simulated_time == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["two_link_wall", "two_link_measured_force"])
+def test_a_second_run_of_a_context_is_a_record_of_its_own(name):
+    """It begins at its start_time again, from the state that the first one ended in."""
+    chosen = scenario(name, "duration=0.2")
+    loop, context = build_scenario(chosen)
+    simulate(loop.diagram, context, 0.2, chosen.integrator)
+    first = loop.record(context)
+    simulate(loop.diagram, context, 0.1, chosen.integrator)
+    second = loop.record(context)
+    assert (second.time[0], second.time[-1]) == (0.0, pytest.approx(0.1))
+    np.testing.assert_allclose(second["state"][0], first["state"][-1], atol=1e-9)
+    # A run that goes on where the last one ended adds to it.
+    chosen.integrator.start_time = context.get_time()
+    simulate(loop.diagram, context, 0.1, chosen.integrator)
+    both = loop.record(context)
+    assert (both.time[0], both.time[-1]) == (0.0, pytest.approx(0.2))
+    np.testing.assert_array_equal(both["state"][: len(second.time) - 1], second["state"][:-1])
+
+
+def test_two_million_steps_are_no_reason_to_warn():
+    def stop(context):
+        raise StopIteration
+
+    with pytest.raises(StopIteration):
+        simulate(*ramp()[:2], 2000.0, fixed(1e-3), after_step=stop)
+
+
+def test_after_each_step():
+    times = []
+    diagram, context, _ = ramp()
+    simulate(diagram, context, 1.0, fixed(), after_step=lambda c: times.append(c.get_time()))
+    # And after the events that were due at the end.
+    np.testing.assert_array_equal(times, [*np.arange(1, 9) / 8, 1.0])
+
+
+# Interruption, by a real signal.
+
+
+@pytest.mark.usefixtures("signals_of_a_shell")
+@pytest.mark.parametrize("number", ENDING_SIGNALS)
+def test_a_signal_ends_the_run_after_its_step(number):
+    before = signal.getsignal(number)
+    sent = []
+
+    def press():
+        if not sent:
+            sent.append(True)
+            os.kill(os.getpid(), number)
+
+    diagram, context, logger = ramp(0.5, press)
+    run = simulate(diagram, context, 2.0, fixed())
+    assert sent
+    assert run.interrupted == number
+    # The signal comes in the step from 0.5 to 0.625, at one of its stages.
+    assert run.simulated_time == context.get_time() == 0.625
+    assert run.steps == 5
+    logged = logger.FindLog(context).data()[0]
+    np.testing.assert_allclose(logged, [*np.arange(6) / 8, 0.625], atol=1e-14)
+    assert signal.getsignal(number) is before
+
+
+def test_under_nohup_a_terminal_that_is_closed_ends_nothing():
+    def close():
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    diagram, context, _ = ramp(0.5, close)
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert simulate(diagram, context, 1.0, fixed()).interrupted is None
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("signals_of_a_shell")
+@pytest.mark.parametrize("second", ENDING_SIGNALS)
+def test_a_second_signal_is_an_exception_and_the_log_is_kept(second):
+    before = signal.getsignal(signal.SIGINT)
+
+    def press_twice():
+        for number in (signal.SIGTERM, second):
+            os.kill(os.getpid(), number)
+            # Python runs the handler between two of its instructions.
+            sum(range(1000))
+
+    diagram, context, logger = ramp(0.5, press_twice)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        simulate(diagram, context, 2.0, fixed())
+    assert caught.value.args == (second,)
+    assert logger.FindLog(context).sample_times()[-1] == 0.5
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_runs_outside_of_the_main_thread():
+    """Where Python allows no signal handler."""
+    result = []
+    thread = threading.Thread(target=lambda: result.append(simulate(*ramp()[:2], 1.0, fixed())))
+    thread.start()
+    thread.join()
+    assert result[0].simulated_time == 1.0
+
+
+# Failure.
+
+
+def test_an_exception_keeps_the_log():
+    def fail():
+        raise ZeroDivisionError("in the middle")
+
+    diagram, context, logger = ramp(0.5, fail)
+    with pytest.raises(ZeroDivisionError, match="in the middle"):
+        simulate(diagram, context, 2.0, fixed())
+    np.testing.assert_array_equal(logger.FindLog(context).sample_times(), np.arange(5) / 8)
+
+
+def test_what_drake_says_gets_time_and_state():
+    def fail():
+        PiecewisePolynomial().value(0.0)  # Drake refuses an empty one.
+
+    with pytest.raises(RuntimeError):
+        fail()
+    diagram, context, _ = ramp(0.5, fail)
+    with pytest.raises(SimulationError, match=r"t = 0\.5\d* s, .*\[") as caught:
+        simulate(diagram, context, 2.0, fixed())
+    assert 0.5 <= caught.value.time <= 0.625
+    # The state is that of the stage at which it failed.
+    np.testing.assert_allclose(caught.value.state, caught.value.time, atol=0.1)
+    assert isinstance(caught.value.__cause__, RuntimeError)
+
+
+def two_link(*settings):
+    scenario = load_scenario(find_scenario("two_link_wall"), settings)
+    return *build_scenario(scenario), scenario
+
+
+def test_a_projection_that_fails_gets_time_and_state():
+    """A circle, as the zero of a function that is flat where a step of 1 s at 50 m/s leads."""
+
+    def gradient(p):
+        return 8 * ca.sumsqr(p) ** 3 / (1 + ca.sumsqr(p) ** 4) ** 2 * p
+
+    system = DaeSystem.from_functions(
+        ["x", "y", "vx", "vy"],
+        f=lambda s: [s[2], s[3], 0, 0],
+        g=lambda s: ca.vertcat(0, 0, gradient(s[:2])),
+        h=lambda s: [0, 0, 0, 1],
+        k=lambda s: [0.5 - 1 / (1 + ca.sumsqr(s[:2]) ** 4)],
+        l=lambda s: [s[1]],
+        m=lambda s: [[0]],
+        nominal_state=[1, 0, 0, 1],
+        name="flat",
+    )
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(system))
+    control = builder.AddSystem(ConstantVectorSource([0.0]))
+    builder.Connect(control.get_output_port(), plant.get_input_port())
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    plant.set_state(plant.GetMyMutableContextFromRoot(context), [1.0, 0.0, 0.0, 50.0])
+    config = SimulatorConfig(
+        integration_scheme="explicit_euler", max_step_size=1.0, use_error_control=False
+    )
+    with pytest.raises(SimulationError, match=r"steps of 1 s .* 50 1/s.*t = 1 s, .*y0") as caught:
+        simulate(diagram, context, 3.0, config)
+    assert caught.value.time == 1.0
+    # Newton's law with v = 0: a straight line.
+    np.testing.assert_allclose(caught.value.state[:2], [1.0, 50.0], rtol=1e-12)
+
+
+def test_a_start_off_the_manifold_is_refused():
+    loop, context, scenario = two_link()
+    own = loop.plant.GetMyMutableContextFromRoot(context)
+    loop.plant.set_state(own, loop.plant.state(own) + 0.1)
+    with pytest.raises(InconsistentStateError) as caught:
+        simulate(loop.diagram, context, 0.5, scenario.integrator)
+    assert np.abs(caught.value.residual).max() > 0.01
+
+
+# Progress.
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_bar_on_a_terminal(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    simulate(*ramp()[:2], 2.0, fixed(), progress=True)
+    last = terminal.getvalue().rstrip("\n").split("\r")[-1]
+    assert last.startswith("100%|")
+    assert "2.00/2.00 s" in last
+    assert last.endswith(" x real time")
+
+
+def test_the_bar_shows_where_a_run_failed(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(module, "BAR_PERIOD", 0.0)
+
+    def fail():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        simulate(*ramp(1.0, fail)[:2], 2.0, fixed(), progress=True)
+    assert "1.00/2.00 s" in terminal.getvalue().split("\r")[-1]
+    assert terminal.getvalue().endswith("\n")
+
+
+def test_no_bar_unless_asked_for(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    simulate(*ramp()[:2], 2.0, fixed())
+    assert terminal.getvalue() == ""
+
+
+def test_lines_where_there_is_no_terminal(monkeypatch, capsys):
+    simulate(*ramp()[:2], 2.0, fixed(), progress=True)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(module, "LINE_PERIOD", 0.0)
+    simulate(*ramp()[:2], 2.0, fixed(1.0), progress=True)
+    lines = capsys.readouterr().err.splitlines()
+    assert list(dict.fromkeys(line.split(",")[0] for line in lines)) == [
+        "1.00/2.00 s",
+        "2.00/2.00 s",
+    ]
+    assert all(line.endswith(" x real time") and "\r" not in line for line in lines)
+
+
+def test_a_state_that_escapes_in_finite_time_ends_the_run():
+    """x' = x^2 from 1 is 1 / (1 - t), which Drake follows with ever smaller steps."""
+    system = DaeSystem.from_functions(
+        ["x"],
+        f=lambda s: [s[0] ** 2],
+        h=lambda s: [1],
+        l=lambda s: [s[0]],
+        nominal_state=[1.0],
+    )
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(system))
+    control = builder.AddSystem(ConstantVectorSource([0.0]))
+    builder.Connect(control.get_output_port(), plant.GetInputPort("control"))
+    diagram = builder.Build()
+    config = SimulatorConfig(integration_scheme="runge_kutta5", accuracy=1e-6)
+    with pytest.raises(SimulationError) as caught:
+        simulate(diagram, diagram.CreateDefaultContext(), 3.0, config, may_diverge=True)
+    # Up to the accuracy.
+    assert caught.value.time == pytest.approx(1.0, abs=1e-5)
+    assert caught.value.state[0] > 1e6

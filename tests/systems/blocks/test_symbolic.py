@@ -1,0 +1,247 @@
+"""Systems from pydrake.symbolic: the same numbers as Drake's expressions, the same systems."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from problems import PROBLEMS
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
+from pydrake.symbolic import (
+    Expression,
+    ExpressionKind,
+    Variable,
+    acos,
+    asin,
+    atan,
+    atan2,
+    ceil,
+    cos,
+    cosh,
+    exp,
+    floor,
+    if_then_else,
+    log,
+    sin,
+    sinh,
+    sqrt,
+    tan,
+    tanh,
+    uninterpreted_function,
+)
+from pydrake.symbolic import abs as absolute
+from pydrake.symbolic import max as larger
+from pydrake.symbolic import min as smaller
+from pydrake.systems.primitives import SymbolicVectorSystem
+
+from drake_dae import find_structure
+from drake_dae.blocks.symbolic import from_symbolic, to_casadi
+from drake_dae.errors import ModelError
+
+# With arguments kept inside their domains: |sin e| <= 1.
+ONE = [
+    lambda a: log(1.0 + a * a),
+    lambda a: exp(sin(a)),
+    lambda a: sqrt(2.0 + a * a),
+    sin,
+    cos,
+    lambda a: tan(sin(a)),
+    lambda a: asin(0.9 * sin(a)),
+    lambda a: acos(0.9 * sin(a)),
+    atan,
+    lambda a: sinh(sin(a)),
+    lambda a: cosh(sin(a)),
+    tanh,
+    lambda a: a**3,
+    lambda a: (2.0 + sin(a)) ** -2,
+    lambda a: 2.0 - a,
+]
+TWO = [
+    lambda a, b: a + b,
+    lambda a, b: a - 3.0 * b + 0.5,
+    lambda a, b: a * b,
+    lambda a, b: a / (2.0 + cos(b)),
+    lambda a, b: (2.0 + sin(a)) ** sin(b),
+    lambda a, b: atan2(a, 2.0 + sin(b)),
+]
+
+
+def tree(random, leaves, depth):
+    """A random expression."""
+    if depth == 0:
+        return leaves[random.integers(len(leaves))] * random.uniform(0.5, 1.5)
+    inner = [tree(random, leaves, depth - 1) for _ in range(2)]
+    if random.random() < 0.5:
+        return ONE[random.integers(len(ONE))](inner[0])
+    return TWO[random.integers(len(TWO))](*inner)
+
+
+def kinds(expression, found):
+    found.add(expression.get_kind())
+    for part in expression.Unapply()[1]:
+        if isinstance(part, Expression):
+            kinds(part, found)
+
+
+def test_random_expressions_have_the_numbers_of_drake():
+    """80 trees at 3 points: some 30 operations, each to round-off, in another order."""
+    random = np.random.default_rng(0)
+    variables = [Variable(name) for name in "xyz"]
+    symbols = {v.get_id(): ca.SX.sym(v.get_name()) for v in variables}
+    found = set()
+    for _ in range(80):
+        expression = tree(random, variables, 5)
+        kinds(expression, found)
+        function = ca.Function("f", list(symbols.values()), [to_casadi(expression, symbols)])
+        for point in random.uniform(-2.0, 2.0, (3, 3)):
+            expected = expression.Evaluate(dict(zip(variables, point, strict=True)))
+            assert float(function(*point)) == pytest.approx(expected, rel=1e-11, abs=1e-12)
+    smooth = {kind for kind in vars(ExpressionKind).values() if isinstance(kind, ExpressionKind)}
+    refused = ("Abs", "Min", "Max", "Ceil", "Floor", "IfThenElse", "UninterpretedFunction", "NaN")
+    assert found == smooth - {getattr(ExpressionKind, name) for name in refused}
+
+
+def test_constants():
+    assert float(to_casadi(Expression(2.5), {})) == 2.5
+    assert float(to_casadi(np.float64(2.5), {})) == 2.5
+
+
+def pendulum(**changes):
+    """PROBLEMS["pendulum"] once more."""
+    x, y, vx, vy = state = [Variable(name) for name in ("x", "y", "vx", "vy")]
+    mass, length, gravity = (Variable(name) for name in ("mass", "length", "gravity"))
+    fields = {
+        "f": [vx, vy, 0.0, -gravity],
+        "g": [0.0, 0.0, x / mass, y / mass],
+        "h": np.array([[0.0], [0.0], [1.0 / mass], [0.0]]),
+        "k": (x**2 + y**2 - length**2) / 2.0,
+        "l": [x],
+        "m": [[0.0]],
+        "parameters": {mass: 2.0, length: 0.8, gravity: 9.81},
+        "output_signals": ("x",),
+        "nominal_state": [0.4, -0.6, 0.1, 0.1],
+        "name": "pendulum",
+    }
+    fields |= {key: change(x, gravity) for key, change in changes.items()}
+    return from_symbolic(state, **fields)
+
+
+def test_the_same_system_as_from_casadi():
+    made, problem = pendulum(), PROBLEMS["pendulum"]()
+    structure = find_structure(made)
+    assert structure.constraint_degrees == problem.constraint_degrees
+    assert structure.output_degrees == problem.output_degrees
+    assert [s.name for s in made.state_signals] == ["x", "y", "vx", "vy"]
+    assert [p.name for p in made.parameters] == ["mass", "length", "gravity"]
+    random = np.random.default_rng(0)
+    for letter in "fghklm":
+        values = [
+            ca.Function(letter, [s.state, s.parameter_symbol], [ca.densify(getattr(s, letter))])
+            for s in (made, problem.system)
+        ]
+        point = random.uniform(0.5, 2.0, 4), random.uniform(0.5, 2.0, 3)
+        # The same operations up to their order.
+        np.testing.assert_allclose(*(value(*point).full() for value in values), rtol=1e-14)
+
+
+def test_drakes_own_symbolic_system():
+    """m = 0: x'' = -sin x - c x' + cos(x) u; f is its dynamics at u = 0, h their slope."""
+    angle, rate, u, c = (Variable(name) for name in ("angle", "rate", "u", "c"))
+    drake = SymbolicVectorSystem(
+        state=[angle, rate],
+        input=[u],
+        dynamics=[rate, -sin(angle) - c * rate + cos(angle) * u],
+        output=[angle],
+        parameter=[c],
+    )
+    dynamics = [drake.dynamics_for_variable(v) for v in (angle, rate)]
+    made = from_symbolic(
+        [angle, rate],
+        f=[row.Substitute(u, 0.0) for row in dynamics],
+        h=[row.Differentiate(u) for row in dynamics],
+        l=angle,
+        parameters={c: 0.3},
+    )
+    assert find_structure(made).output_degrees == (2,)
+    context = drake.CreateDefaultContext()
+    context.SetContinuousState([0.7, -0.4])
+    context.get_mutable_numeric_parameter(0).SetFromVector([0.3])
+    drake.get_input_port().FixValue(context, [1.7])
+    rates = ca.Function("rates", [made.state, made.parameter_symbol], [made.f + made.h * 1.7])
+    np.testing.assert_allclose(
+        rates([0.7, -0.4], [0.3]).full()[:, 0],
+        drake.EvalTimeDerivatives(context).CopyToVector(),
+        rtol=1e-14,
+    )
+
+
+def test_a_multibody_plant_of_expressions():
+    """A rod of 2 kg with its centre 0.4 m from the joint, by Drake's own symbolic dynamics."""
+    plant = MultibodyPlant(0.0)
+    body = plant.AddRigidBody(
+        "rod", SpatialInertia(2.0, np.array([0.0, 0.0, -0.4]), UnitInertia(0.2, 0.2, 0.01))
+    )
+    joint = plant.AddJoint(
+        RevoluteJoint("pivot", plant.world_frame(), body.body_frame(), np.array([0.0, 1.0, 0.0]))
+    )
+    plant.AddJointActuator("motor", joint)
+    plant.Finalize()
+    symbolic = plant.ToSymbolic()
+    q, v, u = (Variable(name) for name in ("q", "v", "u"))
+    context = symbolic.CreateDefaultContext()
+    context.SetContinuousState([Expression(q), Expression(v)])
+    symbolic.get_actuation_input_port().FixValue(context, [Expression(u)])
+    rates = symbolic.EvalTimeDerivatives(context).CopyToVector()
+    made = from_symbolic(
+        [q, v],
+        f=[row.Substitute(u, 0.0) for row in rates],
+        h=[row.Differentiate(u) for row in rates],
+        l=q,
+        name="rod",
+    )
+    # (m c^2 included) I v' = u - m g c sin q, I = 2.0 * 0.2.
+    inertia = 2.0 * 0.2
+    function = ca.Function("rod", [made.state], [ca.densify(made.f), ca.densify(made.h)])
+    drift, drive = function([0.6, 1.1])
+    expected = -2.0 * 9.81 * 0.4 * np.sin(0.6) / inertia
+    np.testing.assert_allclose(drift.full()[:, 0], [1.1, expected], rtol=1e-12)
+    np.testing.assert_allclose(drive.full()[:, 0], [0.0, 1.0 / inertia], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda a: absolute(a), r"\bk\b.*abs\(x\)"),
+        (lambda a: 1.0 + smaller(a, 1.0), r"\bmin\b"),
+        (lambda a: larger(a, 1.0), r"\bmax\b"),
+        (lambda a: ceil(a), "ceil"),
+        (lambda a: sin(floor(a)), "floor"),
+        (lambda a: if_then_else(a > 0, a, 1.0), "if_then_else"),
+        (lambda a: uninterpreted_function("w", [a]), r"\bw\(x\)"),
+        (lambda a: a + Variable("w"), r"\bk\b.*\bw\b"),
+        (lambda a: Variable("b", Variable.Type.BOOLEAN), r"\bb\b"),
+        (lambda a: "x", r"\bk\b.*\bx\b.*str"),
+        (lambda a: np.nan, "pendulum: k, "),
+        (lambda a: [a, a], "pendulum: g "),
+    ],
+)
+def test_refusals_name_the_function_and_the_expression(make, message):
+    with pytest.raises(ModelError, match=message):
+        pendulum(k=lambda x, gravity: make(x))
+
+
+def test_refused_variables():
+    x = Variable("x")
+    with pytest.raises(ModelError, match=r"state.*Variable"):
+        from_symbolic(x, f=[x], h=[1.0], l=[x])
+    for states, parameters, message in (
+        ([x, x], {}, r"\bx\b"),
+        ([x], {x: 1.0}, r"\bx\b"),
+        (["x"], {}, r"state\[0\].*'x'"),
+        ([Variable("n", Variable.Type.INTEGER)], {}, "state"),
+        ([x, Variable("x")], {}, r"\bx\b"),
+        ([x], {Variable("c"): [1.0, 2.0]}, "parameters"),
+    ):
+        with pytest.raises(ModelError, match=message):
+            from_symbolic(
+                states, f=[0.0] * len(states), h=[1.0] * len(states), l=x, parameters=parameters
+            )
