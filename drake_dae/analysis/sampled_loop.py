@@ -6,6 +6,7 @@ from math import ceil, log2, pi
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, Block, stacked
@@ -17,7 +18,7 @@ LEFT_OUT = 1e-6
 EVERY = 2.0
 """A deviation appears or turns every 2 s, and noise has acted as long."""
 
-_CHANGE, _LEAST = 1e-6, 1e-2
+_CHANGE, _LEAST = 1e-7, 1e-2
 """The change of a value for a difference, relative to its size, of which the least is 0.01."""
 
 _FLOW = 2.5e-4
@@ -60,6 +61,19 @@ class LinearLoop:
         poles = self.poles
         poles = poles[np.abs(poles.imag) < pi / (2.0 * self.period)]
         return float(np.min(-poles.real / np.abs(poles), initial=1.0))
+
+    def participation(self, ratio: float) -> FloatArray:
+        """The shares of all x in the worst mode: the one with the least of decay and `ratio`...."""
+        values, left, right = scipy.linalg.eig(self.A, left=True)
+        with np.errstate(divide="ignore"):
+            s = np.log(values.astype(complex)) / self.period
+        rank = np.minimum(-s.real, 1e3)
+        inside = np.abs(s.imag) < pi / (2.0 * self.period)
+        rank = np.where(inside, np.minimum(rank, -s.real / np.abs(s) / ratio), rank)
+        rank[(np.abs(values - 1.0) <= LEFT_OUT) | (np.abs(values) <= 1e-9)] = np.inf
+        worst = int(np.argmin(rank))
+        shares: FloatArray = np.abs(left[:, worst] * right[:, worst])
+        return shares
 
     def by_noise(self, name: str) -> FloatArray:
         """The standard deviation of each row by noise."""
@@ -116,6 +130,7 @@ class SampledLoop:
     Attributes:
         block: The argument.
         period: The longest period of its samples, in s.
+        places: Name of held values -> the place of their first one in x.
         start: x at the start; nan where it follows from others, see `begun`.
 
     Raises:
@@ -134,6 +149,8 @@ class SampledLoop:
         self.start = np.concatenate([block.default("state"), *(held.start for held in groups)])
         begins = [held.symbol if held.begin is None else held.begin for held in groups]
         self._begins = self._function([stacked([block.state, *begins])])
+        ends = self._places[1:-1]
+        self.places = dict(zip(block.held, ends, strict=True))
         self._shown = self._function([stacked([block.outputs[name] for name in outputs])])
         self._names = {name: block.outputs[name].numel() for name in outputs}
         self._flow = self._function([block.derivative]) if block.state.numel() else None
@@ -219,6 +236,13 @@ class SampledLoop:
         result: FloatArray = self._maps[key](np.full((1, count), time), x, n, p).full()
         return result
 
+    def shown(self, time: float, x: FloatArray, parameters: FloatArray) -> dict[str, FloatArray]:
+        """Name of an output -> its columns."""
+        none = np.zeros((self.noise, x.shape[1]))
+        values = self._call(self._shown, time, x, none, parameters)
+        ends = np.cumsum([*self._names.values()])[:-1]
+        return dict(zip(self._names, np.split(values, ends), strict=True))
+
     def linear(self, time: float, x: FloatArray, parameters: FloatArray) -> LinearLoop:
         """The linear model about x, shape (n,), by central differences.
 
@@ -227,18 +251,18 @@ class SampledLoop:
         """
         sizes = np.concatenate([np.maximum(np.abs(x), _LEAST), np.ones(self.noise)])
         steps = _CHANGE * np.concatenate([sizes[: self.size], 1e3 * sizes[self.size :]])
-        moved = np.hstack([np.diag(steps), -np.diag(steps)])
+        moved = np.hstack([np.zeros((steps.size, 1)), np.diag(steps)])
         moved[: self.size] += x[:, None]
         columns, noise = np.split(moved, [self.size])
         p = np.tile(parameters[:, None], (1, moved.shape[1]))
 
         def slopes(values: FloatArray) -> FloatArray:
-            ahead, behind = np.hsplit(values, 2)
-            result: FloatArray = (ahead - behind) / (2.0 * steps)
+            result: FloatArray = (values[:, 1:] - values[:, :1]) / steps
             return result
 
-        A, B = np.hsplit(slopes(self._after(time, columns, noise, p)), [self.size])
-        later = self.after(time, x[:, None], p[:, :1])[:, 0]
+        ahead = self._after(time, columns, noise, p)
+        A, B = np.hsplit(slopes(ahead), [self.size])
+        later = ahead[:, 0]
         counts = (x == np.round(x)) & (np.abs(x) >= 1.0) & (later == np.round(later))
         A[:, counts] = np.eye(self.size)[:, counts]  # Logic has no slope.
         shown = slopes(self._call(self._shown, time, columns, noise, p))[:, : self.size]
