@@ -1,149 +1,125 @@
-"""The public names, each with its home; they are loaded when they are asked for."""
+"""The public names, in the order of the paper; they are loaded when they are asked for.
+
+All else is imported from its room, as `from drake_dae.robots import RollingBall`.
+"""
 
 from . import errors as errors
+from .dae import (
+    DaeSystem as DaeSystem,
+    Signal as Signal,
+    Parameter as Parameter,
+    find_structure as find_structure,
+    NormalForm as NormalForm,
+    ZeroDynamics as ZeroDynamics,
+    dynamic_extension as dynamic_extension,
+    linearize as linearize,
+    drop_constraints as drop_constraints,
+    share_forces as share_forces,
+    TrackingLaw as TrackingLaw,
+    poles as poles,
+)
+from .references import (
+    Reference as Reference,
+    ConstantReference as ConstantReference,
+    LineReference as LineReference,
+    PolylineReference as PolylineReference,
+    CircleReference as CircleReference,
+    SinusoidReference as SinusoidReference,
+    PointToPointReference as PointToPointReference,
+    WaypointsReference as WaypointsReference,
+    ExpressionReference as ExpressionReference,
+    CsvReference as CsvReference,
+)
+from .robots import (
+    RobotModel as RobotModel,
+    LinkExpressions as LinkExpressions,
+    Constraint as Constraint,
+    PointOnSurface as PointOnSurface,
+    FixedDistance as FixedDistance,
+    CoincidentPoints as CoincidentPoints,
+    WeldedFrames as WeldedFrames,
+    JointCoupler as JointCoupler,
+    AxisNormalToSurface as AxisNormalToSurface,
+    RevoluteLoopJoint as RevoluteLoopJoint,
+    PrismaticLoopJoint as PrismaticLoopJoint,
+    RollingWheel as RollingWheel,
+    Surface as Surface,
+    Plane as Plane,
+    Sphere as Sphere,
+    Cylinder as Cylinder,
+    Ellipsoid as Ellipsoid,
+    Torus as Torus,
+    ImplicitSurface as ImplicitSurface,
+    MeasuredSurface as MeasuredSurface,
+    Stage as Stage,
+    FlexibleJoints as FlexibleJoints,
+    DcMotors as DcMotors,
+    ElectrohydraulicServos as ElectrohydraulicServos,
+    JointPositions as JointPositions,
+    PointCoordinates as PointCoordinates,
+    AxisCoordinates as AxisCoordinates,
+    SurfaceCoordinates as SurfaceCoordinates,
+    TiltFromNormal as TiltFromNormal,
+    ExpressionOutput as ExpressionOutput,
+    ForceOutput as ForceOutput,
+    ForceCombination as ForceCombination,
+    Squeeze as Squeeze,
+    JointFriction as JointFriction,
+)
+from .blocks import (
+    Block as Block,
+    TracedSystem as TracedSystem,
+    compile_diagram as compile_diagram,
+    from_symbolic as from_symbolic,
+)
+from .systems import (
+    DaePlant as DaePlant,
+    RobotPlant as RobotPlant,
+    CompliantPlant as CompliantPlant,
+    ContactPlant as ContactPlant,
+    ContactMaterial as ContactMaterial,
+    TrackingController as TrackingController,
+    ReferenceGenerator as ReferenceGenerator,
+    Sampling as Sampling,
+    ControlLimits as ControlLimits,
+    Encoders as Encoders,
+    ForceSensor as ForceSensor,
+    StateEstimator as StateEstimator,
+    Task as Task,
+    TaskController as TaskController,
+    Phase as Phase,
+    Move as Move,
+    Approach as Approach,
+    Press as Press,
+    Dwell as Dwell,
+    Release as Release,
+    Retreat as Retreat,
+)
+from .diagrams import (
+    make_closed_loop as make_closed_loop,
+    ClosedLoop as ClosedLoop,
+    Record as Record,
+)
+from .scene import start_meshcat as start_meshcat
 from .analysis.analyze import analyze as analyze
-from .analysis.report import Analysis as Analysis
 from .analysis.contact_gains import contact_gains as contact_gains
-from .blocks.block import Block as Block
-from .blocks.block import Held as Held
-from .blocks.block import Requirement as Requirement
-from .blocks.compose import compile_diagram as compile_diagram
-from .blocks.symbolic import from_symbolic as from_symbolic
-from .blocks.traced_system import TracedSystem as TracedSystem
-from .dae import ConstraintStructure as ConstraintStructure
-from .dae import DaeSystem as DaeSystem
-from .dae import Extension as Extension
-from .dae import FeedbackGains as FeedbackGains
-from .dae import NormalForm as NormalForm
-from .dae import Parameter as Parameter
-from .dae import Signal as Signal
-from .dae import Structure as Structure
-from .dae import TrackingLaw as TrackingLaw
-from .dae import ZeroDynamics as ZeroDynamics
-from .dae import drop_constraints as drop_constraints
-from .dae import dynamic_extension as dynamic_extension
-from .dae import extend as extend
-from .dae import find_constraint_structure as find_constraint_structure
-from .dae import find_structure as find_structure
-from .dae import gain_coefficients as gain_coefficients
-from .dae import gain_matrices as gain_matrices
-from .dae import linearize as linearize
-from .dae import linearize_loop as linearize_loop
-from .dae import poles as poles
-from .dae import share_forces as share_forces
-from .dae import with_disturbance as with_disturbance
-from .diagrams.closed_loop import ClosedLoop as ClosedLoop
-from .diagrams.record import Record as Record
-from .diagrams.settings import LoopSettings as LoopSettings
-from .diagrams.wiring import make_closed_loop as make_closed_loop
-from .diagrams.wiring import wire_loop as wire_loop
-from .errors import DrakeDaeError as DrakeDaeError
-from .pictures.animation import make_animation as make_animation
-from .pictures.film import save_film as save_film
-from .pictures.runs import plot_runs as plot_runs
-from .references import CircleReference as CircleReference
-from .references import ConstantReference as ConstantReference
-from .references import CsvReference as CsvReference
-from .references import ExpressionReference as ExpressionReference
-from .references import LineReference as LineReference
-from .references import PathLimits as PathLimits
-from .references import PointToPointReference as PointToPointReference
-from .references import PolylineReference as PolylineReference
-from .references import Reference as Reference
-from .references import ReferenceRows as ReferenceRows
-from .references import SinusoidReference as SinusoidReference
-from .references import SpiralReference as SpiralReference
-from .references import WaypointsReference as WaypointsReference
-from .references import references_by_name as references_by_name
-from .robots.actuation.dc_motors import DcMotors as DcMotors
-from .robots.actuation.flexible_joints import FlexibleJoints as FlexibleJoints
-from .robots.actuation.hydraulics import ElectrohydraulicServos as ElectrohydraulicServos
-from .robots.constraints.alignment import AxisNormalToSurface as AxisNormalToSurface
-from .robots.constraints.couplers import JointCoupler as JointCoupler
-from .robots.constraints.loop_joints import PrismaticLoopJoint as PrismaticLoopJoint
-from .robots.constraints.loop_joints import RevoluteLoopJoint as RevoluteLoopJoint
-from .robots.constraints.points import FixedDistance as FixedDistance
-from .robots.constraints.points import PointOnSurface as PointOnSurface
-from .robots.constraints.rolling import Blade as Blade
-from .robots.constraints.rolling import RollingBall as RollingBall
-from .robots.constraints.rolling import RollingWheel as RollingWheel
-from .robots.constraints.welds import CoincidentPoints as CoincidentPoints
-from .robots.constraints.welds import WeldedFrames as WeldedFrames
-from .robots.force_outputs import ForceCombination as ForceCombination
-from .robots.force_outputs import ForceOutput as ForceOutput
-from .robots.force_outputs import NamedForce as NamedForce
-from .robots.force_outputs import Squeeze as Squeeze
-from .robots.joint_friction import JointFriction as JointFriction
-from .robots.known_forces import KnownForce as KnownForce
-from .robots.known_forces import KnownWrench as KnownWrench
-from .robots.links.multibody import MultibodyExpressions as MultibodyExpressions
-from .robots.links.textbook import LinkExpressions as LinkExpressions
-from .robots.model import RobotModel as RobotModel
-from .robots.outputs import AxisCoordinates as AxisCoordinates
-from .robots.outputs import ExpressionOutput as ExpressionOutput
-from .robots.outputs import JointPositions as JointPositions
-from .robots.outputs import PointCoordinates as PointCoordinates
-from .robots.outputs import SurfaceCoordinates as SurfaceCoordinates
-from .robots.outputs import TiltFromNormal as TiltFromNormal
-from .robots.surfaces.implicit import ImplicitSurface as ImplicitSurface
-from .robots.surfaces.measured import MeasuredSurface as MeasuredSurface
-from .robots.surfaces.surfaces import Cylinder as Cylinder
-from .robots.surfaces.surfaces import Ellipsoid as Ellipsoid
-from .robots.surfaces.surfaces import Plane as Plane
-from .robots.surfaces.surfaces import Sphere as Sphere
-from .robots.surfaces.surfaces import Torus as Torus
-from .running.bench.page import write_page as write_page
-from .running.export.export import export_code as export_code
-from .running.export.steps.controller import export_controller as export_controller
-from .running.export.wasm.wasm import export_wasm as export_wasm
-from .running.record_writer import RecordWriter as RecordWriter
-from .running.rollout.problems import start_values as start_values
-from .running.rollout.rollout import rollout as rollout
 from .running.simulate import simulate as simulate
-from .scenario.build import build_scenario as build_scenario
-from .scenario.commanded import build_commanded as build_commanded
-from .scenario.files import load_scenario as load_scenario
-from .scenario.model import complete_scenario as complete_scenario
-from .scenario.new import new_scenario as new_scenario
-from .scenario.scenario import scenario_schema as scenario_schema
-from .scenario.shipped import shipped_model as shipped_model
-from .scene.view import start_meshcat as start_meshcat
-from .studies.study import Study as Study
+from .running.rollout.rollout import rollout as rollout
+from .running import (
+    export_controller as export_controller,
+    write_page as write_page,
+)
+from .pictures import (
+    plot_runs as plot_runs,
+    make_animation as make_animation,
+)
+from .scenario import (
+    Scenario as Scenario,
+    load_scenario as load_scenario,
+    build_scenario as build_scenario,
+    new_scenario as new_scenario,
+    shipped_model as shipped_model,
+)
 from .studies.sweep import sweep as sweep
-from .studies.variations import grid_variations as grid_variations
-from .studies.variations import listed_variations as listed_variations
-from .studies.variations import random_variations as random_variations
-from .systems.control.commanded import CommandedReferences as CommandedReferences
-from .systems.control.contract import Controller as Controller
-from .systems.control.controller import TrackingController as TrackingController
-from .systems.control.drake_references import TrajectoryReference as TrajectoryReference
-from .systems.control.limits import ControlLimits as ControlLimits
-from .systems.control.references import ReferenceGenerator as ReferenceGenerator
-from .systems.control.sampling import ControlHold as ControlHold
-from .systems.control.sampling import Sampling as Sampling
-from .systems.observing.estimator import StateEstimator as StateEstimator
-from .systems.observing.observer import DisturbanceObserver as DisturbanceObserver
-from .systems.observing.observer_rates import Observing as Observing
-from .systems.plants.contact.compliant_plant import CompliantPlant as CompliantPlant
-from .systems.plants.contact.contact_material import ContactMaterial as ContactMaterial
-from .systems.plants.contact.contact_material import PointMaterial as PointMaterial
-from .systems.plants.contact.contact_plant import ContactPlant as ContactPlant
-from .systems.plants.contact.disturbance_forces import DisturbanceForce as DisturbanceForce
-from .systems.plants.contract import Plant as Plant
-from .systems.plants.dae_plant import DaePlant as DaePlant
-from .systems.plants.robot_plant import RobotPlant as RobotPlant
-from .systems.sensing.encoders import Encoders as Encoders
-from .systems.sensing.encoders import StateSensor as StateSensor
-from .systems.sensing.force_sensor import ForceSensor as ForceSensor
-from .systems.task.contacts import open_contact as open_contact
-from .systems.task.controller import TaskController as TaskController
-from .systems.task.phases import Approach as Approach
-from .systems.task.phases import Condition as Condition
-from .systems.task.phases import Dwell as Dwell
-from .systems.task.phases import Move as Move
-from .systems.task.phases import Press as Press
-from .systems.task.phases import Release as Release
-from .systems.task.phases import Retreat as Retreat
-from .systems.task.task import Task as Task
 
 __version__: str

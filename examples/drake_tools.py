@@ -26,7 +26,6 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_dae import (
     ConstantReference,
     ForceSensor,
-    LoopSettings,
     Plane,
     PointCoordinates,
     PointOnSurface,
@@ -39,6 +38,7 @@ from drake_dae import (
     shipped_model,
 )
 from drake_dae.dae import Structure
+from drake_dae.diagrams import LoopSettings
 
 LOW, HIGH = 0.0, 0.6
 """Heights of the tip, m."""

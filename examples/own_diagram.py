@@ -30,8 +30,8 @@ from drake_dae import (
     poles,
     rollout,
     shipped_model,
-    start_values,
 )
+from drake_dae.running import start_values
 
 DURATION, STEP = 2.0, 1e-3
 

@@ -20,6 +20,7 @@ import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
 
 import drake_dae as dd
+from drake_dae.dae import gain_coefficients
 
 
 def main(folder: Path) -> float:
@@ -46,7 +47,7 @@ def main(folder: Path) -> float:
         outputs=[dd.PointCoordinates("tip", "x")],
         nominal_positions=[-0.6, 1.0],
     )
-    law = dd.TrackingLaw(model.dae, dd.gain_coefficients([36.0, 9.0]))
+    law = dd.TrackingLaw(model.dae, gain_coefficients([36.0, 9.0]))
     loop = dd.make_closed_loop(
         dd.DaePlant(law.structure.system, structure=law.structure),
         law,

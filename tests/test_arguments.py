@@ -27,17 +27,29 @@ from pydrake.systems.framework import Context, Diagram, System
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 import drake_dae as dd
+from drake_dae.analysis import Analysis
 from drake_dae.analysis.report import Assumption
 from drake_dae.blocks.block import Block
-from drake_dae.dae import Derivatives, Elimination, Manifold, PinnedMotion, RankMargin
+from drake_dae.dae import (
+    Derivatives,
+    Elimination,
+    FeedbackGains,
+    Manifold,
+    PinnedMotion,
+    RankMargin,
+    SensedContact,
+    SensorNoise,
+    with_disturbance,
+)
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError
-from drake_dae.pictures.run_motion import ShownLoop
+from drake_dae.references import PathLimits
 from drake_dae.robots import Constraint, Links, Surface
-from drake_dae.scenario.robot_file.links import add_robot
+from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.systems import Controller, Observing, Plant, PointMaterial
 
 
 @cache
@@ -55,13 +67,13 @@ def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
 
 @cache
 def observed_law() -> dd.TrackingLaw:
-    dae = dd.with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
+    dae = with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
     return dd.TrackingLaw(dae, dd.poles(-4.0))
 
 
-def sensed() -> dd.SensedContact:
-    noise = dd.SensorNoise(1e-5, force=0.1)
-    return dd.SensedContact(1e-3, 1, 1e5, 0.03, 0.3, 0.7, 0.7, 5.0, noise, True)
+def sensed() -> SensedContact:
+    noise = SensorNoise(1e-5, force=0.1)
+    return SensedContact(1e-3, 1, 1e5, 0.03, 0.3, 0.7, 0.7, 5.0, noise, True)
 
 
 @cache
@@ -94,7 +106,7 @@ def _normal_form() -> dd.NormalForm:
 
 
 @cache
-def analysis() -> dd.Analysis:
+def analysis() -> Analysis:
     return dd.analyze(arm("two_link").model.dae, count=3)
 
 
@@ -119,27 +131,27 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     str: lambda: "tool",
     ca.SX: lambda: ca.SX.sym("p", 3),
     Block: lambda: loop().plant.block,
-    Assumption: lambda: SAMPLES[dd.Analysis]().assumptions[0],
+    Assumption: lambda: SAMPLES[Analysis]().assumptions[0],
     Diagram: lambda: loop().diagram,
-    dd.Analysis: analysis,
+    Analysis: analysis,
     dd.ClosedLoop: loop,
     dd.ContactMaterial: dd.ContactMaterial,
-    dd.PointMaterial: dd.PointMaterial,
-    dd.Controller: lambda: loop().controller,
-    dd.Plant: lambda: loop().plant,
+    PointMaterial: PointMaterial,
+    Controller: lambda: loop().controller,
+    Plant: lambda: loop().plant,
     dd.DaeSystem: lambda: arm("two_link").model.dae,
-    dd.FeedbackGains: lambda: law("two_link").gains,
+    FeedbackGains: lambda: law("two_link").gains,
     dd.Sampling: lambda: dd.Sampling(0.01),
     dd.Encoders: lambda: dd.Encoders(1e-5),
-    dd.Observing: lambda: dd.Observing(10.0),
-    dd.SensedContact: sensed,
-    dd.SensorNoise: lambda: dd.SensorNoise(),
+    Observing: lambda: Observing(10.0),
+    SensedContact: sensed,
+    SensorNoise: lambda: SensorNoise(),
     dd.NormalForm: normal_form,
     Manifold: lambda: arm("two_link").structure.manifold,
     Derivatives: lambda: arm("two_link").structure.derivatives,
     Elimination: lambda: arm("two_link").structure.elimination,
     RankMargin: lambda: arm("two_link").structure.control_margin,
-    dd.PathLimits: lambda: dd.PathLimits(0.2, 1.0),
+    PathLimits: lambda: PathLimits(0.2, 1.0),
     dd.Record: record,
     dd.ReferenceGenerator: lambda: loop().reference,
     dd.RobotModel: lambda: arm("two_link").model,
@@ -155,7 +167,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
     System: lambda: loop().diagram,
     Trajectory: lambda: PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]]),
-    ShownLoop: loop,
 }
 
 # What fits an argument with a name, of all names or of one.
@@ -179,7 +190,7 @@ PLACES: dict[str, Callable[[], Any]] = {
     "law of DisturbanceObserver": observed_law,
     "law of StateEstimator": observed_law,
     "gains of AdvisedGains": lambda: dd.contact_gains(1e5, 0.03, 1e-3),
-    "observing of StateEstimator": lambda: dd.Observing(10.0, state_rate=40.0),
+    "observing of StateEstimator": lambda: Observing(10.0, state_rate=40.0),
     "states of with_disturbance": lambda: ["joint1_w", "joint2_w"],
     "center": lambda: (0.0, 0.0, 0.0),
     "degrees": lambda: [2],

@@ -17,9 +17,7 @@ from drake_dae import (
     FlexibleJoints,
     ForceSensor,
     JointPositions,
-    MultibodyExpressions,
     NormalForm,
-    Observing,
     Parameter,
     PointToPointReference,
     Record,
@@ -30,24 +28,23 @@ from drake_dae import (
     TrackingLaw,
     build_scenario,
     dynamic_extension,
-    export_code,
     find_structure,
     load_scenario,
     make_animation,
     poles,
     simulate,
-    start_values,
-    with_disturbance,
 )
 from drake_dae.arrays import brief, numbers
 from drake_dae.cli import main
-from drake_dae.dae import Signal
+from drake_dae.dae import Signal, with_disturbance
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
-from drake_dae.pictures.axes import labelled
-from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.robots import MultibodyExpressions
+from drake_dae.running import export_code, start_values
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.typed_yaml import load_yaml
+from drake_dae.systems import Observing
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
@@ -327,10 +324,6 @@ def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
         Record.load(tmp_path / "record.npz")
     with pytest.raises(ModelError, match="nowhere"):
         Record.load("nowhere")
-
-
-def test_dollars_in_names_are_no_mathematics():
-    assert labelled(Signal("$x^$", "m")) == r"\$x^\$ [m]"
 
 
 def test_a_folder_that_is_none(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""Limits of signals: their ranges, which is exceeded most, and what slower references change."""
+"""Limits of a robot: which is exceeded most along a motion, and what slower references change."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,9 +9,12 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.analysis.tables import digits
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import DaeSystem, PinnedMotion, Signal, Structure
 from drake_dae.dae.zero_dynamics.pinned_outputs import PinnedOutputs
+from drake_dae.diagrams.record import Record
+from drake_dae.errors import ModelError
+from drake_dae.robots import FrictionCone, RobotModel
 
 SLACK, CLOSE = 1e-9, 1e-6
 """The share by which a limit may be passed, since a start may be on it; and the relative accuracy
@@ -29,17 +32,38 @@ class LimitKind(StrEnum):
     CONE = "friction cone"
 
 
+@dataclass(frozen=True)
+class Excess:
+    """A signal where it exceeds its limit most: its value, the time in s, and the limit.
+
+    The limit is 0 for a force that can only push, and for |F_t| - mu F_n of a friction cone.
+    """
+
+    signal: Signal
+    kind: LimitKind
+    value: float
+    time: float
+    limit: float
+
+    def __str__(self) -> str:
+        name, unit = self.signal.name, f" {self.signal.unit}".rstrip()
+        value, limit = f"{abs(self.value):.4g}{unit}", f"{abs(self.limit):.4g}{unit}"
+        if self.kind is LimitKind.POSITION:
+            value, limit = f"{digits(self.value)}{unit}", f"{digits(self.limit)}{unit}"
+            return f"{name} comes to {value} at {self.time:.4g} s, beyond its limit of {limit}"
+        if self.kind is LimitKind.CONE:
+            return f"{name} is left by {value} at {self.time:.4g} s"
+        if not self.limit:
+            return f"{name} would pull with {value} at {self.time:.4g} s: a real contact opens"
+        share = f"{self.value / self.limit:.3g} times its limit of {limit}"
+        return f"{name} has {value} at {self.time:.4g} s, {share}"
+
+
 @dataclass(frozen=True, eq=False)
 class SignalRange:
-    """One signal along a motion, beside its limits.
+    """The least and the largest value of a signal along a motion with their times, and its limits.
 
-    Attributes:
-        signal: Name and unit.
-        kind: What the limit is on.
-        least, least_time: The lowest value, and when in s.
-        largest, largest_time: The highest value, and when in s.
-        low, high: The limits; infinite without a limit.
-        beyond_time: The first time beyond a limit, in s; None if there is none.
+    `beyond_time` is the first time beyond a limit, None if there is none.
     """
 
     signal: Signal
@@ -65,7 +89,7 @@ class SignalRange:
             return float(1.0 - np.float64(2.0 * self.room) / (self.high - self.low))
 
     @property
-    def excess(self) -> "Excess | None":
+    def excess(self) -> Excess | None:
         """Where it is beyond its limits most; None if it keeps them."""
         if self.beyond_time is None:
             return None
@@ -86,41 +110,12 @@ class SignalRange:
         }
 
 
-@dataclass(frozen=True)
-class Excess:
-    """A signal where it exceeds its limit most: its value, the time in s, and the limit.
-
-    The limit is 0 for a force that can only push, and for |F_t| - mu F_n of a friction cone, which
-    is then positive.
-    """
-
-    signal: Signal
-    kind: LimitKind
-    value: float
-    time: float
-    limit: float
-
-    def __str__(self) -> str:
-        name, unit = self.signal.name, f" {self.signal.unit}".rstrip()
-        value, limit = f"{abs(self.value):.4g}{unit}", f"{abs(self.limit):.4g}{unit}"
-        if self.kind is LimitKind.POSITION:
-            value, limit = f"{digits(self.value)}{unit}", f"{digits(self.limit)}{unit}"
-            return f"{name} comes to {value} at {self.time:.4g} s, beyond its limit of {limit}"
-        if self.kind is LimitKind.CONE:
-            return f"{name} is left by {value} at {self.time:.4g} s"
-        if not self.limit:
-            return f"{name} would pull with {value} at {self.time:.4g} s: a real contact opens"
-        share = f"{self.value / self.limit:.3g} times its limit of {limit}"
-        return f"{name} has {value} at {self.time:.4g} s, {share}"
-
-
 class SignalLimits:
     """Limits low <= s <= high of signals s(x, u, lambda), where lambda are all constraint forces.
 
     Args:
         system: The system.
-        signals: Names and units of s, k of them.
-        kinds: What each limit is on.
+        signals, kinds: Names and units of s, k of them, and what each limit is on.
         values: s, shape (k, 1), in `system.state` and the symbols.
         bounds: low and high, shape (2, k), infinite without a limit.
         symbols: Those of u and lambda.
@@ -138,57 +133,106 @@ class SignalLimits:
         self.system, self.bounds = system, bounds
         self.signals, self.kinds = tuple(signals), tuple(kinds)
         (u, force), v, values = symbols, ca.SX.sym("v", system.num_constraints), ca.densify(values)
-        self.values = system.trace("limited", {"s": values}, {"u": u, "force": force})
+        self._values = system.trace("limited", {"s": values}, {"u": u, "force": force})
         pinned = {"s": ca.substitute(values, force, system.forces(v))}
         self.pinned_values = system.trace("limited", pinned, {"u": u, "v": v})
 
+    def of_motion(self, motion: PinnedMotion) -> FloatArray:
+        """The rows of s along a motion with pinned outputs."""
+        rows = motion.states, motion.controls, motion.constraint_inputs, motion.parameters
+        return np.array([self.pinned_values(*row)[0].copy() for row in zip(*rows, strict=True)])
+
+    def of_record(self, record: Record) -> FloatArray:
+        """The rows of s in a record of the system."""
+        signals = (record["state"], record["control"], record["constraint_force"])
+        p = self.system.parameter_values
+        rows = [self._values(*row, p)[0].copy() for row in zip(*signals, strict=True)]
+        return np.array(rows).reshape(len(rows), len(self.signals))
+
     def ranges(self, times: FloatArray, values: FloatArray) -> tuple[SignalRange, ...]:
         """The range of each signal along rows of s, with times."""
-        if not times.size:
-            return ()
         found = []
-        for i, (signal, kind) in enumerate(zip(self.signals, self.kinds, strict=True)):
-            column, (low, high) = values[:, i], self.bounds[:, i]
+        for i in range(len(self.signals) if times.size else 0):
+            column, (low, high) = values[:, i], self.bounds[:, i].tolist()
             size = np.max(np.abs(column))
             # The first of those that differ by round-off.
             least = int(np.argmax(column <= column.min() + SLACK * size))
             largest = int(np.argmax(column >= column.max() - SLACK * size))
             slack = SLACK * max(1.0, size)
             beyond = (column < low - slack) | (column > high + slack)
-            found.append(
-                SignalRange(
-                    signal,
-                    kind,
-                    least=float(column[least]),
-                    least_time=float(times[least]),
-                    largest=float(column[largest]),
-                    largest_time=float(times[largest]),
-                    low=float(low),
-                    high=float(high),
-                    beyond_time=float(times[np.argmax(beyond)]) if beyond.any() else None,
-                )
-            )
+            lowest, highest = ((float(column[k]), float(times[k])) for k in (least, largest))
+            first = float(times[np.argmax(beyond)]) if beyond.any() else None
+            of = self.signals[i], self.kinds[i]
+            found.append(SignalRange(*of, *lowest, *highest, low, high, first))
         return tuple(found)
 
-    def worst(self, values: FloatArray, times: FloatArray, sizes: FloatArray) -> Excess | None:
-        """The largest excess of rows of s, as a share of its limit, or of `sizes` for 0.
+    def worst(self, times: FloatArray, values: FloatArray) -> Excess | None:
+        """The largest excess that depends on the pace, as a share of its limit.
 
-        Positions are left out, which do not depend on the pace.
+        Of a limit of 0 the share is that of the signal's largest value.
         """
-        paced = np.array([kind is not LimitKind.POSITION for kind in self.kinds])
-        sizes = np.where(self.bounds == 0.0, sizes, np.abs(self.bounds))
-        over = np.array([self.bounds[0] - values, values - self.bounds[1]])
-        with np.errstate(invalid="ignore", divide="ignore"):  # -inf / inf without a limit.
-            shares = np.nan_to_num(over / sizes[:, None, :], nan=-np.inf)
-        shares[over <= SLACK] = -np.inf
-        shares[:, :, ~paced] = -np.inf
-        most = shares.max(initial=-np.inf)
-        if not most > SLACK:
-            return None
-        # The first of those that differ by round-off.
-        side, row, i = np.argwhere(shares >= most - SLACK * abs(most))[0]
-        limit, value = float(self.bounds[side, i]), float(values[row, i])
-        return Excess(self.signals[i], self.kinds[i], value, float(times[row]), limit)
+        ranges = [r for r in self.ranges(times, values) if r.kind is not LimitKind.POSITION]
+        shares = {
+            excess: abs(excess.value - excess.limit)
+            / (abs(excess.limit) or max(abs(r.least), abs(r.largest)))
+            for r in ranges
+            if (excess := r.excess)
+        }
+        return max(shares, key=lambda excess: shares[excess], default=None)
+
+
+def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> SignalLimits:
+    """The limits of drives, joint forces, positions, speeds, pushing forces and friction cones.
+
+    Raises:
+        ModelError: A cone, of a contact that must not slide, names a force that is not there.
+    """
+    dae, links, loops = model.dae, model.links, model.loop_joints
+    control = ca.SX.sym("u", dae.num_controls)
+    force, forces = ca.SX.sym("force", len(dae.force_signals)), dae.force_signals
+    names = [signal.name for signal in forces]
+    nq, nv = links.q.numel(), links.v.numel()
+    q, v = slice(nq), slice(nq, nq + nv)
+    half = len(loops.signals) // 2
+    pushes = {
+        signal.name
+        for constraint in model.constraints
+        for signal, is_one in zip(constraint.force_signals, constraint.is_unilateral, strict=True)
+        if is_one
+    }
+    most, effort, (low, high) = model.control_limits, links.effort_limits, loops.limits
+    least, free = (
+        [0.0 if name in pushes else -np.inf for name in names],
+        np.full(len(names), np.inf),
+    )
+    groups: list[tuple[LimitKind, Sequence[Signal], ca.SX, Any, Any]] = [
+        (LimitKind.CONTROL, dae.control_signals, control, -most, most),
+        (LimitKind.EFFORT, links.actuator_signals, model.joint_force, -effort, effort),
+        (LimitKind.POSITION, dae.state_signals[q], dae.state[q], *links.position_limits),
+        (LimitKind.SPEED, dae.state_signals[v], dae.state[v], *links.velocity_limits),
+        (LimitKind.POSITION, loops.signals[:half], loops.state[:half], low[:half], high[:half]),
+        (LimitKind.SPEED, loops.signals[half:], loops.state[half:], low[half:], high[half:]),
+        (LimitKind.FORCE, forces, force, least, free),
+    ]
+    for cone in cones:
+        for name in (cone.normal, *cone.tangents):
+            if name not in names:
+                raise ModelError(unknown_name("constraint force", name, names))
+        normal = names.index(cone.normal)
+        tangents = ca.norm_2(force[[names.index(name) for name in cone.tangents]])
+        signal = Signal(f"the friction cone of {cone.normal}", forces[normal].unit)
+        value = tangents - cone.limit * force[normal]
+        groups.append((LimitKind.CONE, [signal], value, [-np.inf], [0.0]))
+    groups = [group for group in groups if group[2] is not None]  # Rigid joints have no stages.
+    bounds = [np.array([low, high], dtype=float).reshape(2, -1) for *_, low, high in groups]
+    return SignalLimits(
+        dae,
+        [signal for _, signals, *_ in groups for signal in signals],
+        [kind for kind, signals, *_ in groups for _ in signals],
+        ca.vertcat(*(values for *_, values, _, _ in groups)),
+        np.hstack(bounds),
+        (control, force),
+    )
 
 
 @dataclass(frozen=True)
@@ -225,10 +269,7 @@ def limits_along(
     motion is that along the reference t -> R(t), of `ZeroDynamics.motion`.
     """
     times, p, layout, system = motion.times, motion.parameters, structure.layout, structure.system
-    rows = zip(motion.states, motion.controls, motion.constraint_inputs, p, strict=True)
-    values = np.array([limits.pinned_values(*row)[0].copy() for row in rows])
-    sizes = np.abs(values).max(axis=0, initial=0.0)
-    excess = limits.worst(values, times, sizes) if values.size else None
+    excess = limits.worst(times, limits.of_motion(motion))
     if excess is None:
         return None
     if system.exogenous.moving or structure.zero_dynamics_dimension:
@@ -245,16 +286,16 @@ def limits_along(
         goal[commanded] *= force
         at = pinned.at(goal, p[i])
         point = at.point(at.state(motion.states[i]))
-        return limits.pinned_values(point.state, point.control, point.constraint_input, p[i])[0]
+        values = limits.pinned_values(point.state, point.control, point.constraint_input, p[i])
+        return values[0].copy()
 
     def worst(rate: float, chosen: Sequence[int] = range(times.size)) -> Excess | None:
-        every = np.array([slowed(i, rate).copy() for i in chosen])
-        return limits.worst(every, times[list(chosen)], sizes)
+        return limits.worst(times[list(chosen)], np.array([slowed(i, rate) for i in chosen]))
 
     if (rest := worst(0.0)) is not None:
         i, column = int(np.searchsorted(times, rest.time)), limits.signals.index(rest.signal)
         alone = slowed(i, 0.0, force=0.0)[column]
-        alone *= abs(alone) > SLACK * sizes[column]  # Else round-off.
+        alone *= abs(alone) > SLACK * abs(rest.value)  # Else round-off.
         text = f"slower references do not help: at rest {rest}; by gravity alone it has {alone:.4g}"
         return LimitsAlong(excess, None, f"{text} {rest.signal.unit}".rstrip())
     rate, now = 1.0, worst(1.0)

@@ -1,0 +1,6 @@
+"""Blocks, blocks made from diagrams, and Drake systems made from blocks."""
+
+import lazy_loader
+
+# The names stand in __init__.pyi, and are loaded when they are asked for.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
-from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.run_pictures import ANIMATION
+from drake_dae.pictures import ANIMATION, PLOTS
 
 SCENARIO, SUMMARY, RECORD = "scenario.yaml", "summary.txt", "record.npz"
 PART = "record.part"
@@ -40,7 +39,8 @@ def runs_by_name(paths: Sequence[Path]) -> dict[str, Path]:
         ModelError: A run is named twice.
     """
     if len(set(paths)) < len(paths):
-        raise ModelError("a run is named twice; name each run once")
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise ModelError(f"the run '{twice}' is named twice; name each run once")
     names = Counter(path.name for path in paths)
     return {path.name if path.name and names[path.name] == 1 else str(path): path for path in paths}
 

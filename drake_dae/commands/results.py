@@ -11,12 +11,9 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.files import check_unwritten, complete
-from drake_dae.pictures.film import save_film
-from drake_dae.pictures.plots import PLOTS
-from drake_dae.pictures.run_pictures import save_run_plots
-from drake_dae.pictures.runs import plot_runs
+from drake_dae.pictures import PLOTS
 from drake_dae.scenario.build import build_scenario
-from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.scenario import load_scenario
 
 
 def _plot_options(parser: Parser) -> None:
@@ -27,8 +24,8 @@ def _plot_options(parser: Parser) -> None:
     parser.flag("--all", "all plots of each run, into its folder, as write.plots=true does")
     parser.flag(
         "--film",
-        "the robot as it moves, with the paths and the forces of its contacts: a .gif or .mp4 (by "
-        "ffmpeg), or a .png for four moments side by side",
+        "the robot as it moves, with the paths and the forces of its contacts: a .gif, or a .png "
+        "for four moments side by side",
     )
     parser.out("FILE", "a .png, .pdf or .svg (default: plot.png), or the film (film.gif)")
 
@@ -48,6 +45,8 @@ def _plot(options: argparse.Namespace) -> int:
         raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
     check_unwritten([path], options.force)
     names = [name for text in options.signals for name in text.split(",") if name]
+    from drake_dae.pictures.plots import plot_runs
+
     figure = plot_runs({n: load_run(run) for n, run in runs.items()}, names, options.errors)
     with complete(path.parent, path.name) as place:
         figure.savefig(place / path.name, dpi=110)
@@ -56,11 +55,13 @@ def _plot(options: argparse.Namespace) -> int:
 
 
 def _plot_all(options: argparse.Namespace, runs: dict[str, Path]) -> int:
+    from drake_dae.pictures.plots import save_plots
+
     check_unwritten((folder / name for folder in runs.values() for name in PLOTS), options.force)
     for folder in runs.values():
         with waiting(f"drawing {folder}"):
             loop, context, record = _run_again(folder)
-            save_run_plots(record, loop, context, folder, loop.predicted_error(record))
+            save_plots(loop, record, context, folder)
         written = [name for name in PLOTS if (folder / name).exists()]
         print(f"written to {folder}/: {', '.join(written)}")
     return 0
@@ -69,6 +70,8 @@ def _plot_all(options: argparse.Namespace, runs: dict[str, Path]) -> int:
 def _film(options: argparse.Namespace, runs: dict[str, Path]) -> int:
     if len(runs) > 1:
         raise ModelError(f"a film is of one run, got {', '.join(runs)}")
+    from drake_dae.pictures.film import save_film
+
     (folder,) = runs.values()
     path: Path = options.out or folder / "film.gif"
     check_unwritten([path], options.force)

@@ -19,10 +19,9 @@ from drake_dae.files import check_unwritten
 from drake_dae.robots import Vector
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.files import load_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
 from drake_dae.scenario.new import new_scenario
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, load_scenario
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.scenario.start import start_scenario
 

@@ -23,15 +23,15 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter, Recorded
 from drake_dae.errors import DrakeDaeError, ScenarioError, describe_os_error
 from drake_dae.files import check_folder, check_unwritten, complete
-from drake_dae.pictures.run_pictures import ANIMATION, save_animation, save_run_plots
+from drake_dae.pictures import ANIMATION
+from drake_dae.pictures.animation import make_animation
 from drake_dae.running.interruption import Interruption, end_at_once, ending_signals
 from drake_dae.running.record_writer import RecordWriter
 from drake_dae.running.simulate import RunStatistics, simulate
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.files import load_scenario, save_scenario
 from drake_dae.scenario.judging import judge_run
-from drake_dae.scenario.scenario import Scenario, scenario_data
+from drake_dae.scenario.scenario import Scenario, load_scenario, save_scenario, scenario_data
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scene.view import start_meshcat
@@ -212,14 +212,15 @@ class _Run:
         try:
             if ending.signal is not None:
                 end_at_once(ending.signal)
-            drawn = record, self.loop, self.context, self.folder
+            drawn = self.loop, record, self.context
             is_drawn = not failure.startswith("interrupted")
             with waiting("drawing"):
                 if wanted.plots and is_drawn:
-                    predicted = self.loop.predicted_error(record)
-                    self._attempt(save_run_plots, *drawn, predicted, summary.accuracy)
+                    from drake_dae.pictures.plots import save_plots  # Matplotlib takes a second.
+
+                    self._attempt(save_plots, *drawn, self.folder, summary.accuracy)
                 if wanted.animation and is_drawn:
-                    self._attempt(save_animation, *drawn, self.title)
+                    self._attempt(self._write_animation, *drawn)
         finally:
             written = [name for name in (*FILES, PART) if (self.folder / name).exists()]
             self._attempt(self._tell, summary, written)
@@ -245,6 +246,11 @@ class _Run:
                 writer.finish(self.context)  # The rows that still fit.
             raise
         writer.path.unlink(missing_ok=True)
+
+    def _write_animation(self, loop: ClosedLoop, record: Record, context: Context) -> None:
+        with complete(self.folder, ANIMATION) as place:
+            page = make_animation(loop, record, context, self.title)
+            (place / ANIMATION).write_text(page, encoding="utf-8")
 
     def _write_summary(self, text: str) -> None:
         with complete(self.folder, SUMMARY) as place:

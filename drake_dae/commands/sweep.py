@@ -11,7 +11,7 @@ from drake_dae.arrays import number_in
 from drake_dae.commands.parser import Parser
 from drake_dae.errors import ModelError
 from drake_dae.files import check_folder
-from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.scenario import load_scenario
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.studies.runs import Outcome
 from drake_dae.studies.study import FILES

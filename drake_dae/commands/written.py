@@ -12,7 +12,7 @@ from drake_dae.running.export.export import export_code
 from drake_dae.running.export.steps.controller import export_controller
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.commanded import build_commanded
-from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.scenario import load_scenario
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 
 

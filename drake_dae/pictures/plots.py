@@ -1,242 +1,184 @@
-"""Plots of a run."""
+"""Plots of one run, and of signals of several runs over each other."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Signal
-from drake_dae.diagrams.record import Record
-from drake_dae.pictures.axes import (
-    decades,
-    flatten,
-    grid,
-    labelled,
-    legend,
-    round_off,
-    short,
-    squares,
-)
-from drake_dae.pictures.event_marks import mark_events, mark_labels, mark_phases
-from drake_dae.pictures.moments import RunEvent
-from drake_dae.running.judgement import ROUND_OFF, output_sizes
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record, Recorded
+from drake_dae.errors import ModelError
+from drake_dae.files import complete
+from drake_dae.pictures.events import RunEvent, events_of, kinds_of
+from drake_dae.pictures.motion import ContactPath, contact_paths, follow
+from drake_dae.running.judgement import output_sizes
+from drake_dae.running.phases import phase_spans
 
-if TYPE_CHECKING:  # Loaded with the first figure: most runs draw none.
-    from matplotlib.figure import Figure
+_FIRST = ("controlled_output", "constraint_force", "control", "state")
+"""The signals in which an entry's name is looked up first; of these the first has the outputs."""
 
-    from drake_dae.pictures.run_motion import ContactPath
+_DERIVED = ("desired_output", "tracking_error", "predicted_error")
+"""Signals whose entries have the names of the outputs, and are drawn with these."""
 
-PATHS = "path.png"
-"""The plot of contact points that move on surfaces; omitted if there are none."""
+_LEFT, _RIGHT, _ABOVE, _BELOW = 0.85, 0.2, 0.3, 0.5
+"""The space around axes, in inches: for tick labels, the title, and the label of the time."""
 
-PLOTS = ("outputs.png", "errors.png", "residual.png", "controls.png", PATHS)
-"""The files that `save_plots` writes."""
+_LINE, _HANDLE, _LETTER, _PHASE = 0.2, 0.65, 0.075, 0.11
+"""In inches: the height of a legend's line, the width of its sample of a curve and of a letter, and
+the width of a phase's name, which is vertical."""
 
-HELD = 1e-4
-"""An output with a constant reference is listed as held instead of drawn, if its error relative to
-its size is at most this."""
+_WIDE: dict[str, Any] = {"linewidth": 4, "alpha": 0.4}
+"""The style of predicted errors and desired paths, below the narrow actual ones."""
 
-_DPI = 110
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+Entry = tuple[str, int]
+"""The name of a record's signal, and the index of an entry in it."""
+
+
+class ShownFigure(Figure):
+    """A figure that a notebook displays, with or without Matplotlib's inline mode."""
+
+    def _repr_png_(self) -> bytes:
+        file = BytesIO()
+        self.savefig(file, format="png", dpi=110)
+        return file.getvalue()
+
+
+@checked(ModelError)
+def plot_runs(
+    records: Mapping[str, Record], names: Sequence[str] = (), errors: bool = False
+) -> Figure:
+    """Plots signals of several runs over each other, outputs with dashed references.
+
+    A notebook displays the figure; its `savefig` writes a file. If there is only one run, its
+    phases and contact events are marked.
+
+    Args:
+        records: Label of a run -> its record.
+        names: The names of signals of the records, as "control", or of single entries, as
+            "wall.force". If several signals have an entry with the same name, write the signal
+            before it, as "state/joint1". All outputs are drawn if there are no names.
+        errors: Whether to draw |z - r| of outputs on a log scale, over the predicted error.
+
+    Raises:
+        ModelError: There is no run, a run has no such signal, or `errors` is set for a signal that
+            is not an output.
+    """
+    if not records:
+        raise ModelError("there is no run to draw")
+    first = next(iter(records.values()))
+    names = names or _FIRST[:1]
+    entries = [entry for name in names for entry in _entries(first, name)]
+    if not entries:
+        raise ModelError(f"there is nothing to draw: '{', '.join(names)}' is empty")
+    for group, index in entries:
+        signal = first.signals[group].signals[index]
+        if errors and group != _FIRST[0]:
+            raise ModelError(f"an error is that of an output, and {signal.name} is none")
+        for label, record in records.items():
+            if group not in record.signals or signal not in record.signals[group].signals:
+                unit = signal.unit or "1"
+                raise ModelError(f"the run '{label}' has no {group} '{signal.name}' in {unit}")
+    return _draw(records, entries, errors, events_of(first) if len(records) == 1 else ())
 
 
 def save_plots(
+    loop: ClosedLoop,
     record: Record,
-    predicted: FloatArray,
-    limits: FloatArray | None,
-    folder: str | Path,
-    paths: Sequence[ContactPath] = (),
+    context: Context,
+    folder: Path,
     accuracy: float | None = None,
-    events: Sequence[RunEvent] = (),
-) -> list[Path]:
-    """Writes the plots of a run as PNG files: outputs, errors, residual, controls, paths.
+) -> None:
+    """Writes the plots of a run as PNG files, `PLOTS`.
 
     Args:
-        record: A record with desired_output, controlled_output, constraint_residual and control.
+        loop: The loop of a robot.
+        record: The record of a run of this loop.
+        context: The context of its diagram, which contains the parameters; not changed.
+        folder: The folder to write to.
+        accuracy: The accuracy of the integrator; None with fixed steps.
+
+    Raises:
+        OSError: They cannot be written.
+    """
+    motion, predicted = follow(loop, record, context), loop.predicted_error(record)
+    events, limits = events_of(record, motion.model), motion.model.control_limits
+    figures = figures_of_run(record, predicted, limits, accuracy, events)
+    if paths := contact_paths(motion):
+        figures["path.png"] = plot_paths(paths)
+    with complete(folder, *figures) as place:
+        for name, figure in figures.items():
+            figure.savefig(place / name, dpi=110)
+
+
+def figures_of_run(
+    record: Record,
+    predicted: FloatArray,
+    limits: FloatArray | None = None,
+    accuracy: float | None = None,
+    events: Sequence[RunEvent] = (),
+) -> dict[str, Figure]:
+    """Name of a file -> its figure: outputs, errors, residual and controls of one run.
+
+    Args:
+        record: The record.
         predicted: The predicted tracking error, shape (k, p).
         limits: The largest |u|, shape (p,), inf for an actuator without a limit; None without any.
-        folder: The folder to write to.
-        paths: The paths of contact points on surfaces; if empty, no such plot is written.
-        accuracy: The accuracy of the integrator; None with fixed steps.
+        accuracy: The accuracy of the integrator, below which errors are grey; None with fixed
+            steps.
         events: The events of the run, marked on the time axes.
-
-    Returns:
-        The files.
     """
-    figures = [
-        plot_outputs(record, predicted, events),
-        plot_errors(record, predicted, accuracy, events),
-        plot_residual(record, events),
-        plot_controls(record, limits, events),
-    ]
-    for figure in figures:
-        mark_phases(figure, record)
-    if paths:
-        figures.append(plot_paths(paths))
-    files = [Path(folder) / name for name in PLOTS[: len(figures)]]
-    for file, figure in zip(files, figures, strict=True):
-        figure.savefig(file, dpi=_DPI)
-    return files
+    outputs = record.signals["controlled_output"].signals
+    signals = {**record.signals, "predicted_error": Recorded(predicted, outputs)}
+    run = {"actual": replace(record, signals=signals)}
+    accurate_to = None if accuracy is None else accuracy * output_sizes(record, predicted)
+    figures = {}
+    if entries := _entries(record, "controlled_output"):
+        figures["outputs.png"] = _draw(run, entries, False, events)
+        figures["errors.png"] = _draw(run, entries, True, events, accurate_to=accurate_to)
+    figures["residual.png"] = _plot_residual(record, events)
+    if entries := _entries(record, "control"):
+        figures["controls.png"] = _draw(run, entries, False, events, limits)
+    return figures
 
 
-def plot_outputs(record: Record, predicted: FloatArray, events: Sequence[RunEvent] = ()) -> Figure:
-    """Plots the controlled outputs, with dashed references; lists held outputs below as text.
-
-    Args:
-        record: A record with controlled_output and desired_output.
-        predicted: The predicted tracking error, shape (k, p).
-        events: The events of the run.
-    """
-    values = record["controlled_output"]
-    desired = record["desired_output"]
-    signals = record.signals["controlled_output"].signals
-    size = output_sizes(record, predicted)
-    error = np.max(np.abs(values - desired), axis=0, initial=0.0)
-    is_held = (np.ptp(desired, axis=0) == 0.0) & (error <= HELD * size)
-    drawn = np.flatnonzero(~is_held)
-    figure, axes = grid(
-        [labelled(signals[i]) for i in drawn],
-        ("actual", "reference", *mark_labels(events)) if len(drawn) else (),
-        [
-            f"{signals[i].name} = {short(desired[0, i])} {signals[i].unit}".rstrip()
-            + (f" (within {short(error[i], 1)})" if error[i] > ROUND_OFF * size[i] else "")
-            for i in np.flatnonzero(is_held)
-        ],
-        "held: ",
-    )
-    for axis, i in zip(axes, drawn, strict=False):
-        axis.plot(record.time, values[:, i], color="C0", label="actual")
-        axis.plot(record.time, desired[:, i], color="C1", linestyle="--", label="reference")
-    mark_events(axes, events)
-    if len(drawn):
-        legend(figure, axes[0])
-    return figure
-
-
-def plot_errors(
-    record: Record,
-    predicted: FloatArray,
-    accuracy: float | None = None,
-    events: Sequence[RunEvent] = (),
-) -> Figure:
-    """Plots |z - r| of each output on a log scale, over the predicted error.
-
-    Errors below the integrator's accuracy are in a grey region. An output whose predicted and
-    actual errors are below it all the time is listed below as text.
-
-    Args:
-        record: A record with controlled_output and desired_output.
-        predicted: The predicted tracking error, shape (k, p).
-        accuracy: The accuracy of the integrator; None with fixed steps.
-        events: The events of the run.
-    """
-    values = record["controlled_output"]
-    errors = np.abs(values - record["desired_output"])
-    signals = record.signals["controlled_output"].signals
-    size = output_sizes(record, predicted)
-    accurate_to = (accuracy or 0.0) * size
-    largest = np.max(np.maximum(errors, np.abs(predicted)), axis=0, initial=0.0)
-    drawn = np.flatnonzero((largest > accurate_to) | (accuracy is None))
-    label = "below the integrator's accuracy" if accuracy is not None else "round-off"
-    titles = [labelled(Signal(f"|error of {signals[i].name}|", signals[i].unit)) for i in drawn]
-    figure, axes = grid(
-        titles,
-        ("predicted", "actual", label, *mark_labels(events)) if len(drawn) else (),
-        [
-            f"{signals[i].name} ("
-            + (
-                f"{short(largest[i], 1)} {signals[i].unit}".rstrip()
-                if largest[i] > ROUND_OFF * size[i]
-                else "round-off"
-            )
-            + ")"
-            for i in range(len(signals))
-            if i not in drawn
-        ],
-        f"below the integrator's accuracy of {short(accuracy or 0.0)} all the time: ",
-    )
-    for axis, i in zip(axes, drawn, strict=False):
-        floor = round_off(values[:, i])
-        for data, style in (
-            (
-                np.abs(predicted[:, i]),
-                {"color": "C1", "linewidth": 4, "alpha": 0.5, "label": "predicted"},
-            ),
-            (errors[:, i], {"color": "C0", "label": "actual"}),
-        ):
-            axis.semilogy(record.time, np.maximum(data, floor), **style)
-        if accuracy is None:
-            axis.axhline(floor, color="0.5", linestyle=":", label=label)
-        else:
-            axis.axhspan(floor / 3.0, accurate_to[i], color="0.88", zorder=0.5, label=label)
-        decades(axis, floor)
-    mark_events(axes, events)
-    if len(drawn):
-        legend(figure, axes[0])
-    return figure
-
-
-def plot_residual(record: Record, events: Sequence[RunEvent] = ()) -> Figure:
+def _plot_residual(record: Record, events: Sequence[RunEvent]) -> Figure:
     """Plots the constraint functions and their derivatives after each step, before projection."""
-    values = np.abs(record["constraint_residual"])
-    labels = [labelled(signal) for signal in record.signals["constraint_residual"].signals]
-    title = "|constraint residual|, before each step's projection"
-    figure, (axis,) = grid([title], (*labels, "round-off", *mark_labels(events)))
+    residual = record.signals["constraint_residual"]
+    labels = [_labelled(signal) for signal in residual.signals]
+    kinds = [kind.label for kind in kinds_of(events)]
+    title = "|constraint residual| after each step"
+    figure, (axis,) = _figure([title], [*labels, "round-off", *kinds])
     floor = round_off(np.ones(1))
-    for i, label in enumerate(labels):
-        axis.semilogy(record.time, np.maximum(values[:, i], floor), label=label)
+    for label, values in zip(labels, residual.values.T, strict=True):
+        axis.semilogy(record.time, np.maximum(np.abs(values), floor), label=label)
     axis.axhline(floor, color="0.5", linestyle=":", label="round-off")
     axis.set_yscale("log")
-    decades(axis, floor)
-    mark_events([axis], events)
-    legend(figure, axis)
-    return figure
-
-
-def plot_controls(
-    record: Record, limits: FloatArray | None = None, events: Sequence[RunEvent] = ()
-) -> Figure:
-    """Plots the controls, with those limits of the actuators that are near the values."""
-    values = record["control"]
-    signals = record.signals["control"].signals
-    bounds = np.full(len(signals), np.inf) if limits is None else limits
-    figure, axes = grid(
-        [
-            labelled(signal) + (f", limit ±{bound:g}" if np.isfinite(bound) else "")
-            for signal, bound in zip(signals, bounds, strict=True)
-        ],
-        marks := mark_labels(events),
-    )
-    mark_events(axes, events)
-    if axes and marks:
-        legend(figure, axes[0])
-    for i, axis in enumerate(axes):
-        axis.plot(record.time, values[:, i], color="C0")
-        scale = max(np.max(np.abs(values[:, i])), 1e-3)
-        flatten(axis, values[:, i], 1e-5 * scale, 0.05 * scale)
-        low, high = axis.get_ylim()
-        margin = 0.5 * (high - low)
-        for bound in (-bounds[i], bounds[i]):
-            if low - margin <= bound <= high + margin:
-                axis.axhline(bound, color="C3", linestyle=":")
+    _set_decades(axis, floor)
+    _mark(figure, record, events)
+    _add_legend(figure)
     return figure
 
 
 def plot_paths(paths: Sequence[ContactPath]) -> Figure:
     """Plots the actual over the desired paths of points on surfaces, seen from the free side."""
-    figure, axes = squares(
-        [f"path on {labelled(Signal(path.name))}" for path in paths], ("desired", "actual", "start")
-    )
+    titles = [f"path on {_plain(path.name)}" for path in paths]
+    figure, axes = _figure(titles, ("desired", "actual", "start"), square=True)
     for axis, path in zip(axes, paths, strict=True):
-        for points, style in (
-            (path.desired, {"color": "C1", "linewidth": 4, "alpha": 0.5, "label": "desired"}),
-            (path.actual, {"color": "C0", "label": "actual"}),
-            (path.actual[:1], {"color": "C0", "marker": "o", "linestyle": "", "label": "start"}),
-        ):
-            axis.plot(*points.T, **style)
+        axis.plot(*path.desired.T, color="C1", label="desired", **_WIDE)
+        axis.plot(*path.actual.T, color="C0", label="actual")
+        axis.plot(*path.actual[:1].T, color="C0", marker="o", linestyle="", label="start")
         # Both directions have the same scale, also if the path is a line.
         both = np.vstack([path.actual, path.desired])
         middle = (np.min(both, axis=0) + np.max(both, axis=0)) / 2.0
@@ -244,7 +186,215 @@ def plot_paths(paths: Sequence[ContactPath]) -> Figure:
         right = -half if path.points_left else half
         axis.set_xlim(middle[0] - right, middle[0] + right)
         axis.set_ylim(middle[1] - half, middle[1] + half)
+        axis.locator_params(nbins=6)
         axis.set_xlabel("along the surface [m]", fontsize=10)
         axis.set_ylabel("across [m]", fontsize=10)
-    legend(figure, axes[0])
+    _add_legend(figure)
     return figure
+
+
+def _entries(record: Record, name: str) -> list[Entry]:
+    """The entries that a name refers to: all entries of a signal, or a single entry."""
+    groups = {key: [s.name for s in recorded.signals] for key, recorded in record.signals.items()}
+    if name in groups:
+        return [(name, index) for index in range(len(groups[name]))]
+    group, slash, entry = name.partition("/")
+    if slash and group in groups:
+        if entry not in groups[group]:
+            raise ModelError(unknown_name(f"entry of {group}", entry, groups[group]))
+        return [(group, groups[group].index(entry))]
+    order = [*_FIRST, *(key for key in groups if key not in (*_FIRST, *_DERIVED))]
+    for group in order:
+        if name in groups.get(group, ()):
+            return [(group, groups[group].index(name))]
+    known = [*groups, *(entry for group in order for entry in groups.get(group, ()))]
+    raise ModelError(unknown_name("signal", name, list(dict.fromkeys(known))))
+
+
+def _draw(
+    records: Mapping[str, Record],
+    entries: Sequence[Entry],
+    errors: bool,
+    events: Sequence[RunEvent],
+    limits: FloatArray | None = None,
+    accurate_to: FloatArray | None = None,
+) -> Figure:
+    """Entries of signals over time, one axes each: their values, or errors over predicted ones."""
+    first = next(iter(records.values()))
+    signals = [first.signals[group].signals[index] for group, index in entries]
+    titles = [_labelled(signal, "|error of {}|" if errors else "{}") for signal in signals]
+    if limits is not None:
+        bounds = [f", limit ±{most:g}" if np.isfinite(most) else "" for most in limits]
+        titles = [title + bound for title, bound in zip(titles, bounds, strict=True)]
+    labels = [*records, "predicted" if errors else "reference"]
+    if accurate_to is not None:
+        labels.append("below the integrator's accuracy")
+    figure, axes = _figure(titles, [*labels, *(kind.label for kind in kinds_of(events))])
+    own_color = "C1" if len(records) == 1 else None
+    for axis, (group, at), signal in zip(axes, entries, signals, strict=True):
+        drawn, floors = list[FloatArray](), list[float]()
+        for number, (label, record) in enumerate(records.items()):
+            index, color = record.signals[group].signals.index(signal), f"C{number % 10}"
+            drawn.append(values := record[group][:, index])
+            floors.append(floor := round_off(values))
+            desired, predicted = (
+                record[name][:, index] if group == _FIRST[0] and name in record.signals else None
+                for name in ("desired_output", "predicted_error")
+            )
+            if errors and predicted is not None:
+                wide = {"color": own_color or color, **_WIDE}
+                axis.semilogy(record.time, np.maximum(np.abs(predicted), floor), **wide)
+            if errors and desired is not None:
+                error = np.maximum(np.abs(values - desired), floor)
+                axis.semilogy(record.time, error, color=color, label=label)
+                continue
+            axis.plot(record.time, values, color=color, label=label)
+            if desired is not None:
+                drawn.append(desired)
+                axis.plot(record.time, desired, color=own_color or color, linestyle="--", alpha=0.7)
+        style: dict[str, Any] = {"color": own_color or "0.5"}
+        if errors:
+            axis.plot([], [], label="predicted", **style, **_WIDE)
+            if accurate_to is not None:
+                top = float(accurate_to[at])
+                axis.axhspan(min(floors) / 3.0, top, color="0.88", zorder=0.5, label=labels[-1])
+            _set_decades(axis, min(floors))
+            continue
+        if group == _FIRST[0]:
+            axis.plot([], [], label="reference", linestyle="--", **style)
+        _flatten(axis, np.concatenate(drawn))
+        if limits is not None:
+            low, high = axis.get_ylim()
+            for bound in (-limits[at], limits[at]):
+                if low - 0.5 * (high - low) <= bound <= high + 0.5 * (high - low):
+                    axis.axhline(bound, color="C3", linestyle=":")
+    if len(records) == 1:
+        _mark(figure, first, events)
+    _add_legend(figure)
+    return figure
+
+
+def _figure(
+    titles: Sequence[str], labels: Sequence[str], square: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """A figure with space for a legend above its axes, which have a common time unless square.
+
+    The positions are computed here, since Matplotlib's automatic layout takes longer than drawing.
+    """
+    columns = min(len(titles), 3) if square else 1 if len(titles) <= 2 else 2
+    rows, cell = -(-len(titles) // columns), 4.65 if square else 6.0
+    width, height = cell - _LEFT - _RIGHT, 3.6 if square else 1.4
+    wide = max(cell * columns, 6.0)
+    top = _LINE * -(-len(labels) // _legend_columns(labels, wide)) + 0.1
+    high = rows * (_ABOVE + height + _BELOW) + top
+    figure, axes = ShownFigure(figsize=(wide, high)), list[Axes]()
+    for i, title in enumerate(titles):
+        row, column = divmod(i, columns)
+        low = high - top - (row + 1) * (_ABOVE + height) - row * _BELOW
+        box = (column * cell + _LEFT) / wide, low / high, width / wide, height / high
+        axis = figure.add_axes(box, sharex=axes[0] if axes and not square else None)
+        axis.set_title(title, y=1.0, fontsize=10)  # With y, Matplotlib does not search a position.
+        axis.grid(True, alpha=0.3)
+        if not square and i + columns >= len(titles):
+            axis.set_xlabel("time [s]", fontsize=10)
+        axes.append(axis)
+    return figure, axes
+
+
+def _legend_columns(labels: Sequence[str], width: float) -> int:
+    """The columns of a legend of a figure of this width, in inches."""
+    if sum(_HANDLE + _LETTER * len(label) for label in labels) <= width - 0.2:
+        return len(labels)
+    return max(1, int((width - 0.2) / (_HANDLE + _LETTER * max(map(len, labels)))))
+
+
+def _add_legend(figure: Figure) -> None:
+    """Adds one legend above all axes, with the labels of the curves in the first."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 1.0 - 0.05 / figure.get_figheight()),
+        borderaxespad=0.0,
+        ncols=_legend_columns(labels, figure.get_figwidth()),
+        fontsize=9,
+    )
+
+
+def _mark(figure: Figure, record: Record, events: Sequence[RunEvent]) -> None:
+    """Marks events on all axes of time, shades every second phase, and writes the phases' names."""
+    spans = phase_spans(record)
+    for axis in figure.axes:
+        for kind in kinds_of(events):
+            times = [event.time for event in events if event.kind is kind]
+            axis.plot(
+                times,
+                [0.0] * len(times),
+                color=kind.color,
+                linestyle="",
+                marker="^",
+                markersize=5,
+                clip_on=False,
+                transform=axis.get_xaxis_transform(),
+                label=kind.label,
+                zorder=3.0,
+            )
+        axis.margins(x=0.01)
+        width = axis.get_position().width * figure.get_figwidth()
+        # The names of short phases are moved to the right, so that they do not overlap.
+        apart = _PHASE / width * float(record.time[-1] - record.time[0]) if spans else 0.0
+        time = -float("inf")
+        for number, span in enumerate(spans):
+            if number % 2:
+                axis.axvspan(span.begin, span.end, color="C0", alpha=0.06, linewidth=0, zorder=0.3)
+            time = max(span.begin, time + apart)
+            axis.text(
+                time,
+                0.97,
+                f" {span.name}",
+                transform=axis.get_xaxis_transform(),
+                rotation=90,
+                va="top",
+                fontsize=6,
+                color="0.45",
+                path_effects=[withStroke(linewidth=2.0, foreground="white")],
+                zorder=0.7,  # Below the curves.
+            )
+
+
+def _set_decades(axis: Axes, floor: float) -> None:
+    """Sets the range of a logarithmic axis, from a third of `floor` upward, and a few tick labels.
+
+    The labels are plain text: Matplotlib draws its mathematical labels slower than the curves.
+    """
+    low, high = floor / 3.0, max(axis.get_ylim()[1], 1e4 * floor)
+    axis.set_ylim(low, high)
+    first, last = int(np.ceil(np.log10(low))), int(np.floor(np.log10(high)))
+    powers = range(first, last + 1, max(1, -(-(last - first) // 5)))
+    axis.set_yticks([10.0**k for k in powers], [f"10{str(k).translate(_RAISED)}" for k in powers])
+    axis.set_yticks([], minor=True)
+
+
+def _flatten(axis: Axes, values: FloatArray) -> None:
+    """Sets the range of an axis so that what does not vary is a flat line, and no noise."""
+    low, high = float(np.min(values)), float(np.max(values))
+    scale = max(abs(low), abs(high), 1e-3)
+    if high - low < 1e-4 * scale:
+        axis.set_ylim((low + high) / 2 - 0.05 * scale, (low + high) / 2 + 0.05 * scale)
+
+
+def _labelled(signal: Signal, form: str = "{}") -> str:
+    """A signal's name with its unit, as Matplotlib's text."""
+    name = form.format(_plain(signal.name))
+    return f"{name} [{signal.unit}]" if signal.unit else name
+
+
+def _plain(text: str) -> str:
+    """A text in which Matplotlib does not read $ as mathematics."""
+    return text.replace("$", r"\$")
+
+
+def round_off(values: FloatArray) -> float:
+    """The round-off of a signal's largest value, at least 1e-16 for a logarithmic axis."""
+    return float(np.finfo(float).eps * max(np.max(np.abs(values), initial=0.0), 0.45))

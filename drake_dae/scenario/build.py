@@ -21,12 +21,12 @@ from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.references import Reference
 from drake_dae.robots import Links, RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.forms.keys import at, each, violated
+from drake_dae.scenario.form import at, each
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, references_of
-from drake_dae.scenario.parts.parts import Poles
-from drake_dae.scenario.robot_file.links import add_robot
+from drake_dae.scenario.parts import Poles
+from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scenario.task_controller import check_task, task_controller
@@ -73,7 +73,9 @@ def build_completed(
         try:
             structure = scenario_structure(model)
         except AssumptionError as error:
-            raise violated(error) from error
+            key = "constraints" if error.assumption <= 3 else "outputs"
+            hint = "" if error.state is None else "; start.positions choose another start"
+            raise ScenarioError((key, f"{error}{hint}")) from error
 
     # The gains, with what belongs to them.
     chosen = advised(completed.scenario, model, structure)

@@ -14,7 +14,7 @@ from drake_dae.errors import DrakeDaeError, ScenarioError
 from drake_dae.references import ConstantReference
 from drake_dae.robots import KnownWrench, PointOnSurface
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.robot_file.links import robot_links
+from drake_dae.scenario.robot_file.reading import robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 

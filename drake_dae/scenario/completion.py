@@ -27,8 +27,8 @@ from drake_dae.robots import (
     force_rows,
     plant_constraints,
 )
-from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.parts.written import TiltFromNormalForm, WrittenOutput, make
+from drake_dae.scenario.form import at
+from drake_dae.scenario.parts import TiltFromNormalForm, WrittenOutput, make
 from drake_dae.scenario.postures import INDEPENDENT, Posture, Postures, tool_axis
 from drake_dae.scenario.scenario import Scenario
 

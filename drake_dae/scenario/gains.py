@@ -19,10 +19,10 @@ from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.references import Reference, SinusoidReference
 from drake_dae.robots import RobotModel
 from drake_dae.scenario.completion import Completed
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.motion import reference_and_start, references_of
-from drake_dae.scenario.parts import parts as parts
-from drake_dae.scenario.parts.task import ScenarioTask
+from drake_dae.scenario import parts as parts
+from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import opening_contact
 from drake_dae.systems.plants.contact.contact_material import PointMaterial

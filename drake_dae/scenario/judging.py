@@ -17,11 +17,12 @@ from drake_dae.analysis.limits import (
     SignalLimits,
     SignalRange,
     limits_along,
+    robot_limits,
 )
 from drake_dae.analysis.report import Analysis
 from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import DaeSystem, PinnedMotion, Signal, ZeroDynamics, find_structure
+from drake_dae.dae import Signal, ZeroDynamics, find_structure
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import AssumptionError, ScenarioError
@@ -29,15 +30,14 @@ from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind
 from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
-from drake_dae.running.limits import limited_values, robot_limits
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import tracking_law
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
 from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
-from drake_dae.scenario.robot_file.links import RobotLinks
+from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import check_task
 from drake_dae.systems.control.contract import PhaseChange
@@ -247,32 +247,18 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
         return Feasibility(analysis, scenario.duration, is_resolved=is_resolved, gains=gains)
     with at("judgement.friction_cones"):
         limits = robot_limits(model, scenario.judgement.friction_cones)
-    rows = zip(
-        motion.states, motion.controls, _forces(model.dae, motion), motion.parameters, strict=True
-    )
-    values = np.array([limits.values(*row)[0].copy() for row in rows])
     slowing = None
     if analysis.structure is not None:
         slowing = limits_along(analysis.structure, limits, reference, motion)
     return Feasibility(
         analysis,
         scenario.duration,
-        limits.ranges(motion.times, values),
+        limits.ranges(motion.times, limits.of_motion(motion)),
         is_resolved,
         links_behind(model, motion.times, motion.states, motion.parameters),
         gains,
         slowing,
     )
-
-
-def _forces(dae: DaeSystem, motion: PinnedMotion) -> FloatArray:
-    """All constraint forces at each state, shape (k, M), as `constraint_force` of a plant."""
-    if dae.sharing is None:
-        return motion.constraint_inputs
-    v = ca.SX.sym("v", dae.num_constraints)
-    function = dae.trace("shared forces", {"forces": dae.forces(v)}, {"v": v})
-    pairs = zip(motion.states, motion.constraint_inputs, strict=True)
-    return np.array([function(x, v_at, dae.parameter_values)[0] for x, v_at in pairs])
 
 
 def sample_times(
@@ -338,7 +324,7 @@ def judge_run(
     if failure:  # The last numbers of a run that broke off are not those of its motion.
         first, last = record.time[[0, -1]]
         stop = max(1, int(np.searchsorted(record.time, last - BREAK * (last - first))))
-    ranges = limits.ranges(record.time[:stop], limited_values(limits, record)[:stop])
+    ranges = limits.ranges(record.time[:stop], limits.of_record(record)[:stop])
     behind = []
     for link in links_behind(model, record.time, record["state"], own):
         numbers = Signal(link.link, "m"), link.depth, 0.0, link.time

@@ -35,10 +35,10 @@ from drake_dae.robots import (
     plant_constraints,
 )
 from drake_dae.scenario.completion import Completed, completions
-from drake_dae.scenario.forms.keys import at, each
+from drake_dae.scenario.form import at, each
 from drake_dae.scenario.motion import in_the_way
-from drake_dae.scenario.parts.written import make
-from drake_dae.scenario.robot_file.links import RobotLinks, robot_links
+from drake_dae.scenario.parts import make
+from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
 from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_guess

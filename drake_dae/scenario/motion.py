@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from drake_dae.analysis.limits import robot_limits
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import DaeSystem, PinnedMotion, Structure, ZeroDynamics
 from drake_dae.errors import DrakeDaeError, ScenarioError
@@ -11,8 +12,7 @@ from drake_dae.references import ConstantReference, Reference
 from drake_dae.references.by_name import assign, in_order
 from drake_dae.references.reference import stack_references
 from drake_dae.robots import RobotModel, links_behind
-from drake_dae.running.limits import robot_limits
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_state
 
@@ -109,11 +109,7 @@ def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> s
     if motion.ending is not None:
         return str(motion.ending)
     limits = robot_limits(model, scenario.judgement.friction_cones)
-    rows = zip(
-        motion.states, motion.controls, motion.constraint_inputs, motion.parameters, strict=True
-    )
-    values = np.array([limits.pinned_values(*row)[0].copy() for row in rows])
-    for one in limits.ranges(motion.times, values):
+    for one in limits.ranges(motion.times, limits.of_motion(motion)):
         # A start may be on the limit of a joint.
         if one.excess and abs(one.excess.value - one.excess.limit) > _SLACK:
             return f"{one.excess}{_singularity(model, motion)}"

@@ -14,7 +14,7 @@ from drake_dae.arrays import brief
 from drake_dae.dae import Structure
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import RobotModel
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
@@ -29,7 +29,7 @@ AddRobot = Callable[[DrakePlant, SceneGraph], None]
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioPlant(ABC):
-    """The contract of the key `plant` of a scenario.
+    """What a scenario simulates; the contract of the key `plant`.
 
     1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
     2. With `carries`, this plant includes payloads, disturbances and changed parameters. Otherwise

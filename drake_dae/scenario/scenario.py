@@ -1,42 +1,75 @@
-"""The form of a scenario: a robot in contact, its task, and its simulation.
+"""The form of a scenario: a robot in contact, its task, and its simulation; read and written.
 
 A scenario is YAML. The library's dataclasses are written with their fields as keys; a choice
 between several classes is written with the name as a tag, for example `surface: !Sphere`.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import pickle
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from casadi import SX
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator
 from pydrake.systems.analysis import SimulatorConfig
 
+from drake_dae import references as rs
+from drake_dae import robots
+from drake_dae.arguments import checked
 from drake_dae.arrays import listed
+from drake_dae.errors import ScenarioError
+from drake_dae.files import read_text
 from drake_dae.references import Reference
-from drake_dae.robots import ForceOutput, Stage
+from drake_dae.robots import ForceOutput, Load, Pair, Stage, Surface, Vector
 from drake_dae.running.simulate import check_config, check_duration
-from drake_dae.scenario.forms import values
-from drake_dae.scenario.forms.forms import Reader
-from drake_dae.scenario.parts.families import CONFIG, FAMILIES, KEYS, VALUES
-from drake_dae.scenario.parts.parts import Estimator, Judgement, Law, Sensors, Start, Write
-from drake_dae.scenario.parts.task import ScenarioTask
-from drake_dae.scenario.parts.written import WrittenConstraint, WrittenOutput
+from drake_dae.scenario import form, parts, plants
+from drake_dae.scenario.form import Family, Key, Reader, keys_of
+from drake_dae.scenario.parts import (
+    Estimator,
+    Judgement,
+    Law,
+    ScenarioTask,
+    Sensors,
+    Start,
+    Write,
+    WrittenConstraint,
+    WrittenOutput,
+)
 from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.shipped import shipped_scenarios
+from drake_dae.scenario.typed_yaml import MOST_TEXT, TAG, dump_yaml, load_lines, load_yaml
 from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.task import phases
 from drake_dae.trace.compiled import Compiled
 
 
-def _duration(duration: float) -> float:
-    check_duration(duration)
-    return duration
+def _checked_by(check: Callable[[Any], None]) -> AfterValidator:
+    def validate(value: Any) -> Any:
+        check(value)
+        return value
+
+    return AfterValidator(validate)
 
 
-def _config(config: SimulatorConfig) -> SimulatorConfig:
-    check_config(config)
-    return config
+_INTEGRATOR = {
+    "integration_scheme": ("runge_kutta5", "One of Drake's: runge_kutta5, runge_kutta3, radau3"),
+    "max_step_size": (0.1, "The longest step, in s; with fixed steps the step."),
+    "accuracy": (1e-6, "The relative error of a step that error control allows."),
+    "use_error_control": (
+        True,
+        "Whether the steps have the length that the accuracy needs, or all max_step_size.",
+    ),
+    "start_time": (0.0, "When the run begins, in s."),
+    "target_realtime_rate": (
+        0.0,
+        "How many seconds pass in the run per second of the clock; 0 is as fast as it goes.",
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,32 +78,23 @@ class Scenario:
 
     Attributes:
         description: One line for `drake-dae list`.
-        robot: The robot's file, with additions: which frames are welded or free, which joints are
-            locked or driven, known payloads and forces.
-        constraints: The constraints; one without a tag is a PointOnSurface. Constraints in the
-            robot's file, such as mimic joints, are appended.
-        compliances: Constraint force -> its relative compliance, for redundant constraints: their
-            forces are shared by least squares. {} is equal compliances; if left out, constraints
-            must not be redundant.
-        outputs: Position outputs; the force outputs follow them. If there are fewer than actuators
-            minus force outputs, they are completed: see `complete_scenario`.
-        tool_axis: The direction of the tool's axis in completed outputs: normal to the surface,
-            fixed in the world, or free.
-        forces: The force outputs: names of constraint forces, and combinations of forces by tags;
-            all constraint forces if left out. Leave out forces that are not to be controlled, such
-            as those of wheels and mimic joints; [] is none.
+        robot: The robot's file, and changes of it.
+        constraints: The constraints; one without a tag is a PointOnSurface. Those in the robot's
+            file, such as mimic joints, are appended.
+        compliances: Constraint force -> its relative compliance, for redundant constraints, whose
+            forces least squares share. {} is equal ones; left out, none may be redundant.
+        outputs: Position outputs; the force outputs follow them. Missing ones are completed, see
+            `complete_scenario`.
+        tool_axis: The tool's axis in completed outputs: normal to the surface, fixed, or free.
+        forces: Force outputs: names of constraint forces, and combinations by tags; all if left
+            out. Leave out those not to be controlled, as of wheels and mimic joints; [] is none.
         actuation: Stages from the joints toward the motor; none for rigid joints.
-        parameters: Parameter name -> its value for law and plant, in place of that of the robot's
-            file, a constraint or a stage; one number for all entries, or a list.
-        bounds: Parameter name -> its lowest and highest value, for example of "wall.position"; a
-            number, or one per entry. Relative degrees are checked for all values within bounds; if
-            both bounds are equal, the value is fixed. Bounds do not restrict a run, only values
-            that `estimator.identify` names.
-        exogenous: Parameter name -> references of its entries, known to plant and law;
-            "wall.position" for example.
-        plant: The plant: ideal constraints, contact that gives way, or Drake's own contact in a
-            discrete MultibodyPlant with the surfaces as geometry. And how it differs from the law's
-            model.
+        parameters: Parameter name -> its value for law and plant; one for all entries, or a list.
+        bounds: Parameter name -> lowest and highest value, numbers or lists. Relative degrees hold
+            within them; they restrict what `estimator.identify` names, and nothing else of a run.
+        exogenous: Parameter name, as "wall.position" -> references that law and plant know.
+        plant: What is simulated: ideal constraints, contact that gives way, or Drake's own contact;
+            and how it differs from the law's model.
         law: The tracking law: its gains, or what computed gains must keep.
         sampling: The period and the delay of the law, in s; continuous if left out.
         sensors: What the law measures: the state by encoders, the force by a sensor.
@@ -80,9 +104,8 @@ class Scenario:
         judgement: Tolerances and friction cones for the verdict of a run.
         references: Name -> reference; a number is a constant. A name is that of an output, tool.y;
             of several, tool for all tool.x, tool.y, ..., or tool.yz; or a list, "tool.y, elbow".
-            Completed outputs without a reference keep their initial value.
         task: A sequence of phases with opening and closing contact, in place of references.
-        start: The start; without positions it is computed (not for a task).
+        start: The start; without positions it is computed.
         duration: The duration of the run, in s.
         integrator: Drake's SimulatorConfig; the run starts at its start_time.
         write: The files that the run writes into its folder.
@@ -99,7 +122,7 @@ class Scenario:
     forces: list[str | ForceOutput] | None = None
     actuation: list[Stage] = field(default_factory=list)
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
-    bounds: dict[str, Annotated[Any, values.INTERVAL]] = field(default_factory=dict)
+    bounds: dict[str, Annotated[Any, form.INTERVAL]] = field(default_factory=dict)
     exogenous: dict[str, list[Reference | float]] = field(default_factory=dict)
     plant: ScenarioPlant = field(default_factory=IdealConstraints)
     law: Law = field(default_factory=Law)
@@ -111,9 +134,11 @@ class Scenario:
     references: dict[str, Reference | float] = field(default_factory=dict)
     task: ScenarioTask | None = None
     start: Start = field(default_factory=Start)
-    duration: Annotated[float, AfterValidator(_duration)] = 10.0
-    integrator: Annotated[SimulatorConfig, AfterValidator(_config)] = field(
-        default_factory=lambda: SimulatorConfig(**CONFIG)
+    duration: Annotated[float, _checked_by(check_duration)] = 10.0
+    integrator: Annotated[SimulatorConfig, _checked_by(check_config)] = field(
+        default_factory=lambda: SimulatorConfig(
+            **{n: value for n, (value, _) in _INTEGRATOR.items()}
+        )
     )
     write: Write = field(default_factory=Write)
     compiled: Compiled = "auto"
@@ -136,10 +161,91 @@ class Scenario:
         return isinstance(other, Scenario) and scenario_data(self) == scenario_data(other)
 
 
+def _family(*classes: type, plain: type | None = None) -> Family:
+    return Family({f"!{cls.__name__.removesuffix('Form')}": cls for cls in classes}, plain)
+
+
+_REFERENCES: dict[str, type] = {
+    "!Constant": rs.ConstantReference,
+    "!Sinusoids": rs.SinusoidReference,
+    "!PointToPoint": rs.PointToPointReference,
+    "!Line": rs.LineReference,
+    "!Circle": rs.CircleReference,
+    "!Spiral": rs.SpiralReference,
+    "!Polyline": rs.PolylineReference,
+    "!Waypoints": rs.WaypointsReference,
+    "!Csv": rs.CsvReference,
+}
+
+# What stands in a scenario for the types in annotations. A new member is one line here.
+FAMILIES: dict[type, Family] = {
+    Surface: _family(
+        robots.Plane,
+        robots.Sphere,
+        robots.Cylinder,
+        robots.Ellipsoid,
+        robots.Torus,
+        robots.ImplicitSurface,
+        robots.MeasuredSurface,
+    ),
+    robots.Constraint: _family(
+        robots.PointOnSurface,
+        parts.WeldedFramesForm,
+        robots.CoincidentPoints,
+        robots.FixedDistance,
+        robots.JointCoupler,
+        robots.RevoluteLoopJoint,
+        robots.PrismaticLoopJoint,
+        robots.AxisNormalToSurface,
+        robots.Blade,
+        robots.RollingWheel,
+        robots.RollingBall,
+    ),
+    robots.PositionOutput: _family(
+        robots.PointCoordinates,
+        robots.AxisCoordinates,
+        parts.SurfaceCoordinatesForm,
+        parts.TiltFromNormalForm,
+        robots.JointPositions,
+    ),
+    ForceOutput: _family(robots.Squeeze, robots.ForceCombination, plain=str),
+    Stage: _family(robots.FlexibleJoints, robots.DcMotors, robots.ElectrohydraulicServos),
+    Reference: Family(_REFERENCES, float),
+    Load: _family(robots.KnownForce, robots.JointFriction),
+    ScenarioPlant: _family(
+        IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
+    ),
+    parts.Gains: _family(parts.Poles, parts.Coefficients, parts.Matrices),
+    phases.Phase: _family(
+        phases.Approach, phases.Press, phases.Move, phases.Dwell, phases.Release, phases.Retreat
+    ),
+}
+
+_VALUES: dict[Any, Any] = {
+    Callable[..., SX] | str: str,
+    str | Path: Annotated[Any, form.FILE],
+    str | Sequence[str]: Annotated[Any, form.NAMES],
+    float | list[float]: Annotated[Any, form.NUMBER_OR_LIST],
+    ArrayLike: Annotated[Any, form.NUMBERS],
+    Vector: Annotated[Any, form.TRIPLE],
+    Pair: Annotated[Any, form.PAIR],
+}
+
+
 @cache
 def scenario_reader() -> Reader[Scenario]:
     """The reader and writer of scenarios as plain data."""
-    return Reader(Scenario, FAMILIES, VALUES, KEYS)
+    keys: dict[type, dict[str, Key]] = {
+        cls: {  # Points of paths are lists.
+            name: replace(key, hint=Annotated[Any, form.ROW]) if key.hint == ArrayLike else key
+            for name, key in keys_of(cls).items()
+        }
+        for cls in _REFERENCES.values()
+    }
+    start = keys[rs.PointToPointReference]["start_time"]
+    keys[rs.PointToPointReference]["start_time"] = replace(start, default=0.0)
+    keys[SimulatorConfig] = {n: Key(type(v), v, text) for n, (v, text) in _INTEGRATOR.items()}
+    return Reader(Scenario, FAMILIES, _VALUES, keys)
 
 
 def scenario_schema() -> dict[str, Any]:
@@ -159,14 +265,88 @@ def scenario_data(scenario: Scenario) -> dict[str, Any]:
 
 
 def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
-    """Makes a scenario from plain data.
-
-    Args:
-        data: Plain data.
-        folder: The folder of relative file names; None for the working directory.
+    """Makes a scenario from plain data; names of files are relative to a folder.
 
     Raises:
-        ScenarioError: Keys are unknown or missing, or values are not valid; all problems are
-            listed.
+        ScenarioError: Keys are unknown or missing, or values are wrong; all problems are listed.
     """
     return scenario_reader().read(data, folder)
+
+
+def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A scenario's plain data with other values at dotted keys; parts without changes are shared.
+
+    Raises:
+        ScenarioError: There is no such place.
+    """
+    varied = dict(data)
+    for part in {key.partition(".")[0] for key in changes} & varied.keys():
+        varied[part] = pickle.loads(pickle.dumps(varied[part]))  # Thrice as fast as deepcopy.
+    for key, value in changes.items():
+        scenario_reader().put(varied, key, value)
+    return varied
+
+
+_ROBOT = re.compile(r"<(?:robot|sdf|mujoco)\b|^directives\s*:", re.MULTILINE)
+
+
+@checked(lambda text: ScenarioError(("", text)))
+def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
+    """Reads a scenario file.
+
+    Args:
+        path: The file, or the name of a shipped scenario such as "two_link_wall".
+        settings: Changes "key=value" with dotted keys, for example "integrator.accuracy=1e-8" or
+            "constraints.0.surface.point=[0.7, 0, 0]". Relative file names are in the folder of the
+            scenario; for a shipped one, which names no such files, in the working directory.
+
+    Raises:
+        ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
+            given twice, or values are not valid; all problems are listed, with their lines.
+    """
+    shipped = shipped_scenarios()
+    path = shipped.get(str(path), Path(path))
+    try:
+        text = read_text(path, 4 * MOST_TEXT)
+        folder = Path().absolute() if path in shipped.values() else path.absolute().parent
+    except UnicodeDecodeError:
+        raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
+    except (OSError, ValueError) as error:  # A null byte in the path.
+        raise ScenarioError((str(path), getattr(error, "strerror", None) or str(error))) from None
+    is_markup = text.lstrip().startswith("<")
+    robot = _ROBOT.search(text) if is_markup or "directives" in text else None
+    if robot is not None and is_markup != robot[0].startswith("directives"):
+        problem = (
+            f"this is a robot, not a scenario; `drake-dae new {path}` writes a scenario with it, "
+            "and in one of your own it is robot.file"
+        )
+        raise ScenarioError((str(path), problem))
+    data, line_of = load_lines(text, str(path))
+    data = {} if data is None else data
+    if isinstance(data, dict):
+        # Drake's convention: keys with an underscore are a place for anchors.
+        data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
+    changed = []
+    for setting in settings:
+        key, separator, value = setting.partition("=")
+        if not separator or not all(key.split(".")):
+            raise ScenarioError((f"--set {setting}", "expected key=value, for example duration=5"))
+        scenario_reader().put(data, key, load_yaml(value, key))
+        changed.append(key)
+
+    def place_of(key: str) -> str:
+        """Where a key stands in the file; empty if it is one of the settings."""
+        is_set = any(f"{key}.".startswith(f"{other}.") for other in changed)
+        line = None if is_set else line_of(key)
+        return "" if line is None else f"[{path.name}:{line}]"
+
+    return scenario_reader().read(data, folder, place_of)
+
+
+def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
+    """Writes a file that `load_scenario` reads back equal: what differs from defaults.
+
+    `comment` is a first line, with its "#".
+    """
+    head = f"{comment}\n" if comment else ""
+    Path(path).write_text(head + dump_yaml(scenario_data(scenario)), encoding="utf-8")

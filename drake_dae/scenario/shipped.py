@@ -7,7 +7,7 @@ from pathlib import Path
 from drake_dae import diagrams
 from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.scenario.typed_yaml import load_yaml
 
 FOLDER = Path(diagrams.__file__).resolve().parent
 DEFAULT_SCENARIO = "seven_joint_wall"

@@ -12,7 +12,7 @@ from drake_dae.dae import Signal, ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.robots import Links, RobotModel
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import opening_contact
 

@@ -5,7 +5,7 @@ import numpy as np
 from drake_dae.dae import TrackingLaw, find_structure
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots import Constraint, RobotModel
-from drake_dae.scenario.forms.keys import at
+from drake_dae.scenario.form import at
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.systems.task.contacts import open_contact

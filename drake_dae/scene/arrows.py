@@ -21,7 +21,6 @@ from drake_dae.robots import (
 
 FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
 MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
-
 PATH_COLOR = Rgba(0.1, 0.2, 0.8, 1.0)
 
 _PIECE = 32
@@ -39,12 +38,7 @@ class ForceArrows:
     """Draws each constraint force on a robot as an arrow whose tip is at the point of application.
 
     The arrow has the direction of the force on the robot. A moment is an arrow with two heads,
-    along its axis. The longest arrow is that of the largest force until now.
-
-    Args:
-        meshcat: The Meshcat to draw in.
-        model: The robot.
-        length: The length of the longest arrow, m.
+    along its axis. The longest arrow, of this length in m, is that of the largest force until now.
 
     Attributes:
         largest_force, largest_moment: The force and moment of the longest arrows, N and N m.
@@ -55,36 +49,30 @@ class ForceArrows:
         self.largest_force = self.largest_moment = 1e-6
         self.has_moment, self._length = False, length
         self._meshcat, self._model = meshcat, model
-        self._wrenches = ConstraintWrenches(model)
-        pairs = zip(self._wrenches.constraints, self._wrenches.with_moment, strict=True)
-        for constraint, with_moment in pairs:
+        wrenches = ConstraintWrenches(model)
+        self._rows = list(zip(wrenches.constraints, wrenches.with_moment, strict=True))
+        for constraint, with_moment in self._rows:
             _add_arrow(meshcat, path_of(constraint, "force"), length, 1, FORCE_COLOR)
             if with_moment:
                 _add_arrow(meshcat, path_of(constraint, "moment"), 0.6 * length, 2, MOMENT_COLOR)
 
     def draw(self, wrenches: Wrenches, time: float) -> None:
-        """Draws the arrows, with a new scale if a force or moment is the largest until now.
-
-        Args:
-            wrenches: The present wrenches.
-            time: The time in a recording, s.
-        """
+        """Draws the arrows at a time of a recording, in s."""
         self.measure([wrenches])
-        pairs = zip(self._wrenches.constraints, self._wrenches.with_moment, strict=True)
-        for row, (constraint, with_moment) in enumerate(pairs):
-            point, force, moment = wrenches.points[row], wrenches.forces[row], wrenches.moments[row]
-            self._draw_arrow(path_of(constraint, "force"), point, force / self.largest_force, time)
+        for row, (constraint, with_moment) in enumerate(self._rows):
+            arrows = {"force": wrenches.forces[row] / self.largest_force}
             if with_moment:
-                arrow = moment / self.largest_moment
-                self._draw_arrow(path_of(constraint, "moment"), point, arrow, time)
+                arrows["moment"] = wrenches.moments[row] / self.largest_moment
+            for kind, arrow in arrows.items():
+                path, size = path_of(constraint, kind), float(np.linalg.norm(arrow))
+                axes = axes_along(arrow / size if size else np.array([0.0, 0.0, 1.0]))
+                pose = RigidTransform(RotationMatrix(axes), wrenches.points[row])
+                self._meshcat.SetTransform(path, pose, time)
+                scale = [max(size, LEAST_SCALE)] * 3
+                self._meshcat.SetProperty(f"{path}/arrow", "scale", scale, time)
 
     def place(self, parameters: FloatArray, time: float) -> None:
-        """Moves surfaces with exogenous parameters to their present poses.
-
-        Args:
-            parameters: The values of all parameters.
-            time: The time in a recording, s.
-        """
+        """Moves surfaces with exogenous parameters to their poses for these values of all."""
         dae = self._model.dae
         moving = {p.name for p in dae.exogenous.moving}
         for constraint in self._model.constraints:
@@ -104,48 +92,6 @@ class ForceArrows:
             self.has_moment = self.has_moment or moment > negligible
             self.largest_moment = max(self.largest_moment, moment, negligible)
 
-    def _draw_arrow(self, path: str, point: FloatArray, arrow: FloatArray, time: float) -> None:
-        size = float(np.linalg.norm(arrow))
-        direction = arrow / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
-        pose = RigidTransform(RotationMatrix(axes_along(direction)), point)
-        self._meshcat.SetTransform(path, pose, time)
-        scale = max(size, LEAST_SCALE)
-        self._meshcat.SetProperty(f"{path}/arrow", "scale", [scale] * 3, time)
-
-
-class GrowingPaths:
-    """Draws the paths of the constraints' points of application while the robot runs.
-
-    Args:
-        meshcat: The Meshcat to draw in.
-        constraints: The constraints that act at a point.
-    """
-
-    def __init__(self, meshcat: Meshcat, constraints: Sequence[Constraint]) -> None:
-        self._meshcat, self._constraints = meshcat, constraints
-        self._piece: list[FloatArray] = []
-        self._number, self._time = 0, -np.inf
-
-    def add(self, points: FloatArray, time: float) -> None:
-        """Appends the present points; a time before the last one clears the paths first.
-
-        Args:
-            points: The points of application, m, shape (k, 3).
-            time: The time in s.
-        """
-        if time < self._time:
-            self._meshcat.Delete("/paths")
-            self._piece, self._number = [], 0
-        self._time = time
-        self._piece.append(points)
-        line = np.array(self._piece)
-        for row, constraint in enumerate(self._constraints):
-            path = f"/paths/{constraint.name}/actual/{self._number}"
-            self._meshcat.SetLine(path, np.asfortranarray(line[:, row].T), 4.0, PATH_COLOR)
-        # In pieces, since Meshcat sends a whole line again with each new point.
-        if len(self._piece) > _PIECE:
-            self._piece, self._number = [points], self._number + 1
-
 
 class ConstraintForceVisualizer(LeafSystem):
     """Draws the constraint forces and the paths of their points while a robot runs.
@@ -153,14 +99,8 @@ class ConstraintForceVisualizer(LeafSystem):
     Input ports:
         link_state: (q, v).
         constraint_force: lambda, shape (m,).
-        exogenous: The exogenous signals, as the plant's port of the same name.
-
-    Args:
-        arrows: The force arrows.
-        meshcat: The Meshcat that draws the paths.
-        model: The robot.
-        places: The index among all parameters of each entry of `exogenous`.
-        period: The time between pictures in s.
+        exogenous: The exogenous signals, as the plant's port of the same name; `places` are their
+            indices among all parameters.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -175,10 +115,9 @@ class ConstraintForceVisualizer(LeafSystem):
     ) -> None:
         super().__init__()
         self.set_name("constraint_force_visualizer")
-        self._model = model
-        self._arrows, self._wrenches = arrows, ConstraintWrenches(model)
-        self._paths = GrowingPaths(meshcat, self._wrenches.constraints)
+        self._arrows, self._meshcat, self._wrenches = arrows, meshcat, ConstraintWrenches(model)
         self._values, self._places = model.dae.parameter_values, list(places)
+        self._piece, self._number, self._time = list[FloatArray](), 0, -np.inf
         size = model.links.q.numel() + model.links.v.numel()
         self._link_state = self.DeclareVectorInputPort("link_state", size)
         self._force = self.DeclareVectorInputPort("constraint_force", len(model.dae.force_signals))
@@ -194,12 +133,27 @@ class ConstraintForceVisualizer(LeafSystem):
         state, force = self._link_state.Eval(context), self._force.Eval(context)
         wrenches = self._wrenches(state, force, self._values)
         self._arrows.draw(wrenches, time)
-        self._paths.add(wrenches.points, time)
+        self._extend_paths(wrenches.points, time)
         return EventStatus.Succeeded()
+
+    def _extend_paths(self, points: FloatArray, time: float) -> None:
+        """Appends points to the paths; a time before the last one clears the paths first."""
+        if time < self._time:
+            self._meshcat.Delete("/paths")
+            self._piece, self._number = [], 0
+        self._time = time
+        self._piece.append(points)
+        for row, constraint in enumerate(self._wrenches.constraints):
+            line = np.array([each[row] for each in self._piece])
+            path = f"/paths/{constraint.name}/actual/{self._number}"
+            self._meshcat.SetLine(path, np.asfortranarray(line.T), 4.0, PATH_COLOR)
+        # In pieces, since Meshcat sends a whole line again with each new point.
+        if len(self._piece) > _PIECE:
+            self._piece, self._number = [points], self._number + 1
 
 
 def path_of(constraint: Constraint, what: str) -> str:
-    """Returns the Meshcat path of a constraint's "surface", "force", "moment" and the like."""
+    """The Meshcat path of a constraint's "surface", "force", "moment" and the like."""
     return f"/contact/{constraint.name}/{what}"
 
 

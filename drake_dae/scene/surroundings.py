@@ -1,5 +1,6 @@
-"""The drawn surfaces that a robot touches, and the extent of a robot."""
+"""What surrounds a robot in a picture: the surfaces that it touches, and a grid below it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +12,17 @@ from drake_dae.arrays import FloatArray
 from drake_dae.robots import Constraint, ConstraintWrenches, PosedShape, RobotModel, own_values
 from drake_dae.trace.functions import TracedFunction
 
+_CELLS = 8.0
+"""The approximate number of grid cells along the diagonal of a scene."""
+
+_NEAR = 0.1
+"""The grid is on a horizontal surface that is nearer to the lowest point than this fraction of the
+scene's diagonal."""
+
 
 @dataclass(frozen=True, eq=False)
 class DrawnSurface:
-    """The drawn surface of one or several constraints.
+    """A surface that one or several constraints touch.
 
     Attributes:
         constraint: The first of these constraints.
@@ -26,13 +34,14 @@ class DrawnSurface:
     pose: RigidTransform
     picture: PosedShape
 
-    @property
-    def level(self) -> float | None:
-        """The height of a horizontal plane, m; None for any other surface."""
-        pose, form = self.pose @ self.picture.pose, self.picture.form
-        if not isinstance(form, Box) or pose.rotation().matrix()[2, 2] < 1.0 - 1e-6:
-            return None
-        return float(pose.translation()[2] + form.height() / 2.0)
+
+@dataclass(frozen=True, eq=False)
+class Floor:
+    """A horizontal grid: the side of a cell, and the ends of its lines, m, shape (k, 3) each."""
+
+    cell: float
+    begins: FloatArray
+    ends: FloatArray
 
 
 def surroundings(
@@ -42,83 +51,78 @@ def surroundings(
     parameters: FloatArray,
     size: float,
 ) -> list[DrawnSurface]:
-    """Returns the surfaces that a robot touches, each only once: two at one pose would flicker.
+    """The surfaces that a robot touches, each only once: two at one pose would flicker.
 
-    An unbounded surface is drawn as a piece around the middle of its contact points, larger than
-    their extent.
-
-    Args:
-        model: The robot.
-        acting: Its constraint wrenches.
-        points: The points of application in a run, m, shape (k, constraints, 3).
-        parameters: The values of all parameters.
-        size: The least size of the drawn piece of an unbounded surface, m.
+    An unbounded surface is drawn as a piece of at least this size around its contact points, which
+    are (times, constraints, 3).
     """
+    constraints = acting.constraints
 
-    def surface_of(row: int, contacts: FloatArray) -> DrawnSurface | None:
-        constraint = acting.constraints[row]
-        values = own_values(constraint, model.dae, parameters)
+    def piece(row: int, contacts: FloatArray) -> DrawnSurface | None:
+        values = own_values(constraints[row], model.dae, parameters)
         low, high = contacts.min(axis=0), contacts.max(axis=0)
         nearest = np.argmin(np.linalg.norm(contacts - (low + high) / 2, axis=1))
         extent = max(size, 1.4 * float(np.linalg.norm(high - low)))
-        picture = constraint.picture(values, contacts[nearest], extent)
+        picture = constraints[row].picture(values, contacts[nearest], extent)
         if picture is None:
             return None
-        pose = constraint.placement(values)
-        return DrawnSurface(constraint, pose, picture.moved(pose.inverse()))
+        pose = constraints[row].placement(values)
+        return DrawnSurface(constraints[row], pose, picture.moved(pose.inverse()))
 
-    def moves(constraint: Constraint) -> bool:
-        return any(parameter.exogenous for parameter in constraint.parameters)
-
-    drawn: list[tuple[list[int], DrawnSurface]] = []
-    for row, constraint in enumerate(acting.constraints):
-        surface = surface_of(row, points[:, row])
-        if surface is None:
+    groups = list[list[int]]()
+    for row in range(len(constraints)):
+        if piece(row, points[:, row]) is None:
             continue
-        for i, (rows, other) in enumerate(drawn):
-            if moves(constraint) or moves(other.constraint):
+        for group in groups:
+            if any(p.exogenous for k in (row, group[0]) for p in constraints[k].parameters):
                 continue
-            contacts = points[:, [*rows, row]].reshape(-1, 3)
-            first, second = surface_of(rows[0], contacts), surface_of(row, contacts)
-            if first is not None and second is not None and _coincide(first, second):
-                drawn[i] = ([*rows, row], first)
+            contacts = points[:, [*group, row]].reshape(-1, 3)
+            if _coincide(piece(group[0], contacts), piece(row, contacts)):
+                group.append(row)
                 break
         else:
-            drawn.append(([row], surface))
-    return [surface for _, surface in drawn]
+            groups.append([row])
+    pieces = [piece(group[0], points[:, group].reshape(-1, 3)) for group in groups]
+    return [surface for surface in pieces if surface is not None]
 
 
-def _coincide(first: DrawnSurface, second: DrawnSurface) -> bool:
-    """Whether two surfaces have the same pose and shape."""
+def _coincide(first: DrawnSurface | None, second: DrawnSurface | None) -> bool:
+    if first is None or second is None:
+        return False
     poses = [surface.pose @ surface.picture.pose for surface in (first, second)]
+    form, other = first.picture.form, second.picture.form
     if not poses[0].IsNearlyEqualTo(poses[1], 1e-9):
         return False
-    form, other = first.picture.form, second.picture.form
     if isinstance(form, Shape) or isinstance(other, Shape):
         return repr(form) == repr(other)
-    first_corners, second_corners = (np.array(mesh.vertices()) for mesh in (form, other))
-    return first_corners.shape == second_corners.shape and np.allclose(
-        first_corners, second_corners, rtol=0.0, atol=1e-9
-    )
+    return np.array_equal(form.vertices(), other.vertices())
 
 
-def scene_extent(
-    model: RobotModel,
-    wrenches: ConstraintWrenches,
-    state: FloatArray,
-    scene_graph: SceneGraph | None = None,
-) -> tuple[FloatArray, float]:
-    """Returns the center and the diagonal, m, of the box around a robot and its contact points.
+def floor_below(points: FloatArray, surfaces: Sequence[DrawnSurface] = ()) -> Floor:
+    """A grid slightly below points, m, shape (k, 3), or on a horizontal plane near the lowest.
 
-    Args:
-        model: The robot.
-        wrenches: Its constraint wrenches.
-        state: x, or only its first part, the link state (q, v).
-        scene_graph: The geometry of its links; None if only the links' origins count.
+    The side of a cell is 1, 2 or 5 times a power of ten.
     """
-    points = scene_points(model, wrenches, state[None], scene_graph)
-    low, high = points.min(axis=0), points.max(axis=0)
-    return (low + high) / 2, max(float(np.linalg.norm(high - low)), 1e-3)
+    size, low, high = diagonal(points), points.min(axis=0), points.max(axis=0)
+    power = 10.0 ** np.floor(np.log10(size / _CELLS) + 1e-9)
+    cell = power * max(step for step in (1, 2, 5) if step * power <= size / _CELLS * (1 + 1e-9))
+    height = low[2] - 0.003 * size
+    for surface in surfaces:
+        pose, form = surface.pose @ surface.picture.pose, surface.picture.form
+        if isinstance(form, Box) and pose.rotation().matrix()[2, 2] > 1.0 - 1e-6:
+            level = pose.translation()[2] + form.height() / 2.0
+            if abs(level - low[2]) < _NEAR * size:
+                height = level + 0.003 * size
+    first, last = np.floor(low[:2] / cell) - 1, np.ceil(high[:2] / cell) + 1
+    xs, ys = (cell * np.arange(a, b + 0.5) for a, b in zip(first, last, strict=True))
+    begins = [*((x, ys[0], height) for x in xs), *((xs[0], y, height) for y in ys)]
+    ends = [*((x, ys[-1], height) for x in xs), *((xs[-1], y, height) for y in ys)]
+    return Floor(float(cell), np.array(begins), np.array(ends))
+
+
+def diagonal(points: FloatArray) -> float:
+    """The diagonal of the bounding box of points, shape (k, 3), at least 1 mm."""
+    return max(float(np.linalg.norm(np.ptp(points, axis=0))), 1e-3)
 
 
 def scene_points(
@@ -127,7 +131,7 @@ def scene_points(
     states: FloatArray,
     scene_graph: SceneGraph | None = None,
 ) -> FloatArray:
-    """Returns points that enclose a robot and its contact points, m, shape (k, 3).
+    """Points that enclose a robot and its contact points, m, shape (k, 3).
 
     Args:
         model: The robot.
@@ -136,31 +140,27 @@ def scene_points(
         scene_graph: The geometry of its links; None if only the links' origins count.
     """
     links, dae = model.links, model.dae
-    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
     # The world's origin is not a part of the robot.
-    is_link = [name != "world" for name in links.landmark_names]
-    origins = links.landmarks()
-    if any(is_link):
-        origins = origins[:, np.flatnonzero(is_link).tolist()]
+    own = [k for k, name in enumerate(links.landmark_names) if name != "world"]
+    origins = links.landmarks()[:, own] if own else links.landmarks()
+    inputs = {"q": links.q, "parameters": dae.parameter_symbol}
     landmarks = TracedFunction("landmarks", inputs, {"points": origins})
     no_force, points = np.zeros(len(dae.force_signals)), []
     for state in states:
         values = landmarks(state[: links.q.numel()], dae.parameter_values)[0]
-        points.append(values.reshape(3, -1, order="F").T)
-        points.append(wrenches(state, no_force).points)
+        points += [values.reshape(3, -1, order="F").T, wrenches(state, no_force).points]
     return np.vstack([*points, _corners(model, states, scene_graph)])
 
 
 def _corners(model: RobotModel, states: FloatArray, scene_graph: SceneGraph | None) -> FloatArray:
-    """Returns corners and middles of the bounding boxes of the links' geometry, m, (k, 3)."""
-    plant = model.links.plant
+    """Corners and middles of the bounding boxes of the links' geometry, m, (k, 3)."""
+    plant, corners = model.links.plant, [np.zeros((0, 3))]
     if scene_graph is None or plant is None or plant.get_source_id() is None:
-        return np.zeros((0, 3))
+        return corners[0]
     inspector, context = scene_graph.model_inspector(), plant.CreateDefaultContext()
     signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1)
     boxes = []
-    for number in range(1, plant.num_bodies()):
-        body = plant.get_body(BodyIndex(number))
+    for body in map(plant.get_body, map(BodyIndex, range(1, plant.num_bodies()))):
         for geometry in plant.GetVisualGeometriesForBody(body):
             try:
                 box = inspector.GetObbInGeometryFrame(geometry)
@@ -169,7 +169,6 @@ def _corners(model: RobotModel, states: FloatArray, scene_graph: SceneGraph | No
             if box is not None:
                 pose = inspector.GetPoseInFrame(geometry) @ box.pose()
                 boxes.append((body, pose.multiply(signs * box.half_width()[:, None])))
-    corners = [np.zeros((0, 3))]
     for state in states:
         plant.SetPositions(context, state[: plant.num_positions()])
         corners += [plant.EvalBodyPoseInWorld(context, body).multiply(box).T for body, box in boxes]

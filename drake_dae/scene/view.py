@@ -21,12 +21,13 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots import ConstraintWrenches
 from drake_dae.scene.arrows import ConstraintForceVisualizer, ForceArrows, path_of
-from drake_dae.scene.floor import Floor, floor_below
-from drake_dae.scene.framing import ViewAngles, direction_of, framed
-from drake_dae.scene.small_meshes import shrink_meshes
+from drake_dae.scene.camera import direction_of, framed, view_angles
+from drake_dae.scene.meshes import shrink_meshes
 from drake_dae.scene.surroundings import (
     DrawnSurface,
-    scene_extent,
+    Floor,
+    diagonal,
+    floor_below,
     scene_points,
     surroundings,
 )
@@ -52,7 +53,6 @@ ARROW = 0.2
 """The length of the longest arrow, as a fraction of the scene's size."""
 
 _FLOOR_COLOR = Rgba(0.8, 0.8, 0.8, 1.0)
-
 _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
 
@@ -70,18 +70,13 @@ def start_meshcat(host: str = "localhost") -> Meshcat:
         meshcat = Meshcat(MeshcatParams(host=host))
     except RuntimeError as error:
         raise OSError(errno.EADDRINUSE, f"no port for Meshcat: {error}") from None
-    meshcat.SetProperty("/Background", "visible", False)
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
+    for part in ("/Background", "/Grid", "/Axes"):
+        meshcat.SetProperty(part, "visible", False)
     return meshcat
 
 
 def start_unwatched_meshcat() -> Meshcat:
-    """Starts a Meshcat server that only writes a page: Drake does not print its address.
-
-    Raises:
-        OSError: There is no free port.
-    """
+    """Starts a Meshcat server that only writes a page: Drake does not print its address."""
     log = logging.getLogger("drake")
     level = log.level
     log.setLevel(logging.WARNING)
@@ -98,14 +93,10 @@ def add_live_view(
     meshcat: Meshcat,
     exogenous: OutputPort | None = None,
 ) -> None:
-    """Adds the live view of a robot, drawn `FRAME_RATE` times a second.
+    """Adds the view of a robot, drawn `FRAME_RATE` times a second, to a diagram with its plant.
 
-    Args:
-        builder: The builder of the diagram, with the plant in it.
-        plant: The plant; nothing is drawn if it is not a robot.
-        scene_graph: The geometry of the links' MultibodyPlant, or None.
-        meshcat: The Meshcat to draw in.
-        exogenous: The port that is connected to the plant's input `exogenous`, if any.
+    Nothing is drawn if the plant is not a robot. `exogenous` is what the plant's input of this name
+    is connected to.
     """
     if plant.model is None:
         return
@@ -128,12 +119,7 @@ def add_live_view(
 def draw_scene(
     plant: Plant, meshcat: Meshcat, scene_graph: SceneGraph | None = None
 ) -> ForceArrows:
-    """Draws the static parts of a robot's scene, and returns the force arrows.
-
-    Args:
-        plant: The robot.
-        meshcat: The Meshcat to draw in.
-        scene_graph: The geometry of its links, or None.
+    """Draws the static parts of a robot's scene at its nominal state; returns the force arrows.
 
     Raises:
         ModelError: The plant is not a robot.
@@ -141,51 +127,42 @@ def draw_scene(
     model, dae = plant.robot("a view"), plant.dae
     state = plant.structure.manifold.project(dae.nominal_state)
     wrenches = ConstraintWrenches(model)
-    _, size = scene_extent(model, wrenches, state, scene_graph)
-    points = wrenches(state, np.zeros(len(dae.force_signals))).points[None]
-    surfaces = surroundings(model, wrenches, points, dae.parameter_values, PIECE * size)
-    draw_surroundings(meshcat, surfaces)
     robot = scene_points(model, wrenches, state[None], scene_graph)
-    draw_floor(meshcat, floor_below(robot, surfaces))
-    direction = direction_of(robot, points[0], np.zeros_like(points[0]))
-    look_at(meshcat, *framed(robot, direction, ViewAngles.of(CAMERA_ANGLE, ASPECT)))
+    size, points = diagonal(robot), wrenches(state, np.zeros(len(dae.force_signals))).points
+    surfaces = surroundings(model, wrenches, points[None], dae.parameter_values, PIECE * size)
+    draw_surroundings(meshcat, surfaces, floor_below(robot, surfaces))
+    direction = direction_of(robot, points, np.zeros_like(points))
+    look_at(meshcat, *framed(robot, direction, view_angles(CAMERA_ANGLE, ASPECT)))
     return ForceArrows(meshcat, model, ARROW * size)
 
 
 def look_at(meshcat: Meshcat, eye: FloatArray, at: FloatArray) -> None:
-    """Sets the pose of the camera.
-
-    Args:
-        meshcat: The Meshcat.
-        eye: The position of the camera, m, shape (3,).
-        at: The point that the camera looks at, m, shape (3,).
-    """
+    """Places the camera at a point `eye`, looking at a point `at`, m, shape (3,)."""
     meshcat.SetProperty("/Cameras/default/rotated/<object>", "fov", float(np.rad2deg(CAMERA_ANGLE)))
     meshcat.SetCameraPose(eye, at)
 
 
-def draw_floor(meshcat: Meshcat, floor: Floor) -> None:
-    """Draws the grid below a robot."""
-    begin, end = (np.asfortranarray(points.T) for points in floor.lines)
-    meshcat.SetLineSegments("/floor", begin, end, 1.0, _FLOOR_COLOR)
+def draw_surroundings(meshcat: Meshcat, surfaces: Sequence[DrawnSurface], floor: Floor) -> None:
+    """Draws the surfaces that a robot touches, and the grid below it."""
+    begins, ends = np.asfortranarray(floor.begins.T), np.asfortranarray(floor.ends.T)
+    meshcat.SetLineSegments("/floor", begins, ends, 1.0, _FLOOR_COLOR)
+    for surface in surfaces:
+        path = path_of(surface.constraint, "surface")
+        meshcat.SetObject(f"{path}/form", surface.picture.form, rgba=_SURFACE_COLOR)
+        meshcat.SetTransform(f"{path}/form", surface.picture.pose)
+        meshcat.SetTransform(path, surface.pose)
 
 
 def view_of_links(
     plant: Plant, scene_graph: SceneGraph | None, meshcat: Meshcat, period: float = _ON_REQUEST
 ) -> Diagram | None:
-    """Returns a diagram that draws a robot's links in Meshcat for its input, the link state (q, v).
+    """A diagram that draws a robot's links in Meshcat for its input, the link state (q, v).
 
     The links' MultibodyPlant computes the poses of the links, and is not simulated. What is drawn
-    on request goes into a page, with coarser meshes if these are large.
-
-    Args:
-        plant: The robot.
-        scene_graph: The geometry of the links' MultibodyPlant, or None. The diagram has a copy.
-        meshcat: The Meshcat to draw in.
-        period: The time between pictures in s; by default only a forced publish draws.
+    on request, by a forced publish, goes into a page, with coarser meshes if these are large.
 
     Returns:
-        The diagram, or None if the links have no geometry.
+        The diagram, with a copy of the geometry; None if the links have none.
     """
     links = plant.robot("a view").links.plant
     if scene_graph is None or links is None or links.get_source_id() is None:
@@ -202,17 +179,3 @@ def view_of_links(
     diagram = builder.Build()
     diagram.set_name("view_of_links")
     return diagram
-
-
-def draw_surroundings(meshcat: Meshcat, surfaces: Sequence[DrawnSurface]) -> None:
-    """Draws the surfaces that a robot touches.
-
-    Args:
-        meshcat: The Meshcat to draw in.
-        surfaces: The surfaces.
-    """
-    for surface in surfaces:
-        path = path_of(surface.constraint, "surface")
-        meshcat.SetObject(f"{path}/form", surface.picture.form, rgba=_SURFACE_COLOR)
-        meshcat.SetTransform(f"{path}/form", surface.picture.pose)
-        meshcat.SetTransform(path, surface.pose)

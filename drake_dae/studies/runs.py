@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_dae.analysis.limits import SignalLimits
+from drake_dae.analysis.limits import SignalLimits, robot_limits
 from drake_dae.arrays import brief
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
@@ -25,15 +25,13 @@ from drake_dae.errors import (
     ScenarioError,
     SimulationError,
 )
-from drake_dae.running.limits import ranges_of, robot_limits
 from drake_dae.running.rollout.program import program_of
 from drake_dae.running.simulate import simulate
 from drake_dae.running.summary import figures_of
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.files import varied_data
-from drake_dae.scenario.parts.parts import Matrices
+from drake_dae.scenario.parts import Matrices
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
-from drake_dae.scenario.scenario import Scenario, read_scenario
+from drake_dae.scenario.scenario import Scenario, read_scenario, varied_data
 from drake_dae.scenario.start import start_scenario
 from drake_dae.studies.variations import Variation
 
@@ -156,7 +154,7 @@ class Runner:
             return RunResult(Outcome.REFUSED, str(error))
         except Exception as error:  # A sweep of thousands of runs goes on.
             return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
-        ranges = ranges_of(_limits(loop), record)
+        ranges = _limits(loop).ranges(record.time, _limits(loop).of_record(record))
         figures, exceeded = (
             figures_of(record, ranges),
             tuple(r.signal.name for r in ranges if r.excess),

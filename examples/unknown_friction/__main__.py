@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 import drake_dae as dd
+from drake_dae.errors import DrakeDaeError
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.scenario import Scenario
@@ -220,7 +221,7 @@ def main(arguments: list[str] | None = None) -> int:
             continue
         try:
             row = figures(condition)
-        except dd.DrakeDaeError as error:
+        except DrakeDaeError as error:
             print(f"{condition.name:32}{str(error)[:100]}", flush=True)
             kept = kept and condition not in TUNED
             continue

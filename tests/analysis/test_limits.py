@@ -8,11 +8,10 @@ from numpy.testing import assert_allclose
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from drake_dae import ConstantReference, DaeSystem, SinusoidReference, ZeroDynamics, load_scenario
-from drake_dae.analysis.limits import LimitKind, SignalLimits, limits_along
+from drake_dae.analysis.limits import LimitKind, SignalLimits, limits_along, robot_limits
 from drake_dae.dae import Signal, find_structure
 from drake_dae.errors import ScenarioError
 from drake_dae.running.judgement import FindingKind
-from drake_dae.running.limits import robot_limits
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run

@@ -26,14 +26,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, EventStatus, Leaf
 from pydrake.systems.primitives import Adder, LogVectorOutput, MatrixGain, RandomSource
 from scipy.linalg import eigh
 
-from drake_dae import (
-    ContactPlant,
-    ControlHold,
-    Encoders,
-    ReferenceGenerator,
-    load_scenario,
-    simulate,
-)
+from drake_dae import ContactPlant, Encoders, ReferenceGenerator, load_scenario, simulate
 from drake_dae.arrays import FloatArray
 from drake_dae.errors import DrakeDaeError
 from drake_dae.scenario import plants
@@ -41,6 +34,7 @@ from drake_dae.scenario.build import build_completed, make_plant
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.start import start_scenario
+from drake_dae.systems import ControlHold
 
 FRICTION, PERIOD, SETTLED = 0.3, 1e-3, 2.0
 DURATION = SETTLED + np.pi  # Half a turn, and a period of the force.

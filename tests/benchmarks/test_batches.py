@@ -10,15 +10,12 @@ import pytest
 from runs import scenario
 from timing import has_compiler
 
-from drake_dae import (
-    build_scenario,
-    grid_variations,
-    rollout,
-    start_values,
-)
+from drake_dae import build_scenario, rollout
+from drake_dae.running import start_values
 from drake_dae.running.rollout import rollout as module
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import scenario_data
+from drake_dae.studies import grid_variations
 from drake_dae.studies.runs import Runner
 
 FIXED = [

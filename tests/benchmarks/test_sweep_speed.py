@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from runs import scenario
 
-from drake_dae import grid_variations, sweep
+from drake_dae import sweep
 from drake_dae.running.rollout.run import num_cores
+from drake_dae.studies import grid_variations
 
 
 def starts(count):

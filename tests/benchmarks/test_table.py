@@ -31,8 +31,8 @@ from drake_dae import (
     poles,
     rollout,
     simulate,
-    start_values,
 )
+from drake_dae.running import start_values
 
 SPRINGS = FlexibleJoints(8000.0, inertia=1.0)
 MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)

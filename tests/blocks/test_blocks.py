@@ -21,7 +21,8 @@ from pydrake.systems.primitives import (
 )
 from runs import scenario
 
-from drake_dae import Block, Held, Requirement, TracedSystem, build_scenario, compile_diagram
+from drake_dae import Block, TracedSystem, build_scenario, compile_diagram
+from drake_dae.blocks import Held, Requirement
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 
 # Round-off of a handful of operations.

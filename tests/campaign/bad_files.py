@@ -12,12 +12,9 @@ from pathlib import Path
 import numpy as np
 from campaign.outcomes import RAW, REFUSED, Outcome, checked
 
-from drake_dae import (
-    Record,
-)
+from drake_dae import Record
 from drake_dae.cli import main
-from drake_dae.scenario.robot_file.changes import finalize
-from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.reading import finalize, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import FOLDER
 

@@ -13,9 +13,9 @@ import yaml
 from campaign.outcomes import Outcome, checked
 
 from drake_dae import build_scenario, load_scenario, simulate
-from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_yaml
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import FOLDER, shipped_scenarios
+from drake_dae.scenario.typed_yaml import dump_yaml, load_yaml
 from drake_dae.systems.plants.dae_plant import DaePlant
 
 URDFS = {"two_link_arm": "two_link_wall", "five_bar": "five_bar"}

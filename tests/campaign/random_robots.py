@@ -28,7 +28,6 @@ from drake_dae import (
     FlexibleJoints,
     ImplicitSurface,
     JointPositions,
-    LoopSettings,
     Plane,
     PointCoordinates,
     PointOnSurface,
@@ -47,6 +46,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.dae import find_structure
+from drake_dae.diagrams import LoopSettings
 from drake_dae.robots import Constraint, MultibodyExpressions, PositionOutput, Stage, Surface
 
 Random = np.random.Generator

@@ -22,7 +22,7 @@ from drake_dae.cli import main
 from drake_dae.commands import scenarios, simulate
 from drake_dae.commands.folder import FILES, PART
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
-from drake_dae.pictures.plots import PLOTS
+from drake_dae.pictures import PLOTS
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
 
 PLOTTED = "write.plots=true"

@@ -17,8 +17,7 @@ import drake_dae
 from drake_dae import Record
 from drake_dae.cli import main
 from drake_dae.commands import simulate
-from drake_dae.pictures import run_pictures
-from drake_dae.pictures.plots import PLOTS
+from drake_dae.pictures import PLOTS
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scene import view
 
@@ -134,7 +133,7 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
     monkeypatch.setattr(os, "pwrite", write)
     monkeypatch.setattr(np, "savez_compressed", fill)
     monkeypatch.setattr(Figure, "savefig", fill)
-    monkeypatch.setattr(run_pictures, "animate", fill)
+    monkeypatch.setattr(simulate, "make_animation", fill)
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=5"]
     assert main([*arguments, "--set", "write.plots=true"]) == 1
     out, err = capsys.readouterr()

@@ -16,8 +16,7 @@ from drake_dae.cli import main
 from drake_dae.commands import written
 from drake_dae.running.rollout.run import num_cores
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.files import save_scenario
-from drake_dae.scenario.scenario import read_scenario
+from drake_dae.scenario.scenario import read_scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 from drake_dae.scenario.start import start_scenario
 

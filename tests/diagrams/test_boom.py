@@ -7,9 +7,7 @@ from numpy.testing import assert_allclose
 from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from runs import run_scenario, scenario
 
-from drake_dae import (
-    build_scenario,
-)
+from drake_dae import build_scenario
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.judging import find_feasibility
 

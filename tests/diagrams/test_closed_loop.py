@@ -13,12 +13,7 @@ from arms import (
 )
 from runs import run
 
-from drake_dae import (
-    ConstantReference,
-    RobotPlant,
-    SinusoidReference,
-    make_closed_loop,
-)
+from drake_dae import ConstantReference, RobotPlant, SinusoidReference, make_closed_loop
 
 ARMS = ["two_link", "seven_joint"]
 

@@ -8,12 +8,13 @@ import pytest
 from meshes import obj_of_grid
 from runs import run_scenario, scenario
 
-from drake_dae import complete_scenario, load_scenario
+from drake_dae import load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario import complete_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.model import scenario_model
+from drake_dae.scenario.scenario import save_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction
 

@@ -7,9 +7,11 @@ from pydrake.math import RollPitchYaw
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
-from drake_dae import DisturbanceForce, build_scenario, rollout, start_values
+from drake_dae import build_scenario, rollout
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.running import start_values
 from drake_dae.scenario.model import scenario_model
+from drake_dae.systems import DisturbanceForce
 
 W = 25.0
 STILL = (

@@ -11,13 +11,13 @@ from drake_dae import (
     ConstantReference,
     DcMotors,
     ForceSensor,
-    LoopSettings,
     RobotPlant,
     TrackingLaw,
     build_scenario,
     make_closed_loop,
     poles,
 )
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ScenarioError, WiringError
 
 REFERENCES = [ConstantReference(0.3), ConstantReference(20.0)]

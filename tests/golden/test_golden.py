@@ -26,7 +26,7 @@ from golden.recording import (
 )
 from runs import DEAR, some
 
-from drake_dae import export_code
+from drake_dae.running import export_code
 from drake_dae.running.export.parts import parts_of
 
 KEPT = np.load(FIXTURE)

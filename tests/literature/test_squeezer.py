@@ -13,7 +13,8 @@ import scipy.integrate
 from arms import error_controlled
 from numpy.testing import assert_allclose
 
-from drake_dae import DaePlant, DaeSystem, Signal, find_constraint_structure, simulate
+from drake_dae import DaePlant, DaeSystem, Signal, simulate
+from drake_dae.dae import find_constraint_structure
 
 # Masses in kg, inertias in kg m^2, lengths in m, a spring in N/m, and the motor's torque in N m.
 M_1, M_2, M_3, M_4, M_5, M_6, M_7 = 0.04325, 0.00365, 0.02373, 0.00706, 0.0705, 0.00706, 0.05498

@@ -14,7 +14,6 @@ from pydrake.multibody.tree import RpyFloatingJoint, SpatialInertia
 from scipy.optimize import brentq
 
 from drake_dae import (
-    Blade,
     CoincidentPoints,
     DaePlant,
     DaeSystem,
@@ -25,11 +24,11 @@ from drake_dae import (
     PointOnSurface,
     RobotModel,
     RobotPlant,
-    RollingBall,
     Signal,
     Sphere,
     simulate,
 )
+from drake_dae.robots import Blade, RollingBall
 
 G = 9.81
 NOTHING = np.zeros((3, 0))

@@ -5,8 +5,9 @@ from math import factorial
 import numpy as np
 import pytest
 
-from drake_dae import CircleReference, LineReference, PathLimits, SpiralReference
+from drake_dae import CircleReference, LineReference
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references import PathLimits, SpiralReference
 
 LIMITS = PathLimits(0.2, 1.0, 8.0)
 

@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 from pydrake.trajectories import PiecewisePolynomial
 
-from drake_dae import (
-    ConstantReference,
-    ExpressionReference,
-    PointToPointReference,
-    TrajectoryReference,
-    references_by_name,
-)
+from drake_dae import ConstantReference, ExpressionReference, PointToPointReference
 from drake_dae.errors import ReferenceSignalError
-from drake_dae.references import stack_references
+from drake_dae.references import references_by_name, stack_references
+from drake_dae.systems import TrajectoryReference
 
 OUTPUTS = ["tool.x", "tool.y", "tool.z", "tool.z_axis.x", "left::joint3", "pipe.angle"]
 OUTPUTS += ["pipe.along", "pipe.force", "grip.x", "grip.y"]

@@ -6,8 +6,9 @@ import pytest
 from runs import both
 from scipy.interpolate import BSpline
 
-from drake_dae import PathLimits, PolylineReference
+from drake_dae import PolylineReference
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references import PathLimits
 from drake_dae.references.polynomials import UNROLLED, PiecewisePolynomials
 from drake_dae.references.splines import TimeSpline, basis_pieces
 from drake_dae.trace.functions import TracedFunction

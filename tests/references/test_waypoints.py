@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from drake_dae import PathLimits, PointToPointReference, WaypointsReference
+from drake_dae import PointToPointReference, WaypointsReference
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references import PathLimits
 
 POINTS = [[0.0, 0.0], [0.2, 0.1], [0.3, -0.1], [0.5, 0.0]]
 TIMES = [0.5, 1.5, 2.0, 3.5]

@@ -14,13 +14,12 @@ from drake_dae import (
     ForceCombination,
     ForceOutput,
     JointCoupler,
-    NamedForce,
     RobotModel,
     Signal,
     Squeeze,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots import ConstraintSet, as_force_outputs, force_rows
+from drake_dae.robots import ConstraintSet, NamedForce, as_force_outputs, force_rows
 from drake_dae.scenario.model import scenario_model
 from drake_dae.trace.functions import TracedFunction
 

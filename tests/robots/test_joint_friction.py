@@ -7,15 +7,9 @@ from arms import arm, numbers, parse
 from numpy.testing import assert_allclose
 from pydrake.systems.analysis import Simulator
 
-from drake_dae import (
-    CompliantPlant,
-    JointFriction,
-    PointMaterial,
-    RobotModel,
-    build_scenario,
-    load_scenario,
-)
+from drake_dae import CompliantPlant, JointFriction, RobotModel, build_scenario, load_scenario
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.systems import PointMaterial
 
 COULOMB, VISCOUS, SLOW = np.array([3.0, 0.5]), np.array([0.2, 0.1]), 0.01
 

@@ -12,9 +12,6 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from drake_dae import (
     ExpressionReference,
     FlexibleJoints,
-    KnownForce,
-    KnownWrench,
-    LoopSettings,
     RobotModel,
     RobotPlant,
     SinusoidReference,
@@ -23,7 +20,9 @@ from drake_dae import (
     make_closed_loop,
     poles,
 )
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.robots import KnownForce, KnownWrench
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.shipped import find_scenario
 

@@ -18,11 +18,11 @@ from drake_dae import (
     RobotPlant,
     TrackingLaw,
     find_structure,
-    gain_matrices,
     make_closed_loop,
     poles,
     simulate,
 )
+from drake_dae.dae import gain_matrices
 
 STIFFNESS = np.tile([2e4, 2e4, 1e4, 1e4, 5e3, 2e3, 2e3], 2)
 START = [APART / 2 + 0.02, -0.03, 0.42, 0.03, -0.02, 0.04, 0.05, -0.06]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from runs import same_records, scenario
 
-from drake_dae import Record, RecordWriter, build_scenario, simulate
+from drake_dae import Record, build_scenario, simulate
 from drake_dae.errors import ModelError
-from drake_dae.running import record_writer
+from drake_dae.running import RecordWriter, record_writer
 
 
 @pytest.fixture

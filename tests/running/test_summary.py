@@ -7,11 +7,10 @@ import pytest
 from arms import arm
 
 from drake_dae import Record, Signal
-from drake_dae.analysis.limits import LimitKind, SignalRange
+from drake_dae.analysis.limits import LimitKind, SignalRange, robot_limits
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.running.judgement import judge
-from drake_dae.running.limits import ranges_of, robot_limits
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary, figures_of
 
@@ -181,7 +180,7 @@ def test_an_empty_record_has_no_figures():
     rows = {name: Recorded(r.values[:0], r.signals) for name, r in full.signals.items()}
     empty = Record(np.zeros(0), rows)
     limits = robot_limits(arm("two_link").model)
-    assert ranges_of(limits, empty) == ()
+    assert limits.ranges(empty.time, limits.of_record(empty)) == ()
     assert figures_of(empty, ()) == {}
 
 

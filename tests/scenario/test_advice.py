@@ -9,21 +9,16 @@ from arms import numbers
 from pydrake.systems.analysis import Simulator
 from runs import scenario
 
-from drake_dae import (
-    build_scenario,
-    contact_gains,
-    load_scenario,
-)
+from drake_dae import build_scenario, contact_gains, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario import parts as parts
 from drake_dae.scenario import plants
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.gains import advised, sensed_contact
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model, scenario_structure
-from drake_dae.scenario.parts import parts as parts
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, save_scenario
 
 PLANT = "plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, friction: 0.3}"
 STILL = "references={tool.z: 0.3, wall.force: 20}"

@@ -6,8 +6,9 @@ from by_inputs import set_inputs
 from pydrake.systems.analysis import SimulatorConfig
 from runs import run, scenario
 
-from drake_dae import build_commanded, build_scenario
+from drake_dae import build_scenario
 from drake_dae.running.bench.inputs import Inputs
+from drake_dae.scenario import build_commanded
 from drake_dae.scenario.shipped import shipped_scenarios
 
 FIXED = SimulatorConfig(

@@ -9,13 +9,14 @@ from arms import numbers
 from numpy.testing import assert_allclose
 from runs import scenario
 
-from drake_dae import Record, build_scenario, grid_variations, load_scenario, sweep
+from drake_dae import Record, build_scenario, load_scenario, sweep
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.running.phases import phase_spans
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.studies import grid_variations
 
 # At rest 20 mm before the wall, which gives way.
 SHORT = """

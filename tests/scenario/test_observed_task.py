@@ -6,18 +6,10 @@ from numpy.testing import assert_allclose
 from pydrake.systems.analysis import Simulator
 from runs import run_scenario, some
 
-from drake_dae import (
-    Approach,
-    Press,
-    Record,
-    Task,
-    build_scenario,
-    grid_variations,
-    load_scenario,
-    sweep,
-)
+from drake_dae import Approach, Press, Record, Task, build_scenario, load_scenario, sweep
 from drake_dae.cli import main
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.studies import grid_variations
 
 # At rest 20 mm before the wall, whose friction the law takes for zero.
 OBSERVED = """

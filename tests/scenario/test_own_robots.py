@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 from scenario_texts import LEVER, lever, run
 
-from drake_dae import (
-    build_scenario,
-    load_scenario,
-)
+from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
 
 MESH = """v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"""

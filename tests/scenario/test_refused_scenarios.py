@@ -3,10 +3,7 @@
 import pytest
 from scenario_texts import two_link
 
-from drake_dae import (
-    build_scenario,
-    load_scenario,
-)
+from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.shipped import find_scenario
 

@@ -12,7 +12,6 @@ from two_arms import GRASP, two_arms
 from drake_dae import (
     AxisCoordinates,
     AxisNormalToSurface,
-    Blade,
     CoincidentPoints,
     ConstantReference,
     Cylinder,
@@ -28,7 +27,6 @@ from drake_dae import (
     PointCoordinates,
     PointOnSurface,
     PointToPointReference,
-    RollingBall,
     RollingWheel,
     SinusoidReference,
     Sphere,
@@ -38,11 +36,11 @@ from drake_dae import (
     load_scenario,
 )
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.files import save_scenario
-from drake_dae.scenario.parts import parts as forms
-from drake_dae.scenario.parts import written
+from drake_dae.robots import Blade, RollingBall
+from drake_dae.scenario import parts as forms
+from drake_dae.scenario import parts as written
 from drake_dae.scenario.robot_file.robot import Pose, Robot
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction
 

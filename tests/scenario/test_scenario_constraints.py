@@ -8,10 +8,10 @@ from runs import run_scenario, scenario_validator, untagged
 from drake_dae import build_scenario, load_scenario
 from drake_dae.analysis.limits import LimitKind
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.forms.typed_yaml import load_yaml
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import find_scenario
+from drake_dae.scenario.typed_yaml import load_yaml
 
 BODY = """<link name="{name}"><inertial><origin xyz="0 0 0"/><mass value="{mass}"/>
 <inertia ixx="{i}" iyy="{i}" izz="{i}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""

@@ -9,16 +9,14 @@ from drake_dae import (
     CircleReference,
     CsvReference,
     LineReference,
-    PathLimits,
     PolylineReference,
-    SpiralReference,
     WaypointsReference,
     build_scenario,
     load_scenario,
 )
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.files import save_scenario
-from drake_dae.scenario.scenario import scenario_data
+from drake_dae.references import PathLimits, SpiralReference
+from drake_dae.scenario.scenario import save_scenario, scenario_data
 from drake_dae.scenario.shipped import find_scenario
 
 GENTLE = "limits: {speed: 0.2, acceleration: 1}"

@@ -7,7 +7,8 @@ import pytest
 from found_places import found_off
 from runs import scenario
 
-from drake_dae import build_scenario, rollout, start_values
+from drake_dae import build_scenario, rollout
+from drake_dae.running import start_values
 
 DURATION = 12.1  # Until the part is polished.
 BALL = "plant=!CompliantContact {friction: 0.3, radius: 0.01}"

@@ -8,8 +8,9 @@ import re
 
 import pytest
 
-from drake_dae import load_scenario, scenario_schema
+from drake_dae import load_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario import scenario_schema
 from drake_dae.scenario.shipped import shipped_scenarios
 
 KINDS = {"key": 90, "value": 90, "tag": 60, "text": 60}

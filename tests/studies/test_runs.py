@@ -5,12 +5,11 @@ import pytest
 from runs import run_scenario, scenario, some
 
 from drake_dae import build_scenario
+from drake_dae.analysis.limits import robot_limits
 from drake_dae.errors import ScenarioError
-from drake_dae.running.limits import ranges_of, robot_limits
 from drake_dae.running.summary import figures_of
-from drake_dae.scenario.files import varied_data
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
-from drake_dae.scenario.scenario import read_scenario, scenario_data
+from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
 from drake_dae.scenario.start import start_scenario
 from drake_dae.studies.runs import Outcome, Runner, structure_of
 
@@ -36,7 +35,8 @@ def alone(base, changes):
     """The figures of a variation in a closed loop of its own."""
     chosen = read_scenario(varied_data(base, changes))
     loop, _, record = run_scenario(chosen)
-    return figures_of(record, ranges_of(robot_limits(loop.plant.model), record))
+    limits = robot_limits(loop.plant.model)
+    return figures_of(record, limits.ranges(record.time, limits.of_record(record)))
 
 
 def check(base, changes, result, tolerance=0.0):
@@ -234,7 +234,9 @@ def test_a_rollout_is_that_of_the_scenario_alone():
     rolled = for_rollout(read_scenario(varied_data(scenario_data(chosen), {"plant.friction": 0.2})))
     loop, _ = build_scenario(rolled[0])
     rollout = roll_scenario(rolled[0], loop, start_scenario(rolled[0], loop))
-    wanted = figures_of(rollout.record, ranges_of(robot_limits(loop.plant.model), rollout.record))
+    limits = robot_limits(loop.plant.model)
+    ranges = limits.ranges(rollout.record.time, limits.of_record(rollout.record))
+    wanted = figures_of(rollout.record, ranges)
     assert result.figures == {**wanted, "steps": float(rollout.steps)}
 
 

@@ -17,6 +17,7 @@ from runs import scenario, some
 
 import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.studies import grid_variations
 from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.studies.study import FILES, Study
 
@@ -24,7 +25,7 @@ KEYS = {
     "start.errors.tool.z": np.linspace(-0.05, 0.05, 10),
     "plant.parameters.link1.mass": [9.0, 11.0],
 }
-VARIATIONS = dd.grid_variations(KEYS)
+VARIATIONS = grid_variations(KEYS)
 COUNT = len(VARIATIONS)
 SETTINGS = ("duration=0.5", "compiled=false")
 

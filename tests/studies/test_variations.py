@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from drake_dae import grid_variations, listed_variations, random_variations
 from drake_dae.errors import ScenarioError
+from drake_dae.studies import grid_variations, listed_variations, random_variations
 from drake_dae.studies.variations import parse_variations
 
 

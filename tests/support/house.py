@@ -26,12 +26,13 @@ FLOORS = (
     ("trace",),
     ("dae",),
     ("references",),
-    ("analysis", "robots"),
+    ("robots",),
     ("blocks",),
     ("systems",),
     ("scene",),
     ("compiler",),
     ("diagrams",),
+    ("analysis",),
     ("running",),
     ("pictures",),
     ("scenario",),
@@ -44,7 +45,7 @@ FLOORS = (
 ROOMS = tuple(room for floor in FLOORS for room in floor)
 
 # The mathematics can be read, tested and used without Drake.
-WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references", "analysis")
+WITHOUT_DRAKE = ("errors", "arrays", "files", "arguments", "trace", "dae", "references")
 
 # The order of the paper: a file of dae imports only files (or folders) before it.
 PAPER = (

@@ -10,10 +10,11 @@ import casadi as ca
 import numpy as np
 from pydrake.systems.framework import BasicVector, LeafSystem
 
-from drake_dae import Controller, ForceOutput, Plant, PointOnSurface
+from drake_dae import ForceOutput, PointOnSurface
 from drake_dae.dae import Signal
 from drake_dae.robots import Application, AttachedStage, Constraint, Stage, Surface
 from drake_dae.robots.actuation.numbers import diagonal_parameter
+from drake_dae.systems import Controller, Plant
 from drake_dae.systems.task.phases import Phase
 
 

@@ -15,10 +15,7 @@ from drake_dae import (
     Approach,
     ClosedLoop,
     CompliantPlant,
-    KnownForce,
-    LoopSettings,
     Move,
-    PointMaterial,
     PointToPointReference,
     Press,
     Release,
@@ -28,13 +25,14 @@ from drake_dae import (
     Task,
     TaskController,
     TrackingLaw,
-    open_contact,
     poles,
     shipped_model,
     simulate,
-    wire_loop,
 )
+from drake_dae.diagrams import LoopSettings, wire_loop
+from drake_dae.robots import KnownForce
 from drake_dae.running.simulate import RunStatistics
+from drake_dae.systems import PointMaterial, open_contact
 from drake_dae.systems.task.phases import Phase
 
 SPEED, OVER, FAR = 0.05, 0.2, 0.02

@@ -3,9 +3,7 @@
 import numpy as np
 from runs import run_scenario
 
-from drake_dae import (
-    load_scenario,
-)
+from drake_dae import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 
 ONE_JOINT = """<robot name="lever"><link name="world"/>

@@ -14,7 +14,7 @@ from runs import IN_CONTACT, each_scenario, some
 
 from drake_dae import DaeSystem, build_scenario
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
-from drake_dae.scenario.files import load_scenario
+from drake_dae.scenario.scenario import load_scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.compiled import attempts
 from drake_dae.trace.compiler import Compiler, find_compiler

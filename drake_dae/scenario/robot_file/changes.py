@@ -1,16 +1,19 @@
-"""The changes that a scenario makes to its robot: base, locked joints, actuators, payloads."""
+"""What a scenario changes of its robot, and loops of joints, which become constraints."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from math import isfinite
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
+    JacobianWrtVariable,
     Joint,
+    JointActuator,
     PrismaticJoint,
     RevoluteJoint,
     RpyFloatingJoint,
@@ -19,35 +22,53 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 
-from drake_dae.arrays import unknown_name
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
-from drake_dae.robots import Coupling, frame_named, joint_names, unique_names
-from drake_dae.scenario.forms.keys import at
-from drake_dae.scenario.robot_file.loops import actuators_of, joints_of
+from drake_dae.robots import (
+    Constraint,
+    Coupling,
+    PrismaticLoopJoint,
+    RevoluteLoopJoint,
+    axes_along,
+    frame_name,
+    frame_named,
+    joint_names,
+    triple,
+    unique_names,
+)
+from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.mending import Mender
 from drake_dae.scenario.robot_file.mjcf import ARMATURE
-from drake_dae.scenario.robot_file.reading import drake_errors
 from drake_dae.scenario.robot_file.robot import Payload, Robot, RobotPlacement
 
 T = TypeVar("T")
 
 
+def joints_of(plant: MultibodyPlant) -> list[Joint]:
+    """The joints of a plant."""
+    return [plant.get_joint(index) for index in plant.GetJointIndices()]
+
+
+def actuators_of(plant: MultibodyPlant) -> list[JointActuator]:
+    """The actuators of a plant."""
+    return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+
+
 def change_robot(robot: Robot, plant: MultibodyPlant, mender: Mender) -> None:
     """Applies the changes that a scenario makes to the robot of its file."""
     couplings = _couplings(plant, mender)
-    with drake_errors():
-        if robot.base is not None:
-            _weld_base(robot.base, plant)
-        locked = _of_joints(plant, mender.standing) | robot.locked
-        if locked:
-            _lock_joints(locked, plant, couplings)
-        _add_free_joints(robot.free, plant)
-        if robot.actuators is not None:
-            _drive_joints(robot.actuators, plant, couplings, mender)
-        add_payloads("robot.payloads", robot.payloads, plant)
+    if robot.base is not None:
+        _weld_base(robot.base, plant)
+    locked = _of_joints(plant, mender.joints["stands"]) | robot.locked
+    if locked:
+        _lock_joints(locked, plant, couplings)
+    _add_free_joints(robot.free, plant)
+    if robot.actuators is not None:
+        _drive_joints(robot.actuators, plant, couplings, mender)
+    add_payloads("robot.payloads", robot.payloads, plant)
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
     is_left_out = ARMATURE in robot.leave_out
-    for name, armature in _of_joints(plant, mender.armatures).items():
+    for name, armature in _of_joints(plant, mender.joints["armature"]).items():
         if not is_left_out and joint_names(plant)[name].index() not in driven:
             raise ModelError(
                 f"joint '{name}' has an armature of {armature:g} and no motor, and Drake gives "
@@ -56,26 +77,15 @@ def change_robot(robot: Robot, plant: MultibodyPlant, mender: Mender) -> None:
             )
 
 
-def finalize(plant: MultibodyPlant) -> None:
-    """Finalizes a plant."""
-    with drake_errors():
-        plant.Finalize()
-
-
 def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -> None:
     """Adds the payloads of a key of the scenario to a plant that is not finalized."""
     for index, payload in enumerate(payloads):
         with at(f"{key}.{index}"):
             frame = frame_named(plant, payload.frame)
             if frame.body() == plant.world_body():
-                raise ModelError(
-                    f"'{payload.frame}' is a frame of the world, and a payload there moves "
-                    "nothing; name a frame of the robot"
-                )
+                raise ModelError(f"a payload on '{payload.frame}', of the world, moves nothing")
             if plant.HasBodyNamed(payload.name):
-                raise ModelError(
-                    f"a payload needs a name of its own; a body '{payload.name}' is there"
-                )
+                raise ModelError(f"a body '{payload.name}' is there; give the payload another name")
             inertia = SpatialInertia(payload.mass, [0.0, 0.0, 0.0], UnitInertia(0.0, 0.0, 0.0))
             body = plant.AddRigidBody(payload.name, frame.model_instance(), inertia)
             plant.WeldFrames(frame, body.body_frame(), RigidTransform(list(payload.point)))
@@ -92,7 +102,7 @@ def _weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
     except RuntimeError:
         raise ModelError(unknown_name("free body or frame on it", base.weld, free)) from None
     body = frame.body()
-    if body.index() == plant.world_body().index():
+    if body == plant.world_body():
         raise ModelError("the world needs no base; name a frame of the robot")
     if joint := attached.get(body.index()):
         raise ModelError(
@@ -120,19 +130,15 @@ def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
 def _lock_joints(
     locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[Coupling]
 ) -> None:
-    """Replaces joints, and those that are coupled to them, by welds at given positions.
+    """Replaces joints, and those that are coupled to them, by welds with their constant X_FM(q).
 
-    Drake supports locked joints only in discrete time. The weld has the constant pose X_FM(q) of
-    the joint, from its frame on the parent to its frame on the child. The actuator, the damping and
-    the rotor of the joint are removed.
+    Drake supports locked joints only in discrete time. Actuator, damping and rotor go.
     """
-    joints = _movable(plant)
-    positions = _with_coupled(locked, couplings)
+    joints, positions = _movable(plant), _with_coupled(locked, couplings)
     for name, value in positions.items():
         joint = _named(name, joints)
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-        # Round-off of a ratio must not put a finger outside.
-        if not low - 1e-9 <= value <= high + 1e-9:
+        if not low - 1e-9 <= value <= high + 1e-9:  # Round-off of a ratio puts nothing outside.
             unit = "m" if isinstance(joint, PrismaticJoint) else "rad"
             why = "" if name in locked else ", as the joint that it is coupled to has it,"
             raise ModelError(
@@ -143,12 +149,11 @@ def _lock_joints(
             "the file has constraints other than mimic joints, which Drake loses when a joint is "
             "locked; name them under robot.leave_out, and write them under constraints"
         )
-    # Drake removes joints only from plants without constraints.
-    for key in plant.GetConstraintIds():
+    for key in plant.GetConstraintIds():  # Drake removes no joint from a plant that has one.
         plant.RemoveConstraint(key)
     for name, value in positions.items():
         joint = joints[name]
-        inboard, outboard = joint.frame_on_parent(), joint.frame_on_child()
+        own_name, inboard, outboard = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
         if isinstance(joint, PrismaticJoint):
             pose = RigidTransform(value * joint.translation_axis())
         else:
@@ -156,7 +161,6 @@ def _lock_joints(
         for actuator in actuators_of(plant):
             if actuator.joint() is joint:
                 plant.RemoveJointActuator(actuator)
-        own_name = joint.name()
         try:
             plant.RemoveJoint(joint)
         except RuntimeError as error:
@@ -204,10 +208,9 @@ def _drive_joints(
         followers = {coupling.follower for coupling in couplings}
         driven = [name for name in joints if name not in followers]
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
-    efforts = _of_joints(plant, mender.efforts)
-    armatures = _of_joints(plant, mender.armatures)
-    names = {_named(name, joints).index(): name for name in limits}
-    with_actuator = set()
+    efforts = _of_joints(plant, mender.joints["effort"])
+    armatures = _of_joints(plant, mender.joints["armature"])
+    names, with_actuator = {_named(name, joints).index(): name for name in limits}, set()
     for actuator in actuators_of(plant):
         name = names.get(actuator.joint().index())
         if name is None:
@@ -231,8 +234,11 @@ def _named(name: str, joints: Mapping[str, Joint]) -> Joint:
 
 def _movable(plant: MultibodyPlant) -> dict[str, Joint]:
     """Name -> joint, for revolute and prismatic joints."""
-    kinds = RevoluteJoint | PrismaticJoint
-    return {name: joint for name, joint in joint_names(plant).items() if isinstance(joint, kinds)}
+    return {name: joint for name, joint in joint_names(plant).items() if _is_simple(joint)}
+
+
+def _is_simple(joint: Joint) -> bool:
+    return isinstance(joint, RevoluteJoint | PrismaticJoint)
 
 
 def _of_joints(plant: MultibodyPlant, values: Mapping[tuple[str, str], T]) -> dict[str, T]:
@@ -252,7 +258,7 @@ def _couplings(plant: MultibodyPlant, mender: Mender) -> list[Coupling]:
     joints = joint_names(plant)
     names = {(int(j.model_instance()), j.name()): name for name, j in joints.items()}
     couplings = []
-    for name, (leader, ratio, offset) in _of_joints(plant, mender.followers).items():
+    for name, (leader, ratio, offset) in _of_joints(plant, mender.joints["follows"]).items():
         leading = names.get((int(joints[name].model_instance()), leader))
         couplings += [Coupling(name, leading, ratio, offset)] if leading else []
     return couplings
@@ -261,3 +267,145 @@ def _couplings(plant: MultibodyPlant, mender: Mender) -> list[Coupling]:
 def _joints_to_parents(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
     """Index of a body -> the joint by which it is attached."""
     return {joint.child_body().index(): joint for joint in reversed(joints_of(plant))}
+
+
+class CutJoint(NamedTuple):
+    """A joint that closed a loop: its axis and poses are those of its frames on both bodies."""
+
+    slides: bool
+    bodies: tuple[BodyIndex, BodyIndex]
+    poses: tuple[RigidTransform, RigidTransform]
+    axis: FloatArray
+    options: dict[str, Any]
+
+
+def closing_joints(plant: MultibodyPlant) -> list[Joint]:
+    """The joints that close loops, so that the others form a tree; if possible without motors."""
+    driven = {actuator.joint().index() for actuator in actuators_of(plant)}
+    groups, closing = list(range(plant.num_bodies())), []
+    for joint in sorted(
+        joints_of(plant),
+        key=lambda joint: (not _is_simple(joint), joint.index() in driven),
+        reverse=True,
+    ):
+        first, second = (
+            groups[int(body.index())] for body in (joint.parent_body(), joint.child_body())
+        )
+        if first == second:
+            closing.append(joint)
+        groups = [second if group == first else group for group in groups]
+    return closing
+
+
+def cut_loops(plant: MultibodyPlant, mender: Mender) -> list[CutJoint]:
+    """Removes joints until the others form a tree; driven joints only if necessary."""
+    driven = {actuator.joint().index(): actuator for actuator in actuators_of(plant)}
+    names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    cuts = []
+    for joint in closing_joints(plant):
+        name = names.get(joint.index(), joint.name())
+        _check_parent(joint, name, plant, mender.joints["parent"])
+        cuts.append(_cut(joint, name, driven.get(joint.index()), plant))
+    return cuts
+
+
+def _check_parent(
+    joint: Joint, name: str, plant: MultibodyPlant, parents: Mapping[tuple[str, str], str]
+) -> None:
+    """Refuses a loop that is open where its file means it to be closed.
+
+    A joint of SDFormat is at its child; of a frame that is its parent, only the body counts.
+    """
+    model = plant.GetModelInstanceName(joint.model_instance())
+    named = parents.get(("", joint.name()), parents.get((model, joint.name()), ""))
+    if not named or not plant.HasFrameNamed(named, joint.model_instance()):
+        return
+    frame = plant.GetFrameByName(named, joint.model_instance())
+    places = [
+        one.GetFixedPoseInBodyFrame().translation() for one in (frame, joint.frame_on_parent())
+    ]
+    gap = float(np.linalg.norm(places[0] - places[1]))
+    if frame.name() != frame.body().name() and gap > 1e-6:
+        raise ModelError(
+            f"joint '{name}' closes a loop at its child, {gap:.3g} m from the frame '{named}' that "
+            f"it names as its parent: of that only the body '{frame.body().name()}' counts. Let "
+            "<pose> place the joint at the frame"
+        )
+
+
+def _cut(
+    joint: Joint, name: str, actuator: JointActuator | None, plant: MultibodyPlant
+) -> CutJoint:
+    if not _is_simple(joint):
+        raise ModelError(
+            f"joint '{name}' closes a loop, and neither turns nor slides; take it out of the file, "
+            "and write it under constraints, as a !WeldedFrames or !CoincidentPoints"
+        )
+    limits = {
+        "lower": joint.position_lower_limits()[0],
+        "upper": joint.position_upper_limits()[0],
+        "velocity_limit": joint.velocity_upper_limits()[0],
+    }
+    options: dict[str, Any] = {"damping": joint.default_damping(), "name": name}
+    if actuator is not None:
+        if actuator.default_rotor_inertia() != 0.0:
+            raise ModelError(
+                f"joint '{name}' closes a loop, as all joints of it do that could be cut, and its "
+                "motor has a rotor: that cannot be a constraint; leave one joint without motor"
+            )
+        options["motor"] = True
+        limits["effort_limit"] = actuator.effort_limit()
+        plant.RemoveJointActuator(actuator)
+    options |= {key: float(value) for key, value in limits.items() if isfinite(value)}
+    parent, child = joint.frame_on_parent(), joint.frame_on_child()
+    slides = isinstance(joint, PrismaticJoint)
+    cut = CutJoint(
+        slides,
+        (parent.body().index(), child.body().index()),
+        (parent.GetFixedPoseInBodyFrame(), child.GetFixedPoseInBodyFrame()),
+        np.array(joint.translation_axis() if slides else joint.revolute_axis()),
+        options,
+    )
+    try:
+        plant.RemoveJoint(joint)
+    except RuntimeError as error:
+        raise ModelError(
+            f"joint '{name}' closes a loop, and cannot be cut: {error} Springs stop it: "
+            "robot.leave_out takes them out, as [dynamics/spring_stiffness]"
+        ) from None
+    return cut
+
+
+def loop_constraint(cut: CutJoint, plant: MultibodyPlant) -> Constraint:
+    """The constraint that replaces a cut joint; planar where the loop is, or it were redundant."""
+    bodies, context = [plant.get_body(index) for index in cut.bodies], plant.CreateDefaultContext()
+    rotation = plant.EvalBodyPoseInWorld(context, bodies[0]).rotation() @ cut.poses[0].rotation()
+    axes, options = axes_along(cut.axis), dict(cut.options)
+    # The columns of the rate of the child in the parent: of joints that turn, and that slide.
+    rates = plant.CalcJacobianSpatialVelocity(
+        context,
+        JacobianWrtVariable.kV,
+        bodies[1].body_frame(),
+        np.zeros((3, 1)),
+        bodies[0].body_frame(),
+        plant.world_frame(),
+    )
+    turning = [column[:3] for column in rates.T if np.linalg.norm(column[:3]) > 1e-9]
+    turning += [] if cut.slides else [rotation @ cut.axis]
+    sliding = [*rates[3:].T, *([rotation @ cut.axis] if cut.slides else [])]
+    normal = turning[-1] if turning else None
+    if normal is not None and any(
+        np.linalg.norm(np.cross(normal, axis)) > 1e-9 for axis in turning
+    ) | any(abs(normal @ axis) > 1e-9 for axis in sliding):
+        normal = None
+    if cut.slides and normal is not None:
+        across = rotation.inverse() @ normal
+        axes = np.column_stack([across, np.cross(cut.axis, across), cut.axis])
+    for letter, body, pose in zip("ab", bodies, cut.poses, strict=True):
+        frame = pose @ RigidTransform(RotationMatrix(axes), np.zeros(3))
+        options[f"frame_{letter}"] = frame_name(plant, body.body_frame())
+        options[f"point_{letter}"] = triple("a point", frame.translation())
+        options[f"rpy_{letter}"] = triple("an angle", RollPitchYaw(frame.rotation()).vector())
+    if cut.slides:
+        return PrismaticLoopJoint(axis="z", normal=None if normal is None else "x", **options)
+    return RevoluteLoopJoint(axis="z", planar=normal is not None, **options)

@@ -4,25 +4,22 @@ A copy has possible inertias, and geometry that can be read and drawn; it lacks 
 read. What changed on the way is collected, and so is what is lost.
 """
 
-import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+from pydrake.multibody.tree import RotationalInertia
 
 from drake_dae.arrays import FloatArray, number_in
 from drake_dae.errors import ModelError
 from drake_dae.scenario.robot_file import mjcf
-from drake_dae.scenario.robot_file.inertias import mend_inertia
-from drake_dae.scenario.robot_file.meshes import DRAWN, all_within, drawable, has_hull
+from drake_dae.scenario.robot_file.files import DRAWN, RobotFiles, drawable, has_hull
 from drake_dae.scenario.robot_file.read_by_drake import DRIVES, READ_BY_DRAKE, take_lost
-from drake_dae.scenario.robot_file.xml_tree import Node, read_xml, write_xml
-
-MOST_FILES = 1000
-"""The largest number of files of a robot, each counted as often as it is included."""
+from drake_dae.scenario.robot_file.xml_tree import read_xml, write_xml
 
 _TYPES = {
     ".urdf": ("revolute", "continuous", "prismatic", "planar", "floating", "fixed"),
@@ -33,55 +30,43 @@ _TYPES = {
 
 _EMPTY = "shapes of size 0 are left out"
 
-_WITH_COMMA = re.compile(r"[-+.\deE\s]*\d,\d[-+.\deE,\s]*")
+
+def _lists() -> dict[str, list[str]]:
+    return defaultdict(list)
 
 
 @dataclass
 class Mender:
-    """Makes mended copies of files, and collects what is to be known of them.
-
-    A "model" is the name of a model instance, or "" for a robot of a single file.
+    """Makes mended copies of files. A "model" is the name of a model instance, "" for a lone robot.
 
     Attributes:
-        find: The file of a URL or path in a file; None if its package is unknown.
-        folders: The folders from which geometry is read.
+        files: The files that they name.
         leave_out: The key `robot.leave_out`.
         drives: Whether the file's motors count, since the scenario names no driven joints.
         has_geometry, drawn: Whether geometry is read, and converted to such that can be drawn.
         folder: An empty folder for the copies; None makes none.
-        omitted, changed: What of the geometry is left out, and what else changed -> the items.
-        lost: Part that is lost -> where.
+        omitted, changed, lost: What of the geometry is left out, what else changed, and what is
+            lost -> where.
         originals: Copy -> its file.
-        efforts: (model, joint) -> effort limit in N m or N.
-        armatures: (model, joint) -> rotor inertia at the joint, kg m^2 or kg.
-        followers: (model, joint) -> the joint that it follows, the ratio, and the offset.
-        standing: (model, joint) -> the position that a coupling gives it, in rad or m.
-        floating: Model, name, parent, child and pose of floating joints: x, y and z in m, and
-            roll, pitch and yaw in rad.
+        joints: "effort" limit, "armature", "follows" (leader, ratio, offset), position at which it
+            "stands", "parent" of SDFormat -> (model, joint) -> value.
+        floating: Model, name, parent, child, and x, y, z, roll, pitch, yaw of floating joints.
         crossed: (model, link) of which visual geometry is left out.
-        parent_frames: (model, joint) -> the parent that an SDFormat file names.
-        count: The number of files that were read.
     """
 
-    find: Callable[[str, Path], Path | None]
-    folders: list[Path]
+    files: RobotFiles
     leave_out: Collection[str] = ()
     drives: bool = True
     has_geometry: bool = True
     drawn: bool = True
     folder: Path | None = None
-    omitted: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
-    changed: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
-    lost: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    omitted: dict[str, list[str]] = field(default_factory=_lists)
+    changed: dict[str, list[str]] = field(default_factory=_lists)
+    lost: dict[str, list[str]] = field(default_factory=_lists)
     originals: dict[Path, Path] = field(default_factory=dict)
-    efforts: dict[tuple[str, str], float] = field(default_factory=dict)
-    armatures: dict[tuple[str, str], float] = field(default_factory=dict)
-    followers: dict[tuple[str, str], tuple[str, float, float]] = field(default_factory=dict)
-    standing: dict[tuple[str, str], float] = field(default_factory=dict)
+    joints: dict[str, dict[tuple[str, str], Any]] = field(default_factory=lambda: defaultdict(dict))
     floating: list[tuple[str, str, str, str, FloatArray]] = field(default_factory=list)
     crossed: set[tuple[str, str]] = field(default_factory=set)
-    parent_frames: dict[tuple[str, str], str] = field(default_factory=dict)
-    count: int = 0
 
     def copy(
         self,
@@ -90,20 +75,17 @@ class Mender:
         placed: Collection[str] = (),
         within: tuple[Path, ...] = (),
     ) -> Path:
-        """A mended copy of a file.
+        """A mended copy of a file; one that is neither URDF, SDFormat nor MJCF stays.
 
-        Args:
-            file: The file; what is neither URDF, SDFormat nor MJCF stays.
-            model: Its model.
-            placed: Links that the scenario places: joints that fix them to the world are removed.
-            within: The files that include this one.
+        `placed` are links that the scenario places, so that no joint fixes them to the world, and
+        `within` the files that include this one.
         """
         kind, own = file.suffix, (*within, file.resolve())
         if kind not in READ_BY_DRAKE:
             return file
-        root = self._read(file, within)
+        root = _read(file, within)
         if kind == ".xml":
-            self._include(root, file, own)
+            _include(root, file, own)
             mjcf.prepare(root, file)
         parents = {child: parent for parent in root.iter() for child in parent}
 
@@ -114,9 +96,17 @@ class Mender:
                 node = parents[node]
             return f"{file.name}{f':{line}' * bool(line)}: {node.tag} '{node.get('name', '')}'"
 
-        _check_values(root, place)
-        armature = {mjcf.ARMATURE}  # Only that of joints without motor is lost.
-        for part, node in take_lost(root, kind, set(self.leave_out) - armature):
+        for node in root.iter():
+            for value in (*node.attrib.values(), node.text or ""):
+                if "$(" in value or "${" in value:
+                    text = (
+                        f"{place(node)}: '{value.strip()}' is a template: xacro FILE -o robot.urdf"
+                    )
+                    raise ModelError(f"{text} writes the URDF")
+                if number_in(value.replace(",", ".", 1)) is not None and "," in value:
+                    raise ModelError(f"{place(node)}: '{value}': numbers have a point, no comma")
+        # Only the armature of joints without motor is lost.
+        for part, node in take_lost(root, kind, {*self.leave_out} - {mjcf.ARMATURE}):
             if self.drives or not part.startswith(DRIVES):
                 self.lost[part].append(place(node))
         for inertial in root.iter("inertial"):
@@ -140,15 +130,6 @@ class Mender:
         self.originals[copy] = file
         return copy
 
-    def _read(self, file: Path, within: tuple[Path, ...]) -> Node:
-        if file.resolve() in within:
-            names = " -> ".join(path.name for path in (*within, file))
-            raise ModelError(f"'{file.name}' includes itself: {names}")
-        self.count += 1
-        if self.count > MOST_FILES:
-            raise ModelError(f"'{within[0].name}' includes more than {MOST_FILES} files")
-        return read_xml(file)
-
     def _check_joint(self, joint: Element, kind: str, place: str) -> None:
         """Checks the type of a joint, and removes limits that Drake refuses."""
         name = joint.get("type", "hinge" if kind == ".xml" else "")
@@ -170,12 +151,10 @@ class Mender:
                 owner.attrib.pop(key, None)
                 _remove(owner, key)
 
-    def _mesh(
-        self, path: Path | None, name: str, collides: bool, kinds: tuple[str, ...]
-    ) -> Path | None:
-        """The file of a mesh as Drake reads it; None if it is left out."""
+    def _mesh(self, name: str, path: Path | None, collides: bool, drawn_as: tuple[str, ...]) -> str:
+        """The file of a mesh as Drake reads it; "" if it is left out."""
         if self.folder is None:
-            return path
+            return str(path or "")
         drawn, why = path, ""
         if path is None:
             why = (
@@ -184,50 +163,49 @@ class Mender:
             )
         elif not path.is_file():
             why = "is not there"
-        elif not all_within(path, self.folders):
+        elif not self.files.holds(path):
             why = "is outside of the model's folder or package (robot.packages can name its folder)"
-        elif kinds and (drawn := drawable(path, kinds)) is None:
+        elif drawn_as and (drawn := drawable(path, drawn_as)) is None:
             why = "cannot be converted (pip install 'drake_dae[meshes]' converts more)"
         elif collides and drawn is not None and not has_hull(drawn):
             why = "cannot be read by Drake"
-        if not why:
-            return drawn
-        items = self.omitted[f"geometry that {why} is left out; no equation needs it"]
-        items.append(f"'{name if path is None else Path(name).name}'")
-        return None
+        if why:
+            items = self.omitted[f"geometry that {why} is left out; no equation needs it"]
+            items.append(f"'{name if path is None else Path(name).name}'")
+        return "" if why else str(drawn)
 
     def _mend_shapes(self, link: Element, file: Path, model: str) -> None:
         """Leaves out what of a link's geometry Drake cannot take, in URDF and SDFormat."""
         name = link.get("name", "")
         for shape in [*link.iterfind("visual"), *link.iterfind("collision")]:
-            is_visual, meshes = shape.tag == "visual", list(_files(shape, "geometry", ("mesh",)))
+            is_visual, meshes = shape.tag == "visual", [*_files(shape)]
             sizes = [
                 size
                 for form in (() if meshes else shape.iterfind("geometry/*"))
                 for key in ("size", "radius", "length", "radii")
                 for size in (form.get(key) or form.findtext(key) or "1").split()
             ]
-            if self.has_geometry and any((number_in(size) or 0.0) <= 0.0 for size in sizes):
-                self.omitted[_EMPTY].append(f"of '{name}'")
+            is_empty = any((number_in(size) or 0.0) <= 0.0 for size in sizes)
+            if is_empty or not self.has_geometry:
+                if self.has_geometry:
+                    self.omitted[_EMPTY].append(f"of '{name}'")
                 link.remove(shape)
-            elif not self.has_geometry:
-                link.remove(shape)
-            for owner, key in meshes if self.has_geometry else ():
-                text = _text(owner, key)
-                kinds = DRAWN if is_visual and self.drawn else ()
-                path = self._mesh(self.find(text, file), text, not is_visual, kinds)
-                _set_text(owner, key, str(path))
-                if path is None:
+                continue
+            for owner, key in meshes:
+                text = (owner.get(key, "") if key else owner.text or "").strip()
+                drawn_as = DRAWN if is_visual and self.drawn else ()
+                path = self._mesh(text, self.files.find(text, file), not is_visual, drawn_as)
+                if key:
+                    owner.set(key, path)
+                else:
+                    owner.text = path
+                if not path:
                     link.remove(shape)
                     self.crossed |= {(model, name)} if is_visual else set()
-            for owner, key in _files(shape, "material", ("texture", "drake:diffuse_map")):
-                path = self.find(_text(owner, key), file)
-                if path is not None and path.is_file() and all_within(path, self.folders):
-                    _set_text(owner, key, str(path))
-                else:
-                    self.omitted["textures are left out"].append(f"'{_text(owner, key)}'")
-                    for material in shape.iterfind("material"):
-                        _remove(material, owner.tag)
+            for material in shape.iterfind("material"):
+                for texture in [t for t in material if t.tag in ("texture", "drake:diffuse_map")]:
+                    self.omitted["textures are left out"].append(f"of '{name}'")
+                    material.remove(texture)
 
     def _follow(self, model: str, joint: Element, tag: str) -> None:
         """Notes whether a joint follows another one, unless Drake reports what is wrong."""
@@ -239,10 +217,10 @@ class Mender:
                 self.lost[f"joint/{tag}"].append(f"joint '{name}'")
             elif ratio == 0.0 and offset is not None:
                 self.changed["joints that follow others with multiplier 0 stand"] += [f"'{name}'"]
-                self.standing[model, name] = offset
+                self.joints["stands"][model, name] = offset
                 joint.remove(mimic)
             elif ratio is not None and offset is not None:
-                self.followers[model, name] = (mimic.get("joint", ""), ratio, offset)
+                self.joints["follows"][model, name] = (mimic.get("joint", ""), ratio, offset)
 
     def _mend_urdf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
         root.attrib.setdefault("name", file.stem)
@@ -271,25 +249,23 @@ class Mender:
             for limit in joint.iterfind("limit"):
                 effort = number_in(limit.get("effort", "")) or 0.0
                 if effort > 0.0:
-                    self.efforts[model, name] = effort
+                    self.joints["effort"][model, name] = effort
                 elif "effort" in limit.attrib:  # Many authors write 0 for an unknown limit.
                     still.add(name)
-        moving = [joint for joint in root.iterfind("joint") if joint.get("type") != "fixed"]
-        joints, count = {joint.get("name") for joint in moving}, Counter[str]()
+        moving = {j.get("name") for j in root.iterfind("joint") if j.get("type") != "fixed"}
+        count = Counter[str]()
         for transmission in root.findall("transmission"):
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
             if driven & still and self.drives:
-                self.lost["transmission/joint"] += [
-                    f"joint '{joint}': effort 0" for joint in driven
-                ]
-            if not has_type or not driven & joints:
+                self.lost["transmission/joint"] += [f"joint '{one}': effort 0" for one in driven]
+            if not has_type or not driven & moving:
                 root.remove(transmission)
                 continue
             for actuator in transmission.iterfind("actuator"):  # Their names may be equal.
-                count[actuator.get("name", "")] += 1
-                if (number := count[actuator.get("name", "")]) > 1:
-                    actuator.set("name", f"{actuator.get('name', '')}_{number}")
+                name = actuator.get("name", "")
+                count[name] += 1
+                actuator.set("name", f"{name}_{count[name]}" if count[name] > 1 else name)
 
     def _mend_sdf(
         self,
@@ -300,7 +276,7 @@ class Mender:
         within: tuple[Path, ...],
     ) -> None:
         for uri in root.iterfind(".//include/uri"):
-            path = self.find((uri.text or "").strip(), file)
+            path = self.files.find((uri.text or "").strip(), file)
             if path is not None and path.is_dir():
                 path = next(iter(sorted(path.glob("*.sdf"))), None)
             if path is not None and path.is_file():
@@ -313,21 +289,8 @@ class Mender:
                 parent, child = (joint.findtext(end, "").strip() for end in ("parent", "child"))
                 if parent == "world" and joint.get("type") == "fixed" and child in placed:
                     body.remove(joint)
-                self.parent_frames[model, joint.get("name", "")] = parent
+                self.joints["parent"][model, joint.get("name", "")] = parent
                 self._follow(model, joint, "drake:mimic")
-
-    def _include(self, owner: Element, main: Path, within: tuple[Path, ...]) -> None:
-        """Puts the content of files that an MJCF file includes into the places of their names."""
-        for index, node in reversed(list(enumerate(owner))):
-            if node.tag != "include":
-                self._include(node, main, within)
-                continue
-            file = main.parent / node.get("file", "")
-            included = self._read(file, within)
-            self._include(included, main, (*within, file.resolve()))
-            for part in included.iter():
-                part.line = 0  # type: ignore[attr-defined]
-            owner[index : index + 1] = list(included)
 
     def _mend_mjcf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
         if not (self.has_geometry and self.drawn):
@@ -336,9 +299,8 @@ class Mender:
         used = mjcf.colliding_meshes(root) if self.has_geometry else set[str]()
         for mesh, path in mjcf.mesh_files(root, file):
             name = mesh.get("file", "")
-            readable = self._mesh(path, name, mesh.get("name") in used, (".obj",))
-            mesh.set("file", str(readable))
-            if readable is None:
+            mesh.set("file", self._mesh(name, path, mesh.get("name") in used, (".obj",)))
+            if not mesh.get("file"):
                 refused[mesh.get("name", "")] = name
         crossed, empty = mjcf.remove_shapes(root, refused)
         self.crossed |= {(model, body) for body in crossed if self.has_geometry}
@@ -346,51 +308,46 @@ class Mender:
             self.omitted[_EMPTY] += [f"of '{body}'" for body in empty]
         for name, armature in mjcf.armatures(root):
             if name:
-                self.armatures[model, name] = armature
+                self.joints["armature"][model, name] = armature
             elif mjcf.ARMATURE not in self.leave_out:
                 self.lost[mjcf.ARMATURE].append(f"{file.name}: of a joint that no motor can drive")
         for name, joint in mjcf.floating_bodies(root, placed):
             self.floating.append((model, joint, "world", name, np.zeros(6)))
 
 
-def _check_values(root: Element, place: Callable[[Element], str]) -> None:
-    """Checks for templates, and for commas in numbers, at which Drake ends to read."""
-    for node in root.iter():
-        for value in (*node.attrib.values(), (node.text or "").strip()):
-            if "$(" in value or "${" in value:
-                raise ModelError(
-                    f"{place(node)}: '{value}': this is a template, of which xacro writes the "
-                    "URDF, as xacro FILE -o robot.urdf"
-                )
-            if "," in value and _WITH_COMMA.fullmatch(value.strip()):
-                raise ModelError(
-                    f"{place(node)}: '{value.strip()}': numbers have a point and no comma, and "
-                    "blanks between them"
-                )
+def _read(file: Path, within: tuple[Path, ...]) -> Element:
+    if file.resolve() in within:
+        names = " -> ".join(path.name for path in (*within, file))
+        raise ModelError(f"'{file.name}' includes itself: {names}")
+    return read_xml(file)
+
+
+def _include(owner: Element, main: Path, within: tuple[Path, ...]) -> None:
+    """Puts the content of files that an MJCF file includes into the places of their names."""
+    for index, node in reversed(list(enumerate(owner))):
+        if node.tag != "include":
+            _include(node, main, within)
+            continue
+        file = main.parent / node.get("file", "")
+        included = _read(file, within)
+        _include(included, main, (*within, file.resolve()))
+        for part in included.iter():
+            part.line = 0  # type: ignore[attr-defined]
+        owner[index : index + 1] = list(included)
 
 
 def _remove(owner: Element, tag: str) -> None:
-    for child in owner.findall(tag) if ":" not in tag else [c for c in owner if c.tag == tag]:
+    for child in [child for child in owner if child.tag == tag]:
         owner.remove(child)
 
 
-def _files(shape: Element, way: str, tags: Collection[str]) -> Iterator[tuple[Element, str]]:
-    """The elements that name files, and the attribute that does; "" is the text, in SDFormat."""
-    for owner in (part for holder in shape.iterfind(way) for part in holder if part.tag in tags):
-        uris = [*owner.findall("uri")] or [owner]
-        yield from ((owner, "filename") for _ in uris[:1] if "filename" in owner.attrib)
-        yield from ((uri, "") for uri in uris if "filename" not in owner.attrib)
-
-
-def _text(owner: Element, key: str) -> str:
-    return (owner.get(key, "") if key else owner.text or "").strip()
-
-
-def _set_text(owner: Element, key: str, value: str) -> None:
-    if key:
-        owner.set(key, value)
-    else:
-        owner.text = value
+def _files(shape: Element) -> Iterator[tuple[Element, str]]:
+    """The elements that name meshes, and the attribute that does; "" is the text, in SDFormat."""
+    for owner in shape.iterfind("geometry/mesh"):
+        if "filename" in owner.attrib:
+            yield owner, "filename"
+        else:
+            yield from ((uri, "") for uri in [*owner.findall("uri")] or [owner])
 
 
 def _take_first_colours(root: Element) -> None:
@@ -405,8 +362,87 @@ def _take_first_colours(root: Element) -> None:
             colours.setdefault(material.get("name", ""), list(material))
     for owner in list(root.iter()):
         for material in owner.findall("material"):
-            name = material.get("name", "")
-            if name and name in colours:
-                material[:] = colours[name]
+            if colour := colours.get(material.get("name", "")):
+                material[:] = colour if material.get("name") else material[:]
             elif not len(material):
                 owner.remove(material)
+
+
+_ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+_ROWS, _COLUMNS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+
+
+def nearest_inertia(inertia: FloatArray) -> FloatArray:
+    """The possible inertia nearest to a symmetric matrix in the Frobenius norm, shape (3, 3).
+
+    The moments d of a body are d_i = s_j + s_k with the second moments s >= 0 along the principal
+    axes. The nearest inertia has the same axes, and the s >= 0 for which d is nearest.
+    """
+    from scipy.optimize import nnls  # Imported here, since few runs need it.
+
+    moments, axes = np.linalg.eigh(inertia)
+    second, _ = nnls(np.ones((3, 3)) - np.eye(3), moments)
+    second = np.maximum(second, 1e-9 * second.sum())  # None is negative by round-off.
+    return np.asarray((axes * (second.sum() - second)) @ axes.T)
+
+
+def mend_inertia(inertial: Element, kind: str, place: str) -> str:
+    """Replaces an impossible inertia by the nearest possible one; says what it replaced, or ""."""
+    words = _mass_and_entries(inertial, kind)
+    numbers = [number_in(word) for word in words]
+    if None in numbers:
+        raise ModelError(f"{place}: mass and inertia are numbers, got {', '.join(words)}")
+    if len(numbers) != 7:
+        return ""  # Drake reports it.
+    mass, entries = numbers[0] or 0.0, np.array(numbers[1:], float)
+    if mass < 0.0:
+        raise ModelError(f"{place}: a mass is positive, got {mass:g} kg")
+    try:
+        is_possible = RotationalInertia(*entries.tolist()).CouldBePhysicallyValid()
+    except RuntimeError:
+        is_possible = False
+    if not np.any(entries) if mass == 0.0 else is_possible:
+        return ""
+    inertia = np.empty((3, 3))
+    inertia[_ROWS, _COLUMNS] = inertia[_COLUMNS, _ROWS] = entries
+    nearest = nearest_inertia(inertia) if mass > 0.0 else np.zeros((3, 3))
+    before, after = np.linalg.eigvalsh(inertia), np.linalg.eigvalsh(nearest)
+    if mass > 0.0 and not np.trace(nearest) > 0.0:
+        raise ModelError(
+            f"{place}: the moments of inertia are {before} kg m^2, and near these is none that a "
+            f"body of {mass:g} kg can have; mend them"
+        )
+    written, matrix = (
+        [repr(float(entry)) for entry in nearest[_ROWS, _COLUMNS]],
+        inertial.find("inertia"),
+    )
+    if matrix is None:
+        # A fullinertia cannot be combined with a quat, so a diagonal one remains diagonal.
+        key = "fullinertia" if "fullinertia" in inertial.attrib else "diaginertia"
+        inertial.set(key, " ".join(written[: 6 if key == "fullinertia" else 3]))
+    else:
+        matrix.clear()
+        for key, entry in zip(_ENTRIES, written, strict=True):
+            if kind == ".urdf":
+                matrix.set(key, entry)
+            else:
+                SubElement(matrix, key).text = entry
+    was, now = (", ".join(f"{d:.3g}" for d in moments) for moments in (before, after))
+    change = 100.0 * np.linalg.norm(nearest - inertia) / np.linalg.norm(inertia)
+    return f"{place}: ({was}) kg m^2, nearest possible ({now}), changed by {change:.2g} %"
+
+
+def _mass_and_entries(inertial: Element, kind: str) -> list[str]:
+    """Mass in kg, and xx, yy, zz, xy, xz and yz in kg m^2; fewer if some are missing."""
+    if kind == ".xml":
+        entries = inertial.get("fullinertia", inertial.get("diaginertia", "")).split()
+        return [inertial.get("mass", "0"), *entries, *["0"] * 3][:7] if len(entries) > 2 else []
+    mass, matrix = inertial.find("mass"), inertial.find("inertia")
+    if matrix is None:
+        return []
+    if kind == ".urdf":
+        weight = "0" if mass is None else mass.get("value", "0")
+        return [weight, *(matrix.get(key, "0") for key in _ENTRIES)]
+    # The defaults of SDFormat are those of the unit matrix.
+    pairs = zip(_ENTRIES, "111000", strict=True)
+    return [inertial.findtext("mass", "1"), *(matrix.findtext(key, one) for key, one in pairs)]

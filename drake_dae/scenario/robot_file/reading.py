@@ -1,7 +1,7 @@
-"""Reads a robot's files into a MultibodyPlant."""
+"""Reads a robot's files into a MultibodyPlant, and into links of the library."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,14 +18,30 @@ from pydrake.multibody.parsing import (
     ProcessModelDirectives,
 )
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RpyFloatingJoint
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    ModelInstanceIndex,
+    QuaternionFloatingJoint,
+    RpyFloatingJoint,
+)
 
 from drake_dae.errors import DrakeDaeError, GeometryWarning, ModelError, RobotFileWarning
-from drake_dae.scenario.robot_file.loops import joints_of
+from drake_dae.robots import Constraint, MultibodyExpressions, joint_names, plant_constraints
+from drake_dae.scenario.form import at
+from drake_dae.scenario.robot_file.changes import (
+    add_payloads,
+    change_robot,
+    cut_loops,
+    joints_of,
+    loop_constraint,
+)
+from drake_dae.scenario.robot_file.files import RobotFiles
 from drake_dae.scenario.robot_file.mending import Mender
-from drake_dae.scenario.robot_file.packages import RobotFiles
 from drake_dae.scenario.robot_file.read_by_drake import DRIVES
-from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.robot_file.robot import Payload, Robot
+
+RobotLinks = tuple[MultibodyExpressions, list[Constraint]]
+"""The links of a robot, and its loop-closing joints as constraints."""
 
 _REMEDIES = {
     "inertia": "it takes the nearest possible moments of inertia",
@@ -38,6 +54,84 @@ _REMEDIES = {
 """What the name of a lost part contains -> what to do besides."""
 
 _RED = [0.8, 0.1, 0.1, 1.0]
+
+_MASSLESS = 1e-12
+"""An eigenvalue of M(q) below this fraction of the largest one is zero up to round-off."""
+
+
+@at("robot.file")
+def add_robot(
+    robot: Robot,
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    payloads: Sequence[Payload] = (),
+) -> None:
+    """Adds the robot of a scenario to a plant that is not finalized."""
+    _, mender = read_robot(robot, scene_graph, plant=plant)
+    with drake_errors():
+        change_robot(robot, plant, mender)
+    add_payloads("plant.payloads", payloads, plant)
+    cut_loops(plant, mender)
+
+
+@at("robot.file")
+def robot_links(
+    robot: Robot, scene_graph: SceneGraph, payloads: Sequence[Payload] = (), drawn: bool = True
+) -> RobotLinks:
+    """The links of a scenario's robot, and its loop-closing joints as constraints."""
+    plant, mender = read_robot(robot, scene_graph, drawn)
+    with drake_errors():
+        change_robot(robot, plant, mender)
+        add_payloads("plant.payloads", payloads, plant)
+        cuts = cut_loops(plant, mender)
+    finalize(plant)
+    for joint in joints_of(plant):
+        if isinstance(joint, QuaternionFloatingJoint):
+            name = joint.child_body().name()
+            raise ModelError(
+                f"body '{name}' is free, with a quaternion, which is not supported. Weld it to the "
+                f"world by robot.base, as base: {{weld: {name}}}, or name it in robot.free, which "
+                "gives it a joint in roll, pitch and yaw"
+            )
+    links = MultibodyExpressions(plant, scene_graph)
+    _check_mass(plant)
+    try:
+        plant_constraints(links)
+    except ModelError as error:
+        raise ModelError(
+            f"{error}. robot.leave_out takes them out, as [equality/connect] of MJCF, or "
+            "[robot/drake:ball_constraint] of a URDF"
+        ) from None
+    return links, [loop_constraint(cut, plant) for cut in cuts]
+
+
+def finalize(plant: MultibodyPlant) -> None:
+    """Finalizes a plant."""
+    with drake_errors():
+        plant.Finalize()
+
+
+def _check_mass(plant: MultibodyPlant) -> None:
+    """Checks that each joint moves a mass; otherwise its acceleration is not determined."""
+    context = plant.CreateDefaultContext()
+    default, random = plant.GetPositions(context), np.random.default_rng(0)
+    # A point mass at the end of a straight arm makes M(q) singular in that configuration only.
+    for step in (np.zeros_like(default), *random.uniform(-1.0, 1.0, (3, default.size))):
+        plant.SetPositions(context, default + step)
+        values, modes = np.linalg.eigh(plant.CalcMassMatrix(context))
+        null = modes[:, values <= _MASSLESS * values[-1]]
+        if not null.size:
+            return
+    massless = {}
+    for name, joint in joint_names(plant).items():
+        velocities = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
+        if np.any(np.abs(null[velocities]) > 0.1):
+            massless[name] = joint.child_body().name()
+    raise ModelError(
+        f"joints that move no mass: {', '.join(massless)}. Links without it, which no force can "
+        f"move: {', '.join(massless.values())}; give them <inertial> with mass and inertia, or "
+        "lock the joints by robot.locked"
+    )
 
 
 def read_robot(
@@ -55,9 +149,6 @@ def read_robot(
             longer than all else.
         plant: The plant, registered in the scene graph; None makes one.
 
-    Returns:
-        The plant, and what its files say besides.
-
     Raises:
         ModelError: The files cannot be read, or are not supported.
         ScenarioError: A key of the scenario does not fit; the message names the key.
@@ -69,7 +160,7 @@ def read_robot(
     parser = Parser(plant)
     files = RobotFiles(robot, parser.package_map())
     with TemporaryDirectory() as folder:
-        mender = Mender(files.find, files.folders, robot.leave_out, robot.actuators is None)
+        mender = Mender(files, robot.leave_out, robot.actuators is None)
         mender.has_geometry, mender.drawn = scene_graph is not None, drawn
         mender.folder = Path(folder).resolve()
         with drake_errors(mender.originals):
@@ -91,20 +182,19 @@ def read_robot(
             plant.RegisterVisualGeometry(body, RigidTransform(), bar, f"left_out_{axis}", _RED)
     unlimited = np.full(1, np.inf)  # Many authors write 0 for an unknown limit.
     for joint in joints_of(plant):
-        if joint.num_positions() != 1:
-            continue
-        bounds = joint.position_lower_limits(), joint.position_upper_limits()
-        if "empty_limits" in robot.leave_out and bounds[0] == bounds[1]:
-            joint.set_position_limits(-unlimited, unlimited)
-        if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
-            joint.set_velocity_limits(-unlimited, unlimited)
+        if joint.num_positions() == 1:
+            low, high = joint.position_lower_limits(), joint.position_upper_limits()
+            if "empty_limits" in robot.leave_out and low == high:
+                joint.set_position_limits(-unlimited, unlimited)
+            if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
+                joint.set_velocity_limits(-unlimited, unlimited)
     return plant, mender
 
 
 def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
     """The packages that a robot's file names and that are not found, and what is lost of it."""
     files = RobotFiles(robot, Parser(MultibodyPlant(0.0)).package_map())
-    mender = Mender(files.find, files.folders, robot.leave_out, robot.actuators is None)
+    mender = Mender(files, robot.leave_out, robot.actuators is None)
     with drake_errors():
         _mended(robot, files, mender)
     return list(files.missing), list(mender.lost)
@@ -116,16 +206,14 @@ def _mended(robot: Robot, files: RobotFiles, mender: Mender) -> Path | ModelDire
     if not files.main.name.endswith((".dmd.yaml", ".dmd.yml")):
         return mender.copy(files.main, "", placed)
     _find_packages(files, files.main, ())
-    loaded = LoadModelDirectives(str(files.main))
-    directives = FlattenModelDirectives(loaded, files.packages)
+    directives = FlattenModelDirectives(LoadModelDirectives(str(files.main)), files.packages)
     welds = (directive.add_weld for directive in directives.directives)
     placed += [weld.child for weld in welds if weld is not None]
     for directive in directives.directives:
-        if (model := directive.add_model) is None:
-            continue
-        file = files.needed(model.file, files.main)
-        links = [link.removeprefix(f"{model.name}::") for link in placed]
-        model.file = mender.copy(file, model.name, links).as_uri()
+        if (model := directive.add_model) is not None:
+            links = [link.removeprefix(f"{model.name}::") for link in placed]
+            file = files.needed(model.file, files.main)
+            model.file = mender.copy(file, model.name, links).as_uri()
     return directives
 
 
@@ -183,8 +271,7 @@ def _add_floating_joints(plant: MultibodyPlant, mender: Mender) -> None:
     No constraint force keeps the length of a quaternion at 1.
     """
     for model, name, parent, child, pose in mender.floating:
-        models = _instance(plant, model)
-        is_world = parent == "world"
+        models, is_world = _instance(plant, model), parent == "world"
         above = plant.world_body() if is_world else plant.GetBodyByName(parent, *models)
         body = plant.GetBodyByName(child, *models)
         start = plant.GetDefaultFloatingBaseBodyPose(body)

@@ -9,8 +9,8 @@ import numpy as np
 from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.robots import Load, Vector
-from drake_dae.scenario.forms.typed_yaml import TAG
-from drake_dae.scenario.forms.values import FILE, Value, in_folder
+from drake_dae.scenario.form import FILE, Value, in_folder
+from drake_dae.scenario.typed_yaml import TAG
 
 
 @dataclass(frozen=True)

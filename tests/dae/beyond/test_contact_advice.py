@@ -2,7 +2,7 @@
 
 import pytest
 
-from drake_dae import SensedContact, SensorNoise, advised_gains
+from drake_dae.dae import SensedContact, SensorNoise, advised_gains
 from drake_dae.dae.beyond.one_direction import Direction, DirectionGains, sampled_loop
 from drake_dae.errors import GainError, ModelError
 

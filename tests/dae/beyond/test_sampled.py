@@ -10,16 +10,15 @@ from runs import run
 from drake_dae import (
     ConstantReference,
     DaeSystem,
-    LoopSettings,
     RobotPlant,
     Sampling,
     SinusoidReference,
     TrackingLaw,
     make_closed_loop,
     poles,
-    sampled_poles,
-    sampling_error,
 )
+from drake_dae.dae import sampled_poles, sampling_error
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError
 
 T = 0.05

@@ -22,12 +22,12 @@ from drake_dae import (
     SinusoidReference,
     TrackingLaw,
     build_scenario,
-    contact_damping,
     find_structure,
     load_scenario,
     poles,
     simulate,
 )
+from drake_dae.dae import contact_damping
 from drake_dae.errors import AdviceWarning, ModelError
 from drake_dae.references import stack_references
 from drake_dae.scenario.shipped import find_scenario

@@ -12,7 +12,6 @@ from pydrake.systems.analysis import Simulator
 from drake_dae import (
     DaePlant,
     DaeSystem,
-    LoopSettings,
     NormalForm,
     Parameter,
     SinusoidReference,
@@ -20,12 +19,12 @@ from drake_dae import (
     TrackingLaw,
     ZeroDynamics,
     dynamic_extension,
-    extend,
     find_structure,
     make_closed_loop,
     poles,
 )
-from drake_dae.dae import Verdict
+from drake_dae.dae import Verdict, extend
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import nearest_solution
 

@@ -6,7 +6,8 @@ import pytest
 from runs import roll, run_scenario, scenario
 from scipy.linalg import expm
 
-from drake_dae import DaeSystem, TrackingLaw, poles, sampling_error
+from drake_dae import DaeSystem, TrackingLaw, poles
+from drake_dae.dae import sampling_error
 from drake_dae.errors import ModelError
 
 INERTIA, DAMPING, PERIOD, POLE = 1e-3, 2.0, 1e-3, -10.0

@@ -21,12 +21,7 @@ from problems.zero_systems import (
     zero_dynamics,
 )
 
-from drake_dae import (
-    ConstantReference,
-    DaePlant,
-    analyze,
-    make_closed_loop,
-)
+from drake_dae import ConstantReference, DaePlant, analyze, make_closed_loop
 from drake_dae.dae import DaeSystem, TrackingLaw, Verdict, ZeroDynamics, find_structure, poles
 from drake_dae.errors import (
     InconsistentStateError,

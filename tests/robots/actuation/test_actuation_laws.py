@@ -28,15 +28,15 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from drake_dae import (
     ConstantReference,
-    DrakeDaeError,
     RobotPlant,
     SinusoidReference,
     TrackingLaw,
-    gain_matrices,
     make_closed_loop,
     poles,
     simulate,
 )
+from drake_dae.dae import gain_matrices
+from drake_dae.errors import DrakeDaeError
 
 
 def binomial(pole, degree, size):

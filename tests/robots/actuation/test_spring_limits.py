@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from drake_dae import DaeSystem, TrackingLaw, poles, sampled_poles
+from drake_dae import DaeSystem, TrackingLaw, poles
+from drake_dae.dae import sampled_poles
 
 LINKS, ROTORS, SPRINGS = np.array([2.0, 0.3]), np.array([0.5, 0.7]), np.array([900.0, 500.0])
 

@@ -26,7 +26,6 @@ from drake_dae import (
     CoincidentPoints,
     JointPositions,
     LinkExpressions,
-    MultibodyExpressions,
     Plane,
     PointOnSurface,
     RobotModel,
@@ -36,6 +35,7 @@ from drake_dae import (
     find_structure,
 )
 from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.robots import MultibodyExpressions
 from drake_dae.trace.functions import TracedFunction
 
 VELOCITY = JacobianWrtVariable.kV

@@ -24,23 +24,27 @@ from pydrake.multibody.tree import (
 
 from drake_dae import (
     AxisNormalToSurface,
-    Blade,
     CoincidentPoints,
     Ellipsoid,
     FixedDistance,
     ImplicitSurface,
     JointCoupler,
-    MultibodyExpressions,
     Plane,
     PointOnSurface,
     PrismaticLoopJoint,
     RevoluteLoopJoint,
-    RollingBall,
     RollingWheel,
     Sphere,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots import Constraint, ConstraintSet, WeldedFrames
+from drake_dae.robots import (
+    Blade,
+    Constraint,
+    ConstraintSet,
+    MultibodyExpressions,
+    RollingBall,
+    WeldedFrames,
+)
 from drake_dae.trace.functions import TracedFunction
 
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}

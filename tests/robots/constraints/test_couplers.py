@@ -22,7 +22,6 @@ from drake_dae import (
     JointCoupler,
     JointPositions,
     LinkExpressions,
-    MultibodyExpressions,
     PointCoordinates,
     RobotModel,
     RobotPlant,
@@ -34,7 +33,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import ModelError
-from drake_dae.robots import plant_constraints
+from drake_dae.robots import MultibodyExpressions, plant_constraints
 
 # What is read from a plant.
 

@@ -36,11 +36,10 @@ from drake_dae import (
     find_structure,
     poles,
 )
-from drake_dae.analysis.limits import LimitKind
+from drake_dae.analysis.limits import LimitKind, robot_limits
 from drake_dae.diagrams.wiring import make_closed_loop
 from drake_dae.errors import ModelError
 from drake_dae.references import SinusoidReference
-from drake_dae.running.limits import ranges_of, robot_limits
 
 COUNT = 8
 SLIDES = {2, 6}
@@ -290,7 +289,8 @@ def test_the_law_steers_through_a_motor_in_the_loop_and_limits_are_reported_alik
         predicted = loop.predicted_error(record)
         assert_allclose(record["tracking_error"], predicted, atol=1e-7)
         records.append(record)
-        ranges = ranges_of(robot_limits(loop.plant.model), record)
+        limits = robot_limits(loop.plant.model)
+        ranges = limits.ranges(record.time, limits.of_record(record))
         over = [r for r in ranges if r.excess and r.kind is LimitKind.POSITION]
         left += [(r.least, r.largest, r.low, r.high) for r in over]
     first, second = records

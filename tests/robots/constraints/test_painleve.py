@@ -34,12 +34,12 @@ from drake_dae import (
     poles,
     rollout,
     simulate,
-    start_values,
 )
 from drake_dae.dae import PainleveOutcome, Parameter, Signal, UnilateralInput, painleve_outcome
 from drake_dae.dae.contacts import MOST, Contacts, critical_factor
 from drake_dae.errors import ModelError, PainleveError
 from drake_dae.references import stack_references
+from drake_dae.running import start_values
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.functions import TracedFunction

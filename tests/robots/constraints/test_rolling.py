@@ -21,13 +21,11 @@ from pydrake.multibody.tree import (
 from test_contract_of_constraints import robot
 
 from drake_dae import (
-    Blade,
     Ellipsoid,
     Plane,
     PointCoordinates,
     RobotModel,
     RobotPlant,
-    RollingBall,
     RollingWheel,
     SinusoidReference,
     Sphere,
@@ -38,6 +36,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.robots import Blade, RollingBall
 from drake_dae.trace.functions import TracedFunction
 
 GRAVITY = 9.81

@@ -25,10 +25,10 @@ from drake_dae import (
     make_closed_loop,
     poles,
     rollout,
-    start_values,
 )
 from drake_dae.blocks.block import BlockFunction
 from drake_dae.robots import MultibodyExpressions
+from drake_dae.running import start_values
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction, count_operations
 

@@ -22,9 +22,9 @@ from pydrake.multibody.tree import (
     UniversalJoint,
 )
 
-from drake_dae import LinkExpressions, MultibodyExpressions
+from drake_dae import LinkExpressions
 from drake_dae.errors import ModelError
-from drake_dae.robots import Reaction
+from drake_dae.robots import MultibodyExpressions, Reaction
 from drake_dae.trace.functions import TracedFunction
 
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}

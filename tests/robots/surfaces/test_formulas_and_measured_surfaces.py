@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 from meshes import obj_of_grid, stl_of
 
-from drake_dae import (
-    Cylinder,
-    ImplicitSurface,
-    MeasuredSurface,
-    PointOnSurface,
-    Sphere,
-)
+from drake_dae import Cylinder, ImplicitSurface, MeasuredSurface, PointOnSurface, Sphere
 from drake_dae.errors import ModelError
 from drake_dae.robots import tangents
 from drake_dae.trace.expressions import find_flaw

@@ -5,10 +5,11 @@ import re
 import pytest
 from combinations import combined, one_in
 
-from drake_dae import build_commanded, build_scenario, load_scenario
+from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ModelError, ScenarioError, WiringError
 from drake_dae.running.bench.description import bench_of
 from drake_dae.running.export.steps.boundary import loop_part
+from drake_dae.scenario import build_commanded
 
 
 def is_sentence(text):

@@ -18,6 +18,7 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource, Gain
 import drake_dae as dd
 from drake_dae import shipped_model, write_page
 from drake_dae.errors import ModelError
+from drake_dae.robots import KnownWrench
 from drake_dae.running.bench.description import bench_of, shown_function
 
 FIXED = SimulatorConfig(
@@ -61,7 +62,7 @@ def wired_by_hand(with_geometry=True):
         [wall],
         outputs=[dd.PointCoordinates("tool", "z")],
         nominal_positions=[1.2, -1.6],
-        known_forces=[dd.KnownWrench("link2", name="push.two_link_arm::link2")],
+        known_forces=[KnownWrench("link2", name="push.two_link_arm::link2")],
     )
     law = dd.TrackingLaw(model.dae, dd.poles(-4.0))
     references = [dd.SinusoidReference(0.3, 0.3, 1.5), dd.SinusoidReference(20.0, 5.0, 2.0)]

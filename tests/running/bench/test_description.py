@@ -6,14 +6,8 @@ import pytest
 from arms import arm
 from runs import scenario
 
-from drake_dae import (
-    ConstantReference,
-    LoopSettings,
-    RobotPlant,
-    TrackingLaw,
-    make_closed_loop,
-    poles,
-)
+from drake_dae import ConstantReference, RobotPlant, TrackingLaw, make_closed_loop, poles
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError
 from drake_dae.robots import ConstraintWrenches
 from drake_dae.running.bench.controls import controls_of, prediction

@@ -8,9 +8,10 @@ import pytest
 from browser import in_page, low_contrast, needs_chromium
 from runs import scenario
 
-from drake_dae import build_commanded, write_page
+from drake_dae import write_page
 from drake_dae.cli import main
 from drake_dae.errors import MachineCodeError
+from drake_dae.scenario import build_commanded
 from drake_dae.trace import compiler
 
 needs_zig = pytest.mark.skipif(find_spec("ziglang") is None, reason="there is no ziglang")

@@ -12,16 +12,11 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 from runs import MANY_PIECES, scenario
 
-from drake_dae import (
-    CompliantPlant,
-    PointMaterial,
-    build_scenario,
-    export_controller,
-    make_closed_loop,
-)
+from drake_dae import CompliantPlant, build_scenario, export_controller, make_closed_loop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.steps.boundary import controller_part
 from drake_dae.running.export.steps.ticks import Ticks
+from drake_dae.systems import PointMaterial
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 RUNNING, HOLDING, STOPPED, WAITING = range(4)

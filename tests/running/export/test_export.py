@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from runs import TASKS, each_scenario, scenario, some
 
-from drake_dae import ClosedLoop, build_scenario, export_code
+from drake_dae import ClosedLoop, build_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ModelError
+from drake_dae.running import export_code
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 

@@ -10,8 +10,9 @@ from c_integrated import CIntegrated
 from pydrake.systems.analysis import SimulatorConfig
 from runs import scenario
 
-from drake_dae import Record, build_scenario, export_code, export_controller, simulate
+from drake_dae import Record, build_scenario, export_controller, simulate
 from drake_dae.errors import ModelError
+from drake_dae.running import export_code
 from drake_dae.running.export.steps.boundary import loop_part, plant_part
 from drake_dae.running.export.steps.integrated import fixed_steps, write_integrated
 

@@ -10,9 +10,10 @@ import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from runs import run, scenario
 
-from drake_dae import build_scenario, export_wasm
+from drake_dae import build_scenario
 from drake_dae.cli import main
 from drake_dae.errors import MachineCodeError
+from drake_dae.running import export_wasm
 from drake_dae.trace import compiler
 
 needs_zig = pytest.mark.skipif(find_spec("ziglang") is None, reason="there is no ziglang")

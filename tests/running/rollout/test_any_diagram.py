@@ -28,9 +28,10 @@ from pydrake.systems.primitives import (
 from runs import both
 from scipy.linalg import expm
 
-from drake_dae import export_code, rollout, start_values
+from drake_dae import rollout
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.errors import ModelError
+from drake_dae.running import export_code, start_values
 from drake_dae.running.rollout import program
 
 

@@ -5,9 +5,10 @@ import pytest
 from numpy.testing import assert_allclose
 from runs import first_quick, mostly_compiled, run_scenario, scenario, some
 
-from drake_dae import build_scenario, rollout, start_values
+from drake_dae import build_scenario, rollout
 from drake_dae.compiler.drake_steps import DrakeSteps
 from drake_dae.errors import ModelError, SimulationError
+from drake_dae.running import start_values
 from drake_dae.running.export.parts import parts_of
 from drake_dae.running.rollout import drake_stepped
 from drake_dae.running.rollout.program import program_of

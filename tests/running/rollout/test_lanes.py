@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from runs import scenario, some
 
-from drake_dae import build_scenario, rollout, start_values
+from drake_dae import build_scenario, rollout
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import MachineCodeWarning, ModelError
+from drake_dae.running import start_values
 from drake_dae.running.rollout import rollout as module
 from drake_dae.running.rollout.lanes.emitter import emitted
 from drake_dae.running.rollout.lanes.library import FOLDER, OPTIONS, source

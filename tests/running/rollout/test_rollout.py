@@ -11,7 +11,6 @@ from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, 
 
 from drake_dae import (
     ForceSensor,
-    LoopSettings,
     RobotPlant,
     TrackingLaw,
     build_scenario,
@@ -19,8 +18,8 @@ from drake_dae import (
     poles,
     rollout,
     simulate,
-    start_values,
 )
+from drake_dae.diagrams import LoopSettings
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import (
     InconsistentStateError,
@@ -29,6 +28,7 @@ from drake_dae.errors import (
     SimulationError,
 )
 from drake_dae.references.polynomials import UNROLLED
+from drake_dae.running import start_values
 from drake_dae.running.rollout.program import program_of
 from drake_dae.running.rollout.rollout import run_loop
 from drake_dae.scenario.rolled import roll_scenario

@@ -9,7 +9,6 @@ from runs import mostly_compiled, some
 
 from drake_dae import (
     Approach,
-    Condition,
     Dwell,
     Move,
     Press,
@@ -20,9 +19,10 @@ from drake_dae import (
     load_scenario,
     rollout,
     simulate,
-    start_values,
 )
+from drake_dae.running import start_values
 from drake_dae.running.rollout.program import program_of
+from drake_dae.systems import Condition
 
 
 def pulled(*phases, pull=0.0, sampling=None):

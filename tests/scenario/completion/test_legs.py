@@ -3,8 +3,9 @@
 import pytest
 from vendors import joint, link, robot
 
-from drake_dae import build_scenario, complete_scenario, load_scenario
+from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario import complete_scenario
 from drake_dae.scenario.model import scenario_model
 
 LEGS = """

@@ -7,8 +7,9 @@ import pytest
 from runs import some
 from vendors import joint, link, robot
 
-from drake_dae import build_scenario, complete_scenario, load_scenario
+from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario import complete_scenario
 
 FAR = """
 robot: {{file: {folder}/far.urdf, base: {{weld: base}}, actuators: all}}

@@ -5,10 +5,11 @@ from arms import parse
 from numpy.testing import assert_allclose
 from runs import some
 
-from drake_dae import build_scenario, complete_scenario, load_scenario
+from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario import complete_scenario
 from drake_dae.scenario.completion import BEFORE
-from drake_dae.scenario.files import save_scenario
+from drake_dae.scenario.scenario import save_scenario
 
 TEXT = """
 robot: {{file: package://drake_dae_models/seven_joint_arm.dmd.yaml}}

@@ -9,7 +9,9 @@ import pytest
 from numpy.typing import ArrayLike
 
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.forms.forms import (
+from drake_dae.scenario.form import (
+    NUMBERS,
+    TRIPLE,
     Family,
     Key,
     Reader,
@@ -17,8 +19,7 @@ from drake_dae.scenario.forms.forms import (
     introduction,
     keys_of,
 )
-from drake_dae.scenario.forms.typed_yaml import dump_yaml, load_lines, load_yaml
-from drake_dae.scenario.forms.values import NUMBERS, TRIPLE
+from drake_dae.scenario.typed_yaml import dump_yaml, load_lines, load_yaml
 
 
 class Surface:

@@ -4,14 +4,7 @@ import pytest
 from runs import scenario
 
 from drake_dae import build_scenario
-from drake_dae.errors import AssumptionError, ScenarioError
-from drake_dae.scenario.forms.keys import violated
-
-
-def test_a_violation_has_its_key():
-    assert violated(AssumptionError("no integrators", 5)).problems == (
-        ("outputs", "no integrators"),
-    )
+from drake_dae.errors import ScenarioError
 
 
 @pytest.mark.parametrize(

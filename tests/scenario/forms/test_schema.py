@@ -6,9 +6,9 @@ import pytest
 from book.keys import forms, keys_page
 from runs import scenario_validator, untagged
 
-from drake_dae import scenario_schema
-from drake_dae.scenario.forms.typed_yaml import load_yaml
+from drake_dae.scenario import scenario_schema
 from drake_dae.scenario.shipped import shipped_scenarios
+from drake_dae.scenario.typed_yaml import load_yaml
 
 
 def test_every_form_and_key_is_on_the_page_of_keys_with_its_meaning():

@@ -13,9 +13,8 @@ from pydrake.multibody.tree import FrameIndex
 from pydrake.solvers import MathematicalProgram
 
 from drake_dae.errors import ModelError
-from drake_dae.scenario.robot_file.changes import finalize
 from drake_dae.scenario.robot_file.read_by_drake import READ_BY_DRAKE
-from drake_dae.scenario.robot_file.reading import needs_of, read_robot
+from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.robot_file.xml_tree import read_xml, write_xml
 

@@ -17,8 +17,7 @@ from drake_dae import load_scenario
 from drake_dae.errors import RobotFileWarning, ScenarioError
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.changes import change_robot
-from drake_dae.scenario.robot_file.links import robot_links
-from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.reading import read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot
 
 # The collision meshes of the panda are left out.
@@ -312,7 +311,7 @@ def test_an_effort_limit_of_0_is_unknown(tmp_path):
     file = tmp_path / "robot.urdf"
     text = robot("one", link("a", 1), link("b", 1), joint("j", "a", "b", "0 0 1"))
     file.write_text(text.replace("87.0", "0"))
-    assert read_robot(Robot(str(file)))[1].efforts == {}
+    assert not read_robot(Robot(str(file)))[1].joints["effort"]
 
 
 def test_effort_limits_of_a_file_with_a_prefix_that_it_does_not_declare(tmp_path):
@@ -323,7 +322,7 @@ def test_effort_limits_of_a_file_with_a_prefix_that_it_does_not_declare(tmp_path
     chosen = Robot(file=str(file), actuators="all")
     plant, mender = read_robot(chosen)
     change_robot(chosen, plant, mender)
-    assert mender.efforts == {("", "j"): 87.0}
+    assert mender.joints["effort"] == {("", "j"): 87.0}
     plant.Finalize()
     assert plant.GetAccelerationUpperLimits()[-1] == 7.0
     assert plant.GetEffortUpperLimits().tolist() == [87.0]

@@ -9,9 +9,9 @@ from vendors import write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.robot_file.packages import described_robot
+from drake_dae.scenario.robot_file.files import described_robot
+from drake_dae.scenario.scenario import save_scenario
 
 pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
 
@@ -81,7 +81,7 @@ def test_without_a_network_it_says_what_to_do(fake, tmp_path, monkeypatch):
             raise RuntimeError("could not resolve host")
         return sys.modules[name]
 
-    monkeypatch.setattr("drake_dae.scenario.robot_file.packages.import_module", fail)
+    monkeypatch.setattr("drake_dae.scenario.robot_file.files.import_module", fail)
     with pytest.raises(ModelError) as caught:
         described_robot("far")
     for words in ("could not resolve host", "ROBOT_DESCRIPTIONS_CACHE", "robot.file"):

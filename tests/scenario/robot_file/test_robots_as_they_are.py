@@ -16,10 +16,9 @@ from vendors import binary_stl, joint, link, robot
 
 from drake_dae import load_scenario
 from drake_dae.errors import ModelError, RobotFileWarning, ScenarioError
-from drake_dae.scenario.robot_file.changes import change_robot, finalize
-from drake_dae.scenario.robot_file.inertias import nearest_inertia
-from drake_dae.scenario.robot_file.links import robot_links
-from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.changes import change_robot
+from drake_dae.scenario.robot_file.mending import nearest_inertia
+from drake_dae.scenario.robot_file.reading import finalize, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Pose, Robot, RobotPlacement
 
 

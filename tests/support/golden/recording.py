@@ -10,8 +10,9 @@ from importlib.metadata import version
 import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 
-from drake_dae import build_scenario, contact_gains, load_scenario, rollout, start_values
+from drake_dae import build_scenario, contact_gains, load_scenario, rollout
 from drake_dae.cli import main
+from drake_dae.running import start_values
 from drake_dae.scenario.shipped import find_scenario
 from golden.cases import CASES, FIXTURE, STEPS, Case
 

@@ -29,17 +29,17 @@ from drake_dae import (
     DaeSystem,
     ExpressionReference,
     ForceSensor,
-    LoopSettings,
     ReferenceGenerator,
     RobotPlant,
     SinusoidReference,
     TrackingController,
     TrackingLaw,
-    TrajectoryReference,
     make_closed_loop,
     poles,
 )
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, NonFiniteError, SingularityError
+from drake_dae.systems import TrajectoryReference
 
 GRADIENT = 3e-9
 """Of finite differences, relative to the largest entry: sixth order at steps of 1e-3, where the

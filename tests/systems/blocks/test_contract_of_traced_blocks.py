@@ -15,14 +15,10 @@ from runs import some
 
 from drake_dae import (
     Approach,
-    CommandedReferences,
     CompliantPlant,
     DaePlant,
-    DisturbanceObserver,
     ExpressionReference,
     ForceSensor,
-    Observing,
-    PointMaterial,
     Press,
     ReferenceGenerator,
     Release,
@@ -35,11 +31,12 @@ from drake_dae import (
     TrackingController,
     TrackingLaw,
     poles,
-    with_disturbance,
 )
 from drake_dae.blocks.computations import DERIVATIVE, HELD, Traced
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
+from drake_dae.dae import with_disturbance
+from drake_dae.systems import CommandedReferences, DisturbanceObserver, Observing, PointMaterial
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor

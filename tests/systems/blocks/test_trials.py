@@ -11,12 +11,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from runs import some
 
-from drake_dae import (
-    DaePlant,
-    DaeSystem,
-    ForceSensor,
-    simulate,
-)
+from drake_dae import DaePlant, DaeSystem, ForceSensor, simulate
 from drake_dae.errors import NonFiniteError, SimulationError, SingularityError
 
 ERROR_CONTROLLED = (

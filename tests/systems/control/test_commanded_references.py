@@ -7,13 +7,10 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from drake_dae import (
-    CommandedReferences,
-    ConstantReference,
-    ExpressionReference,
-)
+from drake_dae import ConstantReference, ExpressionReference
 from drake_dae.dae import Signal
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.systems import CommandedReferences
 from drake_dae.systems.control.commanded import RATE, RATES, SPEEDS
 
 SIGNALS = (Signal("tool.y", "m"), Signal("wall.force", "N"))

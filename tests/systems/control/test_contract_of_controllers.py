@@ -10,8 +10,6 @@ from drake_dae import (
     Approach,
     ConstantReference,
     ForceSensor,
-    LoopSettings,
-    Observing,
     Press,
     ReferenceGenerator,
     RobotPlant,
@@ -22,9 +20,10 @@ from drake_dae import (
     TrackingLaw,
     poles,
     simulate,
-    wire_loop,
 )
+from drake_dae.diagrams import LoopSettings, wire_loop
 from drake_dae.errors import ModelError, WiringError
+from drake_dae.systems import Observing
 from drake_dae.systems.control.contract import Controller
 
 GOALS, SAMPLE = [0.3, 20.0], 0.01

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from arms import arm, consistent_states, law
 
-from drake_dae import DaeSystem, TrackingController, TrackingLaw, gain_matrices, poles
+from drake_dae import DaeSystem, TrackingController, TrackingLaw, poles
+from drake_dae.dae import gain_matrices
 from drake_dae.errors import GainError, NonFiniteError, NonMinimumPhaseWarning, SingularityError
 
 

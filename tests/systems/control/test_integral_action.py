@@ -10,8 +10,6 @@ from numpy.testing import assert_allclose
 from drake_dae import (
     ConstantReference,
     ForceSensor,
-    KnownForce,
-    LoopSettings,
     RobotModel,
     RobotPlant,
     SinusoidReference,
@@ -19,13 +17,15 @@ from drake_dae import (
     TrackingLaw,
     build_scenario,
     find_structure,
-    linearize_loop,
     load_scenario,
     make_closed_loop,
     poles,
     simulate,
 )
+from drake_dae.dae import linearize_loop
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import GainError, ModelError, WiringError
+from drake_dae.robots import KnownForce
 from drake_dae.scenario.shipped import find_scenario
 
 WANTED = [SinusoidReference(0.3, 0.2, 1.5), SinusoidReference(20.0, 5.0, 2.0)]

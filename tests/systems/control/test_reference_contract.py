@@ -15,18 +15,16 @@ from drake_dae import (
     CsvReference,
     ExpressionReference,
     LineReference,
-    PathLimits,
     PointToPointReference,
     PolylineReference,
     Reference,
     ReferenceGenerator,
-    ReferenceRows,
     SinusoidReference,
-    SpiralReference,
-    TrajectoryReference,
     WaypointsReference,
 )
 from drake_dae.errors import ReferenceSignalError
+from drake_dae.references import PathLimits, ReferenceRows, SpiralReference
+from drake_dae.systems import TrajectoryReference
 
 PATH = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
     [0.0, 1.0, 2.0], [[0.0, 1.0, 0.5], [1.0, -1.0, 2.0]], np.zeros((2, 1)), np.zeros((2, 1))

@@ -15,9 +15,9 @@ from drake_dae import (
     PointToPointReference,
     ReferenceGenerator,
     SinusoidReference,
-    TrajectoryReference,
 )
 from drake_dae.errors import NonFiniteError, ReferenceSignalError, SimulationError
+from drake_dae.systems import TrajectoryReference
 
 
 def table(signal, degree, time):

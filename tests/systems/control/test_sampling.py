@@ -16,12 +16,10 @@ from runs import run, run_scenario, scenario
 
 from drake_dae import (
     ConstantReference,
-    ControlHold,
     ControlLimits,
     DaePlant,
     DaeSystem,
     ForceSensor,
-    LoopSettings,
     RobotPlant,
     Sampling,
     SinusoidReference,
@@ -31,7 +29,9 @@ from drake_dae import (
     poles,
     simulate,
 )
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, ScenarioError, WiringError
+from drake_dae.systems import ControlHold
 
 STEP = error_controlled(1e-10)
 K, T = 3.0, 0.05

@@ -15,23 +15,22 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.stats import chi2
 
 from drake_dae import (
-    ControlHold,
     DaePlant,
     DaeSystem,
     Encoders,
-    Observing,
     Sampling,
     StateEstimator,
     TrackingController,
     TrackingLaw,
     build_scenario,
     poles,
-    with_disturbance,
 )
+from drake_dae.dae import with_disturbance
 from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
+from drake_dae.systems import ControlHold, Observing
 from drake_dae.systems.sensing.encoders import StateSensor
 
 T, MASS, FAST, SLOW = 0.01, 2.5, 20.0, 5.0

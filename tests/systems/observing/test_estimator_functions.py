@@ -8,7 +8,9 @@ import pytest
 from arms import arm, numbers
 from numpy.testing import assert_allclose
 
-from drake_dae import Observing, RobotModel, TrackingLaw, poles, with_disturbance
+from drake_dae import RobotModel, TrackingLaw, poles
+from drake_dae.dae import with_disturbance
+from drake_dae.systems import Observing
 from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
 
 T = 1e-3

@@ -13,8 +13,6 @@ from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from drake_dae import (
     DaePlant,
     DaeSystem,
-    LoopSettings,
-    Observing,
     Sampling,
     SinusoidReference,
     TrackingLaw,
@@ -24,15 +22,16 @@ from drake_dae import (
     poles,
     rollout,
     simulate,
-    start_values,
-    with_disturbance,
 )
 from drake_dae.cli import main
-from drake_dae.dae import DerivativeLayout, Observation, Parameter, find_structure
+from drake_dae.dae import DerivativeLayout, Observation, Parameter, find_structure, with_disturbance
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.running import start_values
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import FOLDER
+from drake_dae.systems import Observing
 
 T, MASS, VISCOUS = 0.002, 2.5, 0.7
 

@@ -20,13 +20,9 @@ from pydrake.systems.primitives import (
 
 from drake_dae import (
     ConstantReference,
-    ConstraintStructure,
     DaePlant,
     DaeSystem,
-    DisturbanceObserver,
     ForceSensor,
-    LoopSettings,
-    Observing,
     RobotModel,
     RobotPlant,
     Sampling,
@@ -36,11 +32,12 @@ from drake_dae import (
     make_closed_loop,
     poles,
     simulate,
-    with_disturbance,
 )
-from drake_dae.dae import Observation
+from drake_dae.dae import ConstraintStructure, Observation, with_disturbance
 from drake_dae.dae.beyond.friction_share import beside, shares
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, WiringError
+from drake_dae.systems import DisturbanceObserver, Observing
 
 T, RATE, MASS = 0.01, 8.0, 2.5
 STEPS = error_controlled(1e-10)

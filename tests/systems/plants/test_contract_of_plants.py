@@ -18,7 +18,6 @@ from drake_dae import (
     ContactMaterial,
     ContactPlant,
     DaePlant,
-    PointMaterial,
     RobotPlant,
     TrackingLaw,
     build_scenario,
@@ -33,9 +32,10 @@ from drake_dae import (
 from drake_dae.diagrams.record import Record
 from drake_dae.diagrams.recorded import log_steps
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.robot_file.links import add_robot
+from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.studies.runs import Outcome
+from drake_dae.systems import PointMaterial
 from drake_dae.systems.plants.contract import Plant
 
 FINE = 1e-10

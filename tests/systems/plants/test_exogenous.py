@@ -14,16 +14,16 @@ from drake_dae import (
     DaePlant,
     DaeSystem,
     ExpressionReference,
-    LoopSettings,
     Parameter,
     ReferenceGenerator,
     TrackingLaw,
-    find_constraint_structure,
     find_structure,
     linearize,
     make_closed_loop,
     poles,
 )
+from drake_dae.dae import find_constraint_structure
+from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError
 
 GRAVITY = 9.81

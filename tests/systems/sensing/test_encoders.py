@@ -10,9 +10,10 @@ from pydrake.systems.primitives import LogVectorOutput, RandomSource, Trajectory
 from pydrake.trajectories import PiecewisePolynomial
 from runs import run, run_scenario, scenario
 
-from drake_dae import Encoders, StateSensor, build_scenario
+from drake_dae import Encoders, build_scenario
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.start import start_scenario
+from drake_dae.systems import StateSensor
 
 T, W = 1e-3, 300.0
 A = np.exp(-W * T)

@@ -22,9 +22,9 @@ from drake_dae import (
     TrackingLaw,
     poles,
     rollout,
-    start_values,
 )
 from drake_dae.errors import GainError, ModelError
+from drake_dae.running import start_values
 
 MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 SERVOS = ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)

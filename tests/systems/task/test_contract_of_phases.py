@@ -6,17 +6,9 @@ import numpy as np
 import pytest
 from members import Rise
 
-from drake_dae import (
-    Approach,
-    Condition,
-    ConstantReference,
-    Dwell,
-    Move,
-    Press,
-    Release,
-    Retreat,
-)
+from drake_dae import Approach, ConstantReference, Dwell, Move, Press, Release, Retreat
 from drake_dae.errors import ModelError
+from drake_dae.systems import Condition
 from drake_dae.systems.task.phases import Moment
 
 CONTACT_FORCE = 0.5

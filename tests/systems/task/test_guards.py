@@ -9,8 +9,9 @@ from members import Rise
 from numpy.testing import assert_allclose
 from polishing import FAR, OVER, PERIOD, SPEED, run_on, started, task_loop
 
-from drake_dae import Approach, Condition, Dwell, Move, PointToPointReference, Press, Record
+from drake_dae import Approach, Dwell, Move, PointToPointReference, Press, Record
 from drake_dae.running.phases import phase_spans
+from drake_dae.systems import Condition
 
 PRESS = Press(10.0, over=0.05)
 

@@ -3,18 +3,9 @@
 import pytest
 from polishing import laws
 
-from drake_dae import (
-    Approach,
-    Condition,
-    Dwell,
-    Move,
-    Press,
-    Release,
-    Retreat,
-    Task,
-    TaskController,
-)
+from drake_dae import Approach, Dwell, Move, Press, Release, Retreat, Task, TaskController
 from drake_dae.errors import ModelError
+from drake_dae.systems import Condition
 
 TOUCH, AWAY = Approach(name="touch", retries=2, if_spent="away"), Retreat(0.1, name="away")
 

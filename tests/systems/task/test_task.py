@@ -30,7 +30,6 @@ from drake_dae import (
     ContactMaterial,
     ContactPlant,
     Dwell,
-    LoopSettings,
     Move,
     Press,
     Release,
@@ -40,13 +39,13 @@ from drake_dae import (
     Task,
     TaskController,
     TrackingLaw,
-    open_contact,
     poles,
     simulate,
-    wire_loop,
 )
+from drake_dae.diagrams import LoopSettings, wire_loop
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.running.phases import phase_spans, phases_at
+from drake_dae.systems import open_contact
 from drake_dae.systems.task.automaton import faded
 
 TOUCH = FAR / SPEED + OVER / 2.0

@@ -45,17 +45,17 @@ from drake_dae import (
     Ellipsoid,
     Plane,
     PointCoordinates,
-    PointMaterial,
     PointOnSurface,
     RobotModel,
     Sphere,
     build_scenario,
     rollout,
     simulate,
-    start_values,
 )
 from drake_dae.errors import ModelError, ScenarioError, SimulationError
+from drake_dae.running import start_values
 from drake_dae.scenario.shipped import FOLDER
+from drake_dae.systems import PointMaterial
 
 MATERIAL = {"stiffness": 1e5, "dissipation": 2.0, "friction": 0.3, "radius": 0.01}
 

@@ -14,9 +14,8 @@ from runs import run_scenario, scenario
 
 from drake_dae import ContactMaterial, build_scenario, make_animation
 from drake_dae.errors import ScenarioError, WiringError
-from drake_dae.scenario.files import save_scenario
 from drake_dae.scenario.judging import find_feasibility
-from drake_dae.scenario.scenario import Scenario
+from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.systems.plants.contact.contact_material import ball_properties, surface_properties
 
 # Without damping a compliant contact swings for ever. A ball without extension does not roll.

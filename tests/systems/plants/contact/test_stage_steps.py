@@ -21,7 +21,6 @@ from drake_dae import (
     FlexibleJoints,
     Plane,
     PointCoordinates,
-    PointMaterial,
     PointOnSurface,
     RobotModel,
     RobotPlant,
@@ -29,6 +28,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.errors import ModelError
+from drake_dae.systems import PointMaterial
 
 MASS, ROTOR, STIFFNESS = 2.0, 0.5, 4000.0
 RATE = np.sqrt(STIFFNESS * (1.0 / MASS + 1.0 / ROTOR))  # 100 rad/s.

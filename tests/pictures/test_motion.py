@@ -6,8 +6,8 @@ import pytest
 from runs import run_scenario, scenario
 
 from drake_dae import LinkExpressions, PointCoordinates, PointOnSurface, RobotModel, Sphere
-from drake_dae.pictures.run_motion import RunMotion, contact_paths, follow
-from drake_dae.robots import ConstraintWrenches
+from drake_dae.pictures.motion import RunMotion, contact_paths, follow
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 
 
 @pytest.mark.parametrize("turns", [0.25, 1.0])
@@ -31,7 +31,7 @@ def test_a_path_around_a_sphere_is_seen_from_a_side(turns):
     acting = ConstraintWrenches(model, model.dae.parameter_values)
     wrenches = [acting(x, np.array([10.0]), p) for x, p in zip(states, parameters, strict=True)]
     times, nothing = np.arange(len(places)) * 0.1, np.zeros((0, 6))
-    course = RunMotion(None, model, times, 0.0, states, parameters, wrenches, nothing, acting, {})
+    course = RunMotion(model, times, 0.0, states, parameters, wrenches, nothing, acting)
     (path,) = contact_paths(course)
     assert path.name == "ball"
     assert path.desired.shape == (0, 2)

@@ -1,18 +1,110 @@
-"""Parts of a scenario without a class in the library: sensors, estimator, law, start."""
+"""Parts of a scenario without a class in the library, or written otherwise than that has it."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, positive, unknown_name
 from drake_dae.dae import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
-from drake_dae.robots import FrictionCone
+from drake_dae.references import Reference
+from drake_dae.robots import (
+    Constraint,
+    FrictionCone,
+    PositionOutput,
+    SurfaceCoordinates,
+    TiltFromNormal,
+    WeldedFrames,
+)
+from drake_dae.scenario.robot_file.robot import Pose
 from drake_dae.systems.observing.observer_rates import Observing
 from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor
+from drake_dae.systems.task.phases import Phase
+from drake_dae.systems.task.task import Task
+
+T = TypeVar("T", Constraint, PositionOutput)
+
+
+@dataclass(frozen=True)
+class WeldedFramesForm:
+    """Frame B has a fixed pose in frame A, given by angles.
+
+    Attributes:
+        frame_a: Name of frame A; it may be "world".
+        frame_b: Name of frame B, on another body.
+        pose: The pose of B in A; by default the frames coincide.
+        name: The name of the constraint, the prefix of its forces and its parameter.
+    """
+
+    frame_a: str
+    frame_b: str
+    pose: Pose = field(default_factory=Pose)
+    name: str = "weld"
+
+    def make(self, constraints: Sequence[Constraint]) -> Constraint:
+        """The constraint."""
+        rotation = RollPitchYaw(np.deg2rad(self.pose.rpy_deg))
+        pose = RigidTransform(rotation, self.pose.translation)
+        return WeldedFrames(self.frame_a, self.frame_b, pose, self.name)
+
+
+@dataclass(frozen=True)
+class SurfaceCoordinatesForm:
+    """The coordinates along a constraint.
+
+    Attributes:
+        constraint: The name of a constraint with coordinates, such as a PointOnSurface on a !Plane.
+    """
+
+    constraint: str
+
+    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
+        """The output."""
+        return SurfaceCoordinates(_named(self.constraint, constraints))
+
+
+@dataclass(frozen=True)
+class TiltFromNormalForm:
+    """The tilt of a tool's axis from the surface normal at its contact.
+
+    Attributes:
+        constraint: The name of a constraint with a free side, such as a PointOnSurface.
+        axis: The axis of its frame, "x", "y" or "z".
+        components: The rows, a choice of the two other axes, "xy" for example; both if empty.
+    """
+
+    constraint: str
+    axis: str
+    components: str = ""
+
+    def make(self, constraints: Sequence[Constraint]) -> PositionOutput:
+        """The output."""
+        return TiltFromNormal(_named(self.constraint, constraints), self.axis, self.components)
+
+
+WrittenConstraint = Constraint | WeldedFramesForm
+WrittenOutput = PositionOutput | SurfaceCoordinatesForm | TiltFromNormalForm
+
+
+def make(
+    form: T | WeldedFramesForm | SurfaceCoordinatesForm | TiltFromNormalForm,
+    constraints: Sequence[Constraint],
+) -> T:
+    """The library's object of a form that may name constraints; such an object as it is."""
+    return cast(T, form.make(constraints) if hasattr(form, "make") else form)
+
+
+def _named(name: str, constraints: Sequence[Constraint]) -> Constraint:
+    named = {constraint.name: constraint for constraint in constraints}
+    if name not in named:
+        raise ModelError(unknown_name("constraint", name, named))
+    return named[name]
 
 
 @dataclass(frozen=True)
@@ -114,12 +206,7 @@ class PerOutput:
 
 @dataclass(frozen=True)
 class Poles(PerOutput, Gains):
-    """Real poles of the errors, one number or mu_i numbers per output; see also Coefficients.
-
-    Attributes:
-        all: The poles of every output, in 1/s.
-        outputs: Output name -> its poles, in 1/s; "*" is all others. Only without `all`.
-    """
+    """Real poles of the errors in 1/s, one number or mu_i per output; see also Coefficients."""
 
     def design(self) -> GainDesign:
         return poles(self.all or self.outputs)
@@ -127,13 +214,7 @@ class Poles(PerOutput, Gains):
 
 @dataclass(frozen=True)
 class Coefficients(PerOutput, Gains):
-    """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first; in 1/s^mu_i, ..., 1/s.
-
-    Attributes:
-        all: The gains of every output, in 1/s^mu_i, ..., 1/s.
-        outputs: Output name -> its gains, in 1/s^mu_i, ..., 1/s; "*" is all others. Only without
-            `all`.
-    """
+    """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first; in 1/s^mu_i, ..., 1/s."""
 
     def design(self) -> GainDesign:
         return gain_coefficients(self.all or self.outputs)
@@ -165,9 +246,9 @@ class Law:
 
     Attributes:
         gains: Its gains. If they are left out: poles at -4 1/s with ideal constraints. With contact
-            that gives way gains are computed, see `advised`, together with `integral`,
-            `constraint_damping`, `estimator` and `sensors.force` if these are left out; the
-            scenario in the folder of the run contains them; not with `actuation`.
+            that gives way gains are computed, together with `integral`, `constraint_damping`,
+            `estimator` and `sensors.force` if these are left out; the scenario in the folder of the
+            run contains them; not with `actuation`.
         integral: Names of outputs whose errors are integrated as well, with one more pole:
             positions, and forces if `sensors.force` measures them; none if left out while `gains`
             are given.
@@ -193,6 +274,54 @@ class Law:
     force_gain: ArrayLike = 0.0
     control_weights: list[float] = field(default_factory=list)
     largest_roughness: float | None = None
+
+
+@dataclass(frozen=True)
+class ScenarioTask:
+    """A sequence of phases, in place of `references`.
+
+    It starts at rest at start.positions, or in contact near them if the first phase requires
+    contact. Without start.positions it starts 20 mm before the surface, with the first reference of
+    each output. While the contact is open, its distance, such as "wall.distance", is an output in
+    place of its force, and so is each distance of several points. `plant` has a contact that opens,
+    such as `!CompliantContact`.
+
+    Attributes:
+        phases: The phases in their order; after the last one the robot rests.
+        contact: The name of the constraint that opens and closes; not needed if there is only one.
+            Or the list of points that do so together, with as many `!ForceCombination`s of their
+            forces, one of them their sum.
+        contact_force: The force in N below which the contact counts as open.
+        patience: The time in s after which a contact without force counts as lost.
+        tare_time: The time in s at the beginning for which a task without contact measures the bias
+            of the force sensor. No phase ends before, and the bias is subtracted afterwards. 0 for
+            no taring.
+        retries: How many times a phase may be entered again, where it does not say it itself.
+        signals: Name -> reference of a signal that conditions of phases watch.
+        gains: The gains of the law without contact, with the distance among its outputs; those of
+            `law.gains` if left out.
+    """
+
+    phases: Sequence[Phase]
+    contact: str | Sequence[str] = ""
+    contact_force: float = 0.5
+    patience: float = 0.25
+    tare_time: float = 0.0
+    retries: int = 10
+    signals: Mapping[str, Reference | float] = field(default_factory=dict)
+    gains: Gains | None = None
+
+    def __post_init__(self) -> None:
+        signals = self.make().watched("signal")
+        for name in self.signals:
+            if name not in signals:
+                text = unknown_name("signal of a condition", name, signals)
+                raise ModelError(f"signals: {text}")
+
+    def make(self, force_noise: float = 0.0) -> Task:
+        """The `Task` of these phases, for a standard deviation of the force sensor's noise in N."""
+        limits = self.contact_force, self.patience, force_noise, self.tare_time, self.retries
+        return Task(tuple(self.phases), *limits)
 
 
 @dataclass(frozen=True)

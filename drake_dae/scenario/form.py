@@ -7,11 +7,13 @@ docstring explains them. A tag, as in `surface: !Sphere`, chooses among the clas
 import inspect
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache, cached_property
 from pathlib import Path
+from sys import float_info
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -27,36 +29,42 @@ from typing import (
 
 import numpy as np
 import pydantic
-from pydantic_core import ErrorDetails
+from pydantic_core import ErrorDetails, core_schema
 from typing_extensions import TypedDict
 
 from drake_dae.arrays import brief
-from drake_dae.errors import ScenarioError
-from drake_dae.scenario.forms.typed_yaml import TAG
+from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.scenario.typed_yaml import TAG
 
 T = TypeVar("T")
+S = TypeVar("S")
 
-_STRICT = pydantic.ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
-_WORDS = {
-    "float_type": "a number",
-    "finite_number": "a finite number",
-    "int_type": "a whole number",
-    "bool_type": "true or false",
-    "string_type": "text",
-    "list_type": "a list",
-    "dict_type": "names with values",
-}
-"""What is expected, by pydantic's name of the problem."""
+@contextmanager
+def at(key: str) -> Iterator[None]:
+    """Converts errors in the block to a ScenarioError with the key of the scenario."""
+    try:
+        yield
+    except ScenarioError:
+        raise  # It has a key already.
+    except DrakeDaeError as error:
+        raise ScenarioError((key, str(error))) from error
+
+
+def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
+    """Applies a function to each item; errors get the key with the index of the item."""
+    results = []
+    for index, item in enumerate(items):
+        with at(f"{key}.{index}"):
+            results.append(make(item))
+    return results
 
 
 @dataclass(frozen=True)
 class Family:
-    """The classes among which a tag chooses.
+    """The classes among which a tag chooses, the first one without a tag.
 
-    Attributes:
-        members: Tag -> class; the first one is chosen without a tag.
-        plain: A type that may stand in place of a member: str or float; None for none.
+    `plain` is a type that may stand in place of a member: str or float.
     """
 
     members: Mapping[str, type]
@@ -79,12 +87,132 @@ class Key:
     text: str
 
 
-def shown(data: Any) -> str:
+@dataclass(frozen=True, eq=False)
+class Value:
+    """Annotates values that a function of value and folder converts; None where it is wrong.
+
+    `words` say what is expected, as `schema` does.
+    """
+
+    words: str
+    schema: Mapping[str, Any]
+    convert: Callable[[Any, Path], Any]
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: pydantic.GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        return core_schema.with_info_plain_validator_function(self._read)
+
+    def __get_pydantic_json_schema__(
+        self, source: Any, handler: pydantic.GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return dict(self.schema)
+
+    def _read(self, value: Any, info: core_schema.ValidationInfo) -> Any:
+        converted = self.convert(value, info.context or Path())
+        if converted is None:
+            raise ValueError(f"expected {self.words}, got {_shown(value)}")
+        return converted
+
+
+def _are_numbers(values: Any) -> bool:
+    return all(type(v) in (int, float) and abs(v) <= float_info.max for v in values)
+
+
+def _vector(value: Any, size: int) -> Any:
+    is_right = isinstance(value, (list, tuple)) and _are_numbers(value)
+    return tuple(map(float, value)) if is_right and len(value) == (size or len(value)) else None
+
+
+def _numbers(value: Any) -> Any:
+    rows = value if isinstance(value, list) else [value]
+    is_matrix = bool(rows) and all(isinstance(row, list) for row in rows)
+    entries = [entry for row in rows for entry in row] if is_matrix else rows
+    if not entries or not _are_numbers(entries):
+        return None
+    if is_matrix and len({len(row) for row in rows}) > 1:
+        return None
+    numbers = np.array(value, dtype=float)
+    return numbers.tolist() if numbers.size > 1 else numbers.item()
+
+
+def _number_or_list(value: Any) -> Any:
+    return value if _are_numbers(value if isinstance(value, list) else [value]) else None
+
+
+def _interval(value: Any) -> Any:
+    is_pair = isinstance(value, (list, tuple)) and len(value) == 2
+    return tuple(value) if is_pair and all(_number_or_list(v) is not None for v in value) else None
+
+
+def in_folder(value: Any, folder: Path) -> str | None:
+    """The path of a file, relative to a folder; None if it is no name of a file."""
+    if not isinstance(value, (str, Path)) or not str(value) or "\0" in str(value):
+        return None
+    try:
+        return str((folder / value).resolve())
+    except (OSError, RuntimeError):  # A link that leads to itself; no working directory.
+        return None
+
+
+def _names(value: Any) -> Any:
+    names = value if isinstance(value, list) else [value]
+    return value if all(isinstance(name, str) for name in names) else None
+
+
+_NUMBER: dict[str, Any] = {"type": "number"}
+_LIST: dict[str, Any] = {"type": "array", "items": _NUMBER}
+_TEXT: dict[str, Any] = {"type": "string"}
+
+
+def _fixed(size: int) -> Value:
+    schema = {**_LIST, "minItems": size, "maxItems": size}
+    return Value(f"{size} numbers", schema, lambda value, folder: _vector(value, size))
+
+
+NUMBERS = Value(
+    "a number, a list of numbers, or a matrix as a list of rows of one length",
+    {"anyOf": [_NUMBER, _LIST, {"type": "array", "items": _LIST}]},
+    lambda value, folder: _numbers(value),
+)
+ROW = Value("a list of numbers", _LIST, lambda value, folder: _vector(value, 0))
+PAIR, TRIPLE = _fixed(2), _fixed(3)
+NUMBER_OR_LIST = Value(
+    "a number or a list of numbers",
+    {"anyOf": [_NUMBER, _LIST]},
+    lambda value, folder: _number_or_list(value),
+)
+INTERVAL = Value(
+    "a lowest and a highest value, each a number or a list of numbers",
+    {"type": "array", "minItems": 2, "maxItems": 2, "items": {"anyOf": [_NUMBER, _LIST]}},
+    lambda value, folder: _interval(value),
+)
+FILE = Value("the name of a file", _TEXT, in_folder)
+NAMES = Value(
+    "a name or a list of names",
+    {"anyOf": [_TEXT, {"type": "array", "items": _TEXT}]},
+    lambda value, folder: _names(value),
+)
+
+
+def _shown(data: Any) -> str:
     """A value as the user wrote it, but short."""
     if data is None:
         return "nothing"
     text = str(data[TAG]) if isinstance(data, dict) and TAG in data else brief(data)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+_WORDS = {
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "text",
+    "list_type": "a list",
+    "dict_type": "names with values",
+}
+"""What is expected, by pydantic's name of the problem."""
 
 
 class Reader(Generic[T]):
@@ -105,11 +233,8 @@ class Reader(Generic[T]):
         keys: Mapping[type, Mapping[str, Key]] | None = None,
     ) -> None:
         self._form, self._families, self._values = form, families or {}, values or {}
-        self._keys = keys or {}
-        self._types: dict[Any, Any] = {}
-        self._tags = {
-            cls: tag for family in self._families.values() for tag, cls in family.members.items()
-        }
+        self._keys, self._types = keys or {}, dict[Any, Any]()
+        self._tags = {c: t for f in self._families.values() for t, c in f.members.items()}
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(self._type(form))
 
     @cached_property
@@ -130,12 +255,9 @@ class Reader(Generic[T]):
         folder: Path | None = None,
         place_of: Callable[[str], str] = lambda key: "",
     ) -> T:
-        """Makes the dataclass of plain data.
+        """Makes the dataclass of plain data; names of files are relative to a folder.
 
-        Args:
-            data: The plain data.
-            folder: The folder of relative file names; None for the working directory.
-            place_of: Where a key stands, to be added to a problem with it.
+        `place_of` says where a key stands, for the messages.
 
         Raises:
             ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
@@ -165,26 +287,20 @@ class Reader(Generic[T]):
         return str(value) if isinstance(value, Path) else value
 
     def put(self, data: Any, key: str, value: Any) -> None:
-        """Sets an entry of plain data, in place.
-
-        Args:
-            data: Lists and dictionaries.
-            key: A dotted key, "a.b.0.c"; names that a user chooses may have dots themselves.
-            value: Plain data.
+        """Sets an entry of plain data at a dotted key, in place; chosen names may have dots too.
 
         Raises:
             ScenarioError: There is no such entry.
         """
-        parts, path = key.split("."), ""
-        hint: Any = self._form
+        parts, path, hint = key.split("."), "", self._form
         if not all(parts):
             raise ScenarioError((brief(key), "expected a dotted key, for example start.errors"))
         while True:
-            chosen = get_origin(_only(hint)) in (dict, Mapping)
-            count = _name_length(data, parts) if chosen else 1
-            slot: str | int = ".".join(parts[:count])
+            has_names = get_origin(_only(hint)) in (dict, Mapping)
+            count = _name_length(data, parts) if has_names else 1
+            slot: Any = ".".join(parts[:count])
             if isinstance(data, list):
-                if not (str(slot).isascii() and str(slot).isdecimal() and int(slot) < len(data)):
+                if not (slot.isascii() and slot.isdecimal() and int(slot) < len(data)):
                     indices = ", ".join(map(str, range(len(data)))) or "none"
                     raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
                 slot = int(slot)
@@ -195,7 +311,7 @@ class Reader(Generic[T]):
                 data[slot] = value
                 return
             if (family := self._family(hint)) is not None:
-                hint = family.members.get(family.tag_of(data) or "")
+                hint = family.members.get(family.tag_of(data) or "")  # type: ignore[assignment]
             hint = self._inside(hint, slot)
             path = f"{path}.{slot}" if path else str(slot)
             if isinstance(data, dict) and data.get(slot) is None:
@@ -250,22 +366,18 @@ class Reader(Generic[T]):
         make_type: Any = TypedDict
         data = make_type(self._tags.get(form, form.__name__), entries)
         data.__doc__ = introduction(form.__doc__ or "")
-        data.__pydantic_config__ = _STRICT
-        defaults = {
-            name: key.default
-            for name, key in self._keys.get(form, {}).items()
-            if key.default is not MISSING
-        }
+        data.__pydantic_config__ = pydantic.ConfigDict(
+            extra="forbid", strict=True, allow_inf_nan=False
+        )
+        own = self._keys.get(form, {}).items()
+        defaults = {name: key.default for name, key in own if key.default is not MISSING}
         return Annotated[data, pydantic.AfterValidator(lambda given: form(**{**defaults, **given}))]
 
     def _choice(self, family: Family) -> Any:
         """The type of the data of a family."""
-
-        def untagged(data: Any) -> Any:
-            return {key: data[key] for key in data if key != TAG}
-
+        untagged = pydantic.BeforeValidator(lambda data: {k: data[k] for k in data if k != TAG})
         members = [
-            _annotated(self._data(cls), pydantic.BeforeValidator(untagged), pydantic.Tag(tag))
+            _annotated(self._data(cls), untagged, pydantic.Tag(tag))
             for tag, cls in family.members.items()
         ]
         if family.plain is not None:
@@ -293,12 +405,12 @@ class Reader(Generic[T]):
                 keys, data, tag, tags = [*keys, str(part)], data[part], "", ""
             else:
                 tag, tags = f"{part} ", ", ".join(family.members)
-        at, form = ".".join(keys), _only(hint)
+        key, form = ".".join(keys), _only(hint)
         names = list(self.keys_of(form)) if self._is_form(form) else []
         listed = f"keys: {', '.join(names) or 'none'}"
         if tag and isinstance(data, dict) and TAG not in data:
             listed += f". No tag is given; there are {tags}"
-        place = at
+        place = key
         if TAG in loc:
             text = f"takes no tag, got {data[TAG]}"
         elif kind == "missing":
@@ -311,14 +423,14 @@ class Reader(Generic[T]):
             text = str(error["ctx"]["error"])
         elif (family := self._family(hint)) is not None:
             also = {str: "text, or ", float: "a number, or "}.get(family.plain or list, "")
-            text = f"expected {also}one of {', '.join(family.members)}, got {shown(value)}"
+            text = f"expected {also}one of {', '.join(family.members)}, got {_shown(value)}"
         else:
             expected = _WORDS.get(kind, error["msg"].removeprefix("Input should be "))
             expected = listed if kind == "dict_type" and names else expected
-            text = f"expected {expected}, got {shown(value)}"
+            text = f"expected {expected}, got {_shown(value)}"
             if kind == "string_type" and isinstance(value, (bool, int, float)):
                 text += "; text that reads as something else goes in quotes"
-        return at or "scenario", text, place
+        return key or "scenario", text, place
 
 
 def _annotated(hint: Any, *more: Any) -> Any:
@@ -334,12 +446,14 @@ def _members(hint: Any) -> set[Any]:
 
 def _only(hint: Any) -> Any:
     """An annotation without None and without what is said about it."""
-    while get_origin(hint) is Annotated or len(_members(hint) - {NoneType}) < len(_members(hint)):
+    while get_origin(hint) is Annotated or NoneType in _members(hint):
         if get_origin(hint) is Annotated:
             hint = get_args(hint)[0]
         else:
-            (*rest,) = _members(hint) - {NoneType}
+            rest = [*(_members(hint) - {NoneType})]
             hint = rest[0] if len(rest) == 1 else None
+            if hint is None:
+                return None
     return hint
 
 
@@ -376,17 +490,11 @@ def introduction(docstring: str) -> str:
 
 def attribute_texts(source: type) -> dict[str, str]:
     """Name of an attribute -> its text in the docstring of the class or of one of its bases."""
-    return {
-        name: text
-        for cls in reversed(source.__mro__)
-        for names, text in _attributes(inspect.cleandoc(cls.__doc__ or ""))
-        for name in names.split(", ")
-    }
-
-
-def _attributes(doc: str) -> Iterator[tuple[str, str]]:
-    _, _, rest = doc.partition("\nAttributes:\n")
-    section = re.split(r"^\S", rest, maxsplit=1, flags=re.MULTILINE)[0]
-    for entry in re.split(r"^    (?=\w)", section, flags=re.MULTILINE)[1:]:
-        names, _, text = entry.partition(":")
-        yield names, " ".join(text.split())
+    found: dict[str, str] = {}
+    for cls in reversed(source.__mro__):
+        _, _, rest = inspect.cleandoc(cls.__doc__ or "").partition("\nAttributes:\n")
+        section = re.split(r"^\S", rest, maxsplit=1, flags=re.MULTILINE)[0]
+        for entry in re.split(r"^    (?=\w)", section, flags=re.MULTILINE)[1:]:
+            names, _, text = entry.partition(":")
+            found |= dict.fromkeys(names.split(", "), " ".join(text.split()))
+    return found

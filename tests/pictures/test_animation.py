@@ -1,33 +1,28 @@
 """The picture of a closed loop in Meshcat, live and recorded, against MultibodyPlant."""
 
-import socket
-from urllib.parse import urlparse
+import json
 
-import casadi as ca
 import numpy as np
 import pytest
-from arms import arm, fixed_step, parse
-from members import Mirror, Saddle
+from arms import fixed_step, parse
+from browser import needs_chromium
+from browser import shown as in_browser
+from members import Mirror
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RotationMatrix
-from pydrake.systems.analysis import Simulator
 from recordings import animation, commands, middles, objects, overlay, transforms, vertices
-from two_arms import two_arms
+from runs import run, run_scenario, scenario, some
 
 from drake_dae import (
     ConstantReference,
     DaePlant,
     DaeSystem,
-    ImplicitSurface,
     JointPositions,
-    PointCoordinates,
-    PointOnSurface,
     Record,
     RobotModel,
     RobotPlant,
     TrackingLaw,
     build_scenario,
-    load_scenario,
     make_animation,
     make_closed_loop,
     poles,
@@ -36,23 +31,18 @@ from drake_dae import (
 )
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
-from drake_dae.pictures.run_motion import contact_paths, follow, frame_times
-from drake_dae.robots import ConstraintWrenches, Wrenches, tangents
+from drake_dae.pictures.motion import contact_paths, follow, frame_times
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches
 from drake_dae.robots.surfaces import surfaces
-from drake_dae.scenario.shipped import find_scenario
-from drake_dae.scene.arrows import ForceArrows, GrowingPaths
-from drake_dae.scene.surroundings import scene_extent
-from drake_dae.scene.view import FRAME_RATE, draw_scene
+from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.scene.surroundings import diagonal, scene_points
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
 
 
 def recorded(name, *settings):
     """A run of a scenario, and the page of its animation."""
-    scenario = load_scenario(find_scenario(name), settings)
-    loop, context = build_scenario(scenario)
-    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
-    record = loop.record(context)
+    loop, context, record = run_scenario(scenario(name, *settings))
     return loop, record, make_animation(loop, record, context)
 
 
@@ -132,8 +122,8 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     head = things[f"{path}/arrow/head"]["geometries"][0]
     nominal = loop.plant.structure.manifold.project(loop.plant.dae.nominal_state)
     model = loop.plant.model
-    _, size = scene_extent(model, ConstraintWrenches(model), nominal, loop.scene_graph)
-    assert shaft["height"] + head["height"] == pytest.approx(0.2 * size, rel=1e-6)
+    corners = scene_points(model, ConstraintWrenches(model), nominal[None], loop.scene_graph)
+    assert shaft["height"] + head["height"] == pytest.approx(0.2 * diagonal(corners), rel=1e-6)
     middle = places[f"{path}/arrow/shaft"][2, 3]
     assert middle + shaft["height"] / 2 == pytest.approx(-head["height"], rel=1e-6)
     tip = places[f"{path}/arrow/head"][2, 3]
@@ -241,14 +231,13 @@ def test_a_run_that_begins_later_is_shown_from_its_start():
 
 def test_a_parameter_moves_the_surface():
     """The wall stands where the context of the run has it, not where the scenario put it."""
-    scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25", "start.errors={}"])
-    loop, context = build_scenario(scenario)
+    case = scenario("two_link_wall", "duration=0.25", "start.errors={}")
+    loop, context = build_scenario(case)
     own = loop.plant.GetMyMutableContextFromRoot(context)
     state = loop.plant.state(own)
     loop.plant.set_parameter(own, "wall.position", [1.1, 0.0, 0.0])
     loop.plant.set_consistent_state(own, state)
-    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
-    page = make_animation(loop, loop.record(context), context)
+    page = make_animation(loop, run(loop, context, case.duration, case.integrator), context)
     wall = objects(page)["/contact/wall/surface/form"]["geometries"][0]
     thickness = min(wall[key] for key in ("width", "height", "depth"))
     stands = (
@@ -270,10 +259,7 @@ def test_one_moment_is_an_animation_too():
 
 
 def test_an_animation_changes_nothing():
-    scenario = load_scenario(find_scenario("two_link_wall"), ["duration=0.25"])
-    loop, context = build_scenario(scenario)
-    simulate(loop.diagram, context, scenario.duration, scenario.integrator)
-    record = loop.record(context)
+    loop, context, record = run_scenario(scenario("two_link_wall", "duration=0.25"))
     state = context.get_continuous_state_vector().CopyToVector()
     make_animation(loop, record, context)
     np.testing.assert_array_equal(context.get_continuous_state_vector().CopyToVector(), state)
@@ -286,36 +272,6 @@ def test_frames():
     np.testing.assert_array_equal(frame_times(1.0), np.arange(33) / 32)
     # The end is shown, if need be a little late.
     np.testing.assert_array_equal(frame_times(0.05), [0.0, 1 / 32, 2 / 32])
-    assert FRAME_RATE == 32.0  # A power of two: Meshcat finds the frame of a time exactly.
-
-
-# Live.
-
-
-def test_live_view_draws_while_it_runs():
-    meshcat = start_meshcat()
-    scenario = load_scenario(find_scenario("two_link_wall"))
-    loop, context = build_scenario(scenario, meshcat)
-    simulator = Simulator(loop.diagram, context)
-    simulator.AdvanceTo(0.5)
-    page = meshcat.StaticHtml()
-    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    arrow = transforms(page)["/contact/wall/force"]
-    # The wall x = 1.2 pushes along -x.
-    np.testing.assert_allclose(arrow[0, 3], 1.2, atol=1e-9)
-    np.testing.assert_allclose(arrow[:3, 2], [-1.0, 0.0, 0.0], atol=1e-9)
-    plant = parse("two_link_arm")
-    own = plant.CreateDefaultContext()
-    plant.SetPositions(own, state[:2])
-    tool = plant.GetFrameByName("tool").CalcPoseInWorld(own).translation()
-    np.testing.assert_allclose(arrow[:3, 3], tool, atol=1e-9)
-    pose = plant.EvalBodyPoseInWorld(own, plant.GetBodyByName("link2")).GetAsMatrix4()
-    link = transforms(page)["/drake/visualizer/two_link_arm/link2"]
-    np.testing.assert_allclose(link, pose, atol=1e-9)
-    # The path so far: 17 points, the last where the tool is.
-    path = vertices(objects(page)["/paths/wall/actual/0"])
-    assert len(path) == 17
-    np.testing.assert_allclose(path[-1], tool, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -323,161 +279,15 @@ def test_without_live_view_the_steps_are_those_without_any():
     """Drawing ends a step every 1/32 s; a recording is made after the run and changes nothing."""
     times = []
     for meshcat in (None, start_meshcat()):
-        scenario = load_scenario(find_scenario("two_link_wall"), ["duration=1"])
-        loop, context = build_scenario(scenario, meshcat)
-        simulate(loop.diagram, context, 1.0, scenario.integrator)
-        record = loop.record(context)
+        case = scenario("two_link_wall", "duration=1")
+        loop, context = build_scenario(case, meshcat)
+        record = run(loop, context, 1.0, case.integrator)
         times.append(record.time)
         assert "/contact/wall/force" in {
             path for path, _ in animation(make_animation(loop, record, context))
         }
     assert set(frame_times(1.0)) <= set(times[1])
     assert not set(frame_times(1.0)) <= set(times[0])
-
-
-def test_only_this_machine_reaches_meshcat():
-    meshcat = start_meshcat()
-    url = urlparse(meshcat.web_url())
-    assert url.hostname == "localhost"
-    with socket.create_connection(("localhost", url.port), timeout=5):
-        pass
-    # On Linux all of 127.0.0.0/8 is this machine, so that a server on all interfaces would answer.
-    with pytest.raises(OSError):  # noqa: PT011 (each system has its own words)
-        socket.create_connection(("127.0.0.2", url.port), timeout=5)
-
-
-def test_a_path_that_grows_is_in_pieces_that_meet_and_begins_anew():
-    meshcat = start_meshcat()
-    paths = GrowingPaths(meshcat, arm("two_link").model.constraints)
-    points = np.arange(150.0).reshape(50, 1, 3)
-    for time, point in enumerate(points):
-        paths.add(point, 0.1 * time)
-    drawn = {path: vertices(o) for path, o in objects(meshcat.StaticHtml()).items()}
-    first, second = (drawn[f"/paths/wall/actual/{number}"] for number in (0, 1))
-    np.testing.assert_array_equal(first[-1], second[0])
-    np.testing.assert_array_equal(np.vstack([first, second[1:]]), points[:, 0])
-    paths.add(points[0], 0.0)
-    things = objects(meshcat.StaticHtml())
-    assert [path for path in things if path.startswith("/paths")] == ["/paths/wall/actual/0"]
-    np.testing.assert_array_equal(vertices(things["/paths/wall/actual/0"]), points[0])
-
-
-# Arrows and surfaces.
-
-
-def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
-    model = arm("two_link").model
-    meshcat = start_meshcat()
-    arrows = ForceArrows(meshcat, model, length=0.3)
-    loads = ConstraintWrenches(model)
-    state = arm("two_link").structure.manifold.project(model.dae.nominal_state)
-    seen = {}
-    for force in (0.0, 10.0, -20.0):
-        meshcat.StartRecording()
-        arrows.draw(loads(state, [force]), 0.0)
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
-        tracks = animation(meshcat.StaticHtml())
-        direction = rotation(tracks["/contact/wall/force", "quaternion"].values[0])[:, 2]
-        seen[force] = direction[0], tracks["/contact/wall/force/arrow", "scale"].values[0, 0]
-    assert seen[0.0][1] == pytest.approx(1e-3)
-    # The wall's normal is -x; the largest force so far has the full length.
-    assert seen[10.0] == pytest.approx((-1.0, 1.0), abs=1e-6)
-    assert seen[-20.0] == pytest.approx((1.0, 1.0), abs=1e-6)
-    assert arrows.largest_force == 20.0
-
-
-def test_round_off_of_a_moment_is_no_arrow_of_full_length():
-    arrows = ForceArrows(start_meshcat(), arm("two_link").model, length=0.3)
-    row = np.array([[0.0, 0.0, 1.0]])
-    arrows.measure([Wrenches(0.0 * row, 40.0 * row, 1e-9 * row)])
-    assert not arrows.has_moment
-    assert arrows.largest_moment > 1e3 * 1e-9
-    arrows.measure([Wrenches(0.0 * row, 40.0 * row, 2.0 * row)])
-    assert arrows.has_moment
-    assert arrows.largest_moment == 2.0
-
-
-def shown_at_rest(model, forces):
-    """The page of a robot that holds still with given constraint forces."""
-    meshcat = start_meshcat()
-    plant = RobotPlant(model)
-    state = plant.structure.manifold.project(model.dae.nominal_state)
-    arrows = draw_scene(plant, meshcat)
-    loads = ConstraintWrenches(model)(state, forces)
-    meshcat.StartRecording()
-    arrows.draw(loads, 0.0)
-    meshcat.StopRecording()
-    meshcat.PublishRecording()
-    return state, meshcat.StaticHtml()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "surface",
-    [Saddle((1.2, 0.0, 0.0), 0.5), ImplicitSurface(lambda p: p[2] - p[0] ** 2, (1.2, 0.0, 0.0))],
-)
-def test_a_surface_without_a_shape_is_drawn(surface):
-    """Around the contact, every vertex on the surface."""
-    contact = PointOnSurface("tool", surface, name="it")
-    outputs = [PointCoordinates("tool", "x")]
-    plant = parse("two_link_arm")
-    model = RobotModel.from_multibody(plant, [contact], outputs, [1.2, -1.6])
-    _, page = shown_at_rest(model, np.array([10.0]))
-    points = vertices(objects(page)["/contact/it/surface/form"])
-    points += transforms(page)["/contact/it/surface"][:3, 3]
-    assert len(points) > 500
-    offset = ca.SX.sym("offset", 3)
-    distance = ca.Function("distance", [offset], [surface.distance(offset)]).map(len(points))
-    # The page holds single precision.
-    np.testing.assert_allclose(distance((points - surface.position).T), 0.0, atol=1e-6)
-    place = animation(page)["/contact/it/force", "position"].values[0]
-    assert np.min(np.linalg.norm(points - place, axis=1)) < 0.1
-
-
-def test_the_force_of_a_pin_is_drawn():
-    """At the pin, along what the one link does to the other; by Drake's forward kinematics."""
-    loop, _ = build_scenario(load_scenario(find_scenario("five_bar")))
-    model = loop.plant.model
-    (pin,) = model.constraints
-    state, page = shown_at_rest(model, np.array([30.0, -40.0]))
-    context = model.links.plant.CreateDefaultContext()
-    model.links.plant.SetPositions(context, state[: model.links.q.numel()])
-    frame = model.links.plant.GetFrameByName(pin.frame_b)
-    tracks, path = animation(page), f"/contact/{pin.name}/force"
-    point = frame.CalcPoseInWorld(context) @ np.array(pin.point_b)
-    np.testing.assert_allclose(tracks[path, "position"].values[0], point, atol=1e-6)
-    direction = rotation(tracks[path, "quaternion"].values[0])[:, 2]
-    expected = np.zeros(3)
-    expected[["xyz".index(axis) for axis in pin.axes]] = [0.6, -0.8]
-    np.testing.assert_allclose(direction, expected, atol=1e-6)
-    assert f"/contact/{pin.name}/moment" not in [path for path, _ in tracks]
-
-
-@pytest.mark.slow
-def test_force_and_moment_of_a_weld_are_drawn():
-    """In the axes of frame A, at the origin of frame B; the moment along its axis, two heads."""
-    model = two_arms()
-    load = np.array([40.0, 0.0, 30.0, 0.0, 6.0, 8.0])
-    state, page = shown_at_rest(model, load)
-    plant = model.links.plant
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, state[:14])
-    turned = plant.GetFrameByName("object").CalcPoseInWorld(context).rotation().matrix()
-    right = plant.GetModelInstanceByName("right")
-    point = plant.GetFrameByName("tool", right).CalcPoseInWorld(context).translation()
-    tracks = animation(page)
-    for kind, acting in (("force", load[:3]), ("moment", load[3:])):
-        path = f"/contact/grasp/{kind}"
-        np.testing.assert_allclose(tracks[path, "position"].values[0], point, atol=1e-6)
-        direction = rotation(tracks[path, "quaternion"].values[0])[:, 2]
-        expected = turned @ acting / np.linalg.norm(acting)
-        np.testing.assert_allclose(direction, expected, atol=1e-6)
-        # Each is the largest of its kind.
-        scale = tracks[f"{path}/arrow", "scale"].values[0]
-        np.testing.assert_allclose(scale, 1.0, rtol=1e-6)
-    assert "/contact/grasp/moment/arrow/second_head" in objects(page)
-    assert "/contact/grasp/surface" not in objects(page)
 
 
 @pytest.mark.parametrize("constraints", [[], [Mirror(0, 1, -0.4)]])
@@ -496,9 +306,6 @@ def test_a_robot_that_is_held_at_no_point_is_animated_too(constraints):
     assert not [path for path in objects(page) if path.startswith(("/contact", "/paths"))]
 
 
-# Without a picture.
-
-
 def test_an_animation_needs_a_robot():
     system = DaeSystem.from_functions(1, f=lambda x: [0.0], h=lambda x: [1.0], l=lambda x: [x[0]])
     plain = TrackingLaw(system, poles(-1.0))
@@ -509,3 +316,52 @@ def test_an_animation_needs_a_robot():
     simulate(loop.diagram, context, 0.01, fixed_step())
     with pytest.raises(ModelError, match="RobotPlant"):
         make_animation(loop, loop.record(context), context)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", ["!CompliantContact", "!MultibodyPlant"])
+def test_a_cone_has_the_plants_coefficient_and_holds_the_force_of_a_tool_that_slides(plant):
+    """The law of this scenario knows 0; the tool slides at 0.1 m/s, so that F leans by atan 0.3."""
+    own = f"plant={plant} {{stiffness: 1.0e5, friction: 0.3}}"
+    page = recorded("wall_point_contact", "duration=1.2", own)[2]
+    assert any("0.3" in text for _, text in overlay(page)["legend"] if "cone" in text)
+    tracks = animation(page)
+    axis, force = (
+        rotation(tracks[f"/contact/wall/{what}", "quaternion"].values[-1])[:, 2]
+        for what in ("cone", "force")
+    )
+    assert np.arccos(-axis @ force) == pytest.approx(np.arctan(0.3), rel=0.02)
+    assert not [
+        one for one in objects(recorded("two_link_wall", "duration=0.01")[2]) if "cone" in one
+    ]
+
+
+LABELS = """
+return JSON.stringify({
+  clock: document.getElementById('run-clock').textContent,
+  top: document.getElementById('run').getBoundingClientRect().bottom,
+  bar: document.getElementById('run-bar').getBoundingClientRect().top,
+  boxes: [...document.querySelectorAll('.run-force')].filter(one => one.style.display !== 'none')
+    .map(one => one.getBoundingClientRect()).map(one => [one.left, one.top, one.right, one.bottom]),
+});
+"""
+
+
+@needs_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "size"), some([("biped", "900,700"), ("three_fingers", "420,760")])
+)
+def test_labels_do_not_cover_each_other_and_the_title_no_scene(name, size, tmp_path):
+    path = tmp_path / "page.html"
+    path.write_text(recorded(name, "duration=1.0")[2], "utf-8")
+    said = json.loads(in_browser(path, LABELS, "#t=0.5", size))
+    assert said["clock"].startswith("t = 0.50 s")
+    boxes = np.array(said["boxes"])
+    assert len(boxes) >= 3
+    for number, (left, top, right, bottom) in enumerate(boxes):
+        for other in boxes[:number]:
+            assert right <= other[0] or other[2] <= left or bottom <= other[1] or other[3] <= top
+        # Between title and bar, which cover nothing of the scene.
+        assert said["top"] <= top
+        assert bottom <= said["bar"]

@@ -1,0 +1,3 @@
+"""The names of the room, each with its home."""
+
+from .report import Analysis as Analysis

@@ -1,0 +1,223 @@
+"""The actual and desired motion of a robot in a run, frame by frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.systems.framework import Context
+
+from drake_dae.arrays import FloatArray
+from drake_dae.blocks.traced_system import context_in
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record
+from drake_dae.errors import InconsistentStateError
+from drake_dae.robots import RobotModel
+from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
+from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.scene.camera import direction_of, framed
+from drake_dae.scene.surroundings import scene_points
+from drake_dae.scene.view import FRAME_RATE
+
+_STILL = 1e-4
+"""A path on a surface is omitted if its extent is below this fraction of the largest coordinate of
+all contact points."""
+
+_EXTENT_STATES = 60
+"""The approximate number of states from which the extent of a run is computed."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunMotion:
+    """The motion of a robot in a run, at the times of k frames.
+
+    Attributes:
+        model: The robot.
+        times: The times of the frames, in s after the start, shape (k,).
+        start_time: The time at which the run starts, in s.
+        states: x, shape (k, n).
+        parameters: The values of all parameters, shape (k, number of parameters).
+        wrenches: The constraint wrenches in each frame.
+        desired: Link states at rest (q, 0) with the desired outputs, until these are out of reach,
+            shape (j, nq + nv) with j <= k.
+        acting: The function of the constraint wrenches, for the parameters at the start.
+    """
+
+    model: RobotModel
+    times: FloatArray
+    start_time: float
+    states: FloatArray
+    parameters: FloatArray
+    wrenches: Sequence[Wrenches]
+    desired: FloatArray
+    acting: ConstraintWrenches
+
+    @property
+    def points(self) -> FloatArray:
+        """The points of application, m, shape (k, constraints, 3)."""
+        return np.array([wrench.points for wrench in self.wrenches])
+
+    @property
+    def desired_points(self) -> FloatArray:
+        """The points of application for the desired outputs, m, shape (j, constraints, 3)."""
+        no_force = np.zeros(len(self.model.dae.force_signals))
+        pairs = zip(self.desired, self.parameters, strict=False)
+        points = [self.acting(state, no_force, parameters).points for state, parameters in pairs]
+        return np.array(points).reshape(len(points), len(self.acting.constraints), 3)
+
+    @property
+    def normals(self) -> FloatArray:
+        """The unit normals of the surfaces in the world, zero without one, (k, constraints, 3).
+
+        They are computed as the forces at rest: without friction a force is along the normal.
+        """
+        nq, nv = self.model.links.q.numel(), self.model.links.v.numel()
+        force = np.array([one for c in self.model.constraints for one in c.is_unilateral], float)
+        at_rest = np.pad(self.states[:, :nq], ((0, 0), (0, nv)))
+        pairs = zip(at_rest, self.parameters, strict=True)
+        normals = np.array([self.acting(state, force, values).forces for state, values in pairs])
+        lengths = np.linalg.norm(normals, axis=2, keepdims=True)
+        return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPath:
+    """The path of a contact point on a surface, in the plane normal to the surface's mean normal.
+
+    Attributes:
+        name: The constraint's name.
+        actual: The path along two axes of the surface, m, shape (k, 2).
+        desired: The desired path, m, shape (j, 2).
+        points_left: Whether an observer on the free side who sees the second axis upward sees the
+            first axis to the left.
+    """
+
+    name: str
+    actual: FloatArray
+    desired: FloatArray
+    points_left: bool = False
+
+
+def follow(
+    loop: ClosedLoop, record: Record, context: Context, rate: float = FRAME_RATE
+) -> RunMotion:
+    """The motion of a robot in a recorded run of a loop, with so many frames per second.
+
+    Args:
+        loop: A loop of a `RobotPlant`.
+        record: The record of a run of this loop.
+        context: The context of its diagram, which contains the parameters; not changed.
+        rate: Frames per second.
+
+    Raises:
+        ModelError: The plant is not a robot.
+    """
+    plant = loop.plant
+    model = plant.robot("a picture of a run")
+    parameters = plant.parameters(context_in(plant, context))
+    acting = ConstraintWrenches(model, parameters)
+    recorded = record.time - record.time[0]
+    times = frame_times(recorded[-1], rate)
+
+    def at_frames(name: str) -> FloatArray:
+        columns = [np.interp(times, recorded, column) for column in record[name].T]
+        return np.array(columns).reshape(-1, len(times)).T
+
+    states, values = at_frames("state"), np.tile(parameters, (len(times), 1))
+    if "exogenous" in record.signals:
+        values[:, plant.exogenous_places] = at_frames("exogenous")
+    rows = zip(states, at_frames("constraint_force"), values, strict=True)
+    wrenches = [acting(*row) for row in rows]
+    if "contact_force" in record.signals:  # This has the plant's friction, not that of the law.
+        forces = at_frames("contact_force").reshape(len(times), -1, 3)
+        wrenches = [replace(w, forces=force) for w, force in zip(wrenches, forces, strict=True)]
+    desired = _desired_states(model, states, at_frames("desired_output"), values)
+    start = float(record.time[0])
+    return RunMotion(model, times, start, states, values, wrenches, desired, acting)
+
+
+def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
+    """The times of frames, in s after the start; the last is at the end or just after."""
+    return np.arange(int(np.ceil(duration * rate - 1e-9)) + 1) / rate
+
+
+def contact_paths(motion: RunMotion) -> list[ContactPath]:
+    """The paths of moving contact points on their surfaces.
+
+    The points are relative to the surface's reference point, and projected along the surface's mean
+    normal. On a plane these are the plane's coordinates; on a curved surface those of a tangent
+    plane.
+    """
+    size = float(np.max(np.abs(motion.points), initial=0.0))
+    normals, desired_points, paths = motion.normals, motion.desired_points, []
+    for row, constraint in enumerate(motion.acting.constraints):
+        if not any(constraint.is_unilateral):
+            continue
+        values = [own_values(constraint, motion.model.dae, p) for p in motion.parameters]
+        poses = [constraint.placement(own) for own in values]
+        actual, desired = (
+            np.array([pose.inverse() @ p for pose, p in zip(poses, points, strict=False)])
+            for points in (motion.points[:, row], desired_points[:, row])
+        )
+        desired = desired.reshape(-1, 3)
+        if np.max(np.ptp(np.vstack([actual, desired]), axis=0)) <= _STILL * size:
+            continue
+        turns = [pose.rotation().inverse() for pose in poses]
+        own = np.array([turn @ n for turn, n in zip(turns, normals[:, row], strict=True)])
+        # The normals of a path all around a surface have the mean 0; then the first is used.
+        mean = own.mean(axis=0)
+        normal = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > 1e-3 else own[0]
+        axes = np.column_stack(tangents(normal))
+        points_left = bool(np.cross(axes[:, 0], axes[:, 1]) @ normal < 0.0)
+        paths.append(ContactPath(constraint.name, actual @ axes, desired @ axes, points_left))
+    return paths
+
+
+def run_points(motion: RunMotion, scene_graph: SceneGraph | None) -> FloatArray:
+    """Points that enclose the robot and its paths over the run, m, shape (k, 3)."""
+    states = motion.states[:: max(1, len(motion.states) // _EXTENT_STATES)]
+    paths = [motion.points.reshape(-1, 3), motion.desired_points.reshape(-1, 3)]
+    return np.vstack([scene_points(motion.model, motion.acting, states, scene_graph), *paths])
+
+
+def run_view(
+    motion: RunMotion,
+    scene_graph: SceneGraph | None,
+    view: tuple[float, float, float],
+    arrow: float,
+) -> tuple[FloatArray, FloatArray]:
+    """The position of a camera that shows a whole run, and a point on its axis, m.
+
+    Args:
+        motion: The motion of the robot.
+        scene_graph: The geometry of its links, or None.
+        view: The angles of view of the camera, as `view_angles` computes them.
+        arrow: The length of the longest arrow of a force, in m.
+    """
+    forces = np.array([wrench.forces for wrench in motion.wrenches])
+    largest = np.max(np.linalg.norm(forces, axis=2), initial=1e-6)
+    tails = (motion.points - arrow * forces / largest).reshape(-1, 3)
+    middle = len(motion.times) // 2
+    now = motion.states[middle][None]
+    robot = scene_points(motion.model, motion.acting, now, scene_graph)
+    direction = direction_of(robot, motion.points[middle], motion.normals[middle])
+    return framed(np.vstack([run_points(motion, scene_graph), tails]), direction, view)
+
+
+def _desired_states(
+    model: RobotModel, states: FloatArray, desired: FloatArray, values: FloatArray
+) -> FloatArray:
+    """Link states at rest (q, 0) with the desired outputs, until these are out of reach."""
+    nq, nv = model.links.q.numel(), model.links.v.numel()
+    q, desired_states = states[0, :nq], []
+    # With rolling constraints the outputs do not determine q, so that each initial guess follows
+    # the actual motion.
+    steps = np.diff(states[:, :nq], axis=0, prepend=states[:1, :nq])
+    try:
+        positions = desired[:, : len(model.position_signals)]
+        for position, parameters, step in zip(positions, values, steps, strict=True):
+            q = model.configuration(position, q + step, parameters)
+            desired_states.append(np.concatenate([q, np.zeros(nv)]))
+    except InconsistentStateError:
+        pass  # The desired path ends where it is out of reach.
+    return np.array(desired_states).reshape(-1, nq + nv)

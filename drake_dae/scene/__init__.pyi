@@ -1,0 +1,3 @@
+"""The names of the room, each with its home."""
+
+from .view import start_meshcat as start_meshcat

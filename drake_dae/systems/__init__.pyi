@@ -1,0 +1,35 @@
+"""The names of the room, each with its home."""
+
+from .control.commanded import CommandedReferences as CommandedReferences
+from .control.contract import Controller as Controller
+from .control.controller import TrackingController as TrackingController
+from .control.drake_references import TrajectoryReference as TrajectoryReference
+from .control.limits import ControlLimits as ControlLimits
+from .control.references import ReferenceGenerator as ReferenceGenerator
+from .control.sampling import ControlHold as ControlHold
+from .control.sampling import Sampling as Sampling
+from .observing.estimator import StateEstimator as StateEstimator
+from .observing.observer import DisturbanceObserver as DisturbanceObserver
+from .observing.observer_rates import Observing as Observing
+from .plants.contact.compliant_plant import CompliantPlant as CompliantPlant
+from .plants.contact.contact_material import ContactMaterial as ContactMaterial
+from .plants.contact.contact_material import PointMaterial as PointMaterial
+from .plants.contact.contact_plant import ContactPlant as ContactPlant
+from .plants.contact.disturbance_forces import DisturbanceForce as DisturbanceForce
+from .plants.contract import Plant as Plant
+from .plants.dae_plant import DaePlant as DaePlant
+from .plants.robot_plant import RobotPlant as RobotPlant
+from .sensing.encoders import Encoders as Encoders
+from .sensing.encoders import StateSensor as StateSensor
+from .sensing.force_sensor import ForceSensor as ForceSensor
+from .task.contacts import open_contact as open_contact
+from .task.controller import TaskController as TaskController
+from .task.phases import Approach as Approach
+from .task.phases import Condition as Condition
+from .task.phases import Dwell as Dwell
+from .task.phases import Move as Move
+from .task.phases import Phase as Phase
+from .task.phases import Press as Press
+from .task.phases import Release as Release
+from .task.phases import Retreat as Retreat
+from .task.task import Task as Task
