@@ -17,15 +17,17 @@ from drake_dae.blocks.compose import compose
 from drake_dae.dae import (
     FeedbackGains,
     GainDesign,
+    SensedContact,
+    SensorNoise,
     Structure,
     TrackingLaw,
     ZeroDynamics,
+    direction_gains,
     find_structure,
     gain_coefficients,
     poles,
     with_disturbance,
 )
-from drake_dae.dae.beyond.one_direction import SensedContact, SensorNoise, direction_gains
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.wiring import make_closed_loop
@@ -52,13 +54,13 @@ FINER, TRIES = 0.6, 6
 
 SLIDING = ((1.0, 0.8, 0.5), (0.5, 0.8, 2.0), (2.0, 0.8, 1.0))
 STIFF = ((1.0, 0.0, 1.0), (2.0, 0.0, 0.5), (0.5, 0.8, 2.0))
-"""Stiffness relative to the stated one, friction, and the tool's mass relative to the model's, where
-friction damps most and where the contact is fastest: the corners of 1/2 to 2, 0 to 0.8 and 1/2 to 2
-in which loops were slowest or swung most."""
+"""Stiffness relative to the stated one, friction, and the tool's mass relative to the model's:
+where friction damps most, and where the contact is fastest. Of the corners of 1/2 to 2, 0 to 0.8
+and 1/2 to 2 these are the ones in which loops were slowest or swung most."""
 
 SETTLE, BEGIN = 40, 0.5
-"""The samples from a point of the path to the motion that is linearized, and the time in s for which
-the start is run."""
+"""The samples from a point of the path to the motion that is linearized, and the time in s for
+which the start is run."""
 
 FORCE, GRAVITY = 1.0, 9.81
 """The unknown force in N, along gravity and along friction, that appears or turns every 2 s."""
@@ -76,10 +78,10 @@ class ContactGains:
         decay: The decay of the slowest mode in 1/s, the least of all variations.
         damping: The least damping ratio below half the Nyquist rate, likewise.
         roughness: The rms change of the controls from sample to sample by noise, in N m.
-        position_error, force_error: The rms errors to expect in m and N: by noise, and by an unknown
-            force of 1 N that appears or turns every 2 s.
-        binds: Why the gains are no faster: "roughness", "damping", "decay", "start", or "" where the
-            first ones were taken.
+        position_error, force_error: The rms errors to expect in m and N: by noise, and by an
+            unknown force of 1 N that appears or turns every 2 s.
+        binds: Why the gains are no faster: "roughness", "damping", "decay", "start", or "" where
+            the first ones were taken.
     """
 
     position_rate: float
@@ -103,9 +105,9 @@ class ContactGains:
         return [p**2, 2.0**0.5 * p] if poles == 2 else [p**3, 2.0 * p**2, 2.0 * p]
 
     @property
-    def keeps_margins(self) -> bool:
-        """Whether decay and damping are what is recommended."""
-        return self.decay >= DECAY and self.damping >= DAMPING
+    def margin(self) -> float:
+        """The lesser of decay and damping, relative to what is recommended."""
+        return min(self.decay / DECAY, self.damping / DAMPING)
 
 
 @checked(ModelError)
@@ -127,22 +129,21 @@ def contact_gains(
 ) -> ContactGains:
     """Returns the fastest gains with a margin on the loop of plant, sensors, estimator and law.
 
-    All gains are multiples of the rate w = 0.3 rad / (3 (delay + T / 2)), with a factor a for free
-    directions and b for the contact: positions have Butterworth's poles at 1.5 a w, the estimator
-    k_o = 2 a w, k_f = a w / 2 and k_n = b w; the constraint has the damping c = 2.3 b w, at most
-    2 sqrt(A k), and the force's integral 0.4 c. The sampled loop is one `Block`, whose map over a
-    sample has a Jacobian with all couplings in it: of friction, tilt, the tool's inertia, curvature,
-    delay, sensors and estimator. It is taken where on the path friction damps most, d = mu lambda
-    A_t / |v|, and where the contact is fastest, for stiffness and tool's mass from 1/2 to 2 times
-    the model's and friction from 0 to 0.8. Factors are tried from (2, 1) down, until
+    First each direction has the gains with the least error, by noise and by an unknown force,
+    within the roughness, from a linear model of its own (`direction_gains`). Then the loop decides.
+    It is one `Block`, whose map over a sample has a Jacobian with all couplings in it: of friction,
+    tilt, the tool's inertia, curvature, delay, sensors and estimator. That is taken where on the
+    path friction damps most, d = mu lambda A_t / |v|, and where the contact is fastest, with
+    stiffness and tool's mass from 1/2 to 2 times the model's and friction from 0 to 0.8. The gains
+    of free directions, or of the contact, are reduced until
 
-    - the slowest mode decays at 1/s or faster (eigenvalues of 1 left out: counters, held estimates),
+    - the slowest mode decays at 1/s or faster (poles at 0 left out: counters, held estimates),
     - modes below half the Nyquist rate have a damping ratio of 0.1 or more,
     - noise changes the controls by at most `roughness` from sample to sample, in rms,
-    - half a second from the start, with friction 0.8 unknown, ends in contact.
+    - half a second from a start at rest, with friction of 0.8 unknown, ends in contact.
 
-    The factor whose integrals take part in the worst mode is reduced. If none of six pairs does all
-    this, those with the fastest decay within the roughness are returned.
+    Those are reduced whose integrals take part in the worst mode. Where slower gains do not help,
+    the best ones within the roughness are returned, with their margins.
 
     Args:
         model: The robot with rigid joints; each constraint a `PointOnSurface`.
@@ -152,8 +153,9 @@ def contact_gains(
         times: Begin and end of the motion, in s.
         guess: A state near its begin, shape (n,).
         structure: That of the model's system.
-        identify, integral, constraint_damping, contact_stiffness, latency: As for `with_disturbance`
-            and `TrackingLaw`; a given damping is kept.
+        identify: Parameters that the estimator identifies, as for `with_disturbance`.
+        integral, constraint_damping, contact_stiffness, latency: As for `TrackingLaw`; a given
+            damping is kept.
         roughness: In N m; 0.3 % of the largest effort limit if None, 1 N m without limits.
 
     Raises:
@@ -173,16 +175,18 @@ def contact_gains(
     trials = _Trials(model, replace(material, friction=0.0), references, settings, identify, law)
     trials.structure = structure or find_structure(model.dae)
     trials.go_along(np.linspace(*np.asarray(times, dtype=float), 25), guess, roughness)
-    (free, contact), binds, found = (1.0, 1.0), "", list[ContactGains]()
+    free, contact, binds, found = 1.0, 1.0, "", list[ContactGains]()
     for _ in range(TRIES):
         gains, is_of_contact = trials.examined(trials.gains(free, contact), roughness)
         found.append(replace(gains, binds=binds))
+        before = found[-2].margin if binds in ("damping", "decay") else -inf
         if gains.roughness > roughness:
-            binds = "roughness"
-            less = _smoother(found, roughness)
+            binds, less = "roughness", _smoother(found, roughness)
             free, contact = less * free, less * contact
-        elif gains.decay < DECAY or gains.damping < DAMPING:
-            binds = "damping" if gains.damping < DAMPING else "decay"
+        elif gains.margin < 1.0:
+            if gains.margin < min(before + 0.01, 1.0) and gains.decay > 0.0:
+                break  # Slower gains do not help: friction, or a contact that noise lets swing.
+            binds = "damping" if gains.damping / DAMPING < gains.decay / DECAY else "decay"
             free, contact = (free, FINER * contact) if is_of_contact else (FINER * free, contact)
         elif not trials.starts():
             binds, free, contact = "start", FINER * free, FINER * contact
@@ -190,17 +194,17 @@ def contact_gains(
             return found[-1]
     smooth = [g for g in found if g.roughness <= roughness and g.decay > 0.0]
     if smooth:
-        return max(smooth, key=lambda g: min(g.decay / DECAY, g.damping / DAMPING))
-    k, T = material.stiffness, trials.period
+        return max(smooth, key=lambda g: g.margin)
     if found[-1].decay > 0.0:
         raise GainError(
-            f"noise changes the controls by {found[-1].roughness:.3g} N m from sample to sample with "
-            f"the slowest gains that were tried, and {roughness:.3g} N m are allowed: allow more "
-            "roughness, or use better sensors"
+            f"noise changes the controls by {found[-1].roughness:.3g} N m from sample to sample "
+            f"with the slowest gains that were tried, and {roughness:.3g} N m are allowed: allow "
+            "more roughness, or use better sensors"
         )
     raise GainError(
-        f"no gains are stable for a contact of {k:.3g} N/m, half and twice as stiff, with samples of "
-        f"{T:g} s and this delay: sample more often, or make it softer"
+        f"no gains are stable for a contact of {material.stiffness:.3g} N/m, half and twice as "
+        f"stiff, with samples of {trials.period:g} s and this delay: sample more often, or make it "
+        "softer"
     )
 
 
@@ -256,9 +260,12 @@ class _Trials:
         q = slice(0, model.links.q.numel())
         v = slice(q.stop, q.stop + model.links.v.numel())
         N = model.links.velocity_map
-        slip = ca.vertcat(ca.SX(0, 1), *(c.sliding for c in system.contacts if c.sliding is not None))
-        rows = [ca.mtimes(ca.jacobian(each, system.state[q]), N) for each in
-                (system.k, system.l[self.points])]
+        slides = [c.sliding for c in system.contacts if c.sliding is not None]
+        slip = ca.vertcat(ca.SX(0, 1), *slides)
+        rows = [
+            ca.mtimes(ca.jacobian(each, system.state[q]), N)
+            for each in (system.k, system.l[self.points])
+        ]
         values = [system.mass_matrix[v, v], *rows, ca.jacobian(slip, system.state[v]), slip, N]
         function = ca.Function("f", [system.state, system.parameter_symbol], values)
         along, across, ways, sizes = list[float](), list[float](), list[FloatArray](), []
@@ -286,7 +293,7 @@ class _Trials:
         rest = motion.states[0].copy()
         rest[v] = 0.0
         self.begin = round(times[0] / self.period) * self.period, rest
-        self.start = direction_gains(self._situation(*sizes[chosen[1]]), roughness)
+        self.start = direction_gains(self._situation(*sizes[chosen[1]]), 0.8 * roughness)
 
     def _situation(self, *sizes: float) -> SensedContact:
         settings, k = self.settings, self.material.stiffness
@@ -303,7 +310,8 @@ class _Trials:
         if settings.sensor is not None:
             noise = replace(noise, force=float(np.max(settings.sensor.noise_deviation)))
         samples = int(np.ceil(delay / self.period - 1e-9))
-        return SensedContact(self.period, samples, k, *sizes, noise, estimates)
+        leads = self.law["contact_stiffness"] is not None
+        return SensedContact(self.period, samples, k, *sizes, noise, estimates, leads)
 
     def gains(self, free: float, contact: float) -> ContactGains:
         """The gains with factors for free directions and for the contact."""
@@ -347,8 +355,8 @@ class _Trials:
         Gains that are too rough where friction damps most are not examined further.
         """
         self.run = run = _Run(self.loop(gains), self.model, self.material)
-        found, worst = list[LinearLoop](), 0
-        rough = errors = np.zeros(3)
+        found = list[LinearLoop]()
+        errors: tuple[float, ...] = (inf, inf, inf)
         for moment, state, way, cases in self.path:
             for k, mu, mass in cases:
                 x = state + way / (k * self.material.stiffness)

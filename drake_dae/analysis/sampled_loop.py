@@ -12,11 +12,12 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, Block, stacked
 from drake_dae.errors import ModelError
 
-LEFT_OUT = 1e-6
-"""Eigenvalues that differ from 1 by less are counters and held estimates, which no motion moves."""
+HELD = 0.1
+"""Real poles within 0.1/s of 0 are left out: counters, and estimates that are held where nothing
+moves them; as the posture turns, these drift. Slow modes by friction are pairs."""
 
 EVERY = 2.0
-"""A deviation appears or turns every 2 s, and noise has acted as long."""
+"""A deviation appears or turns every 2 s; noise has acted as long."""
 
 _CHANGE, _LEAST = 1e-7, 1e-2
 """The change of a value for a difference, relative to its size, of which the least is 0.01."""
@@ -45,10 +46,16 @@ class LinearLoop:
     @property
     def poles(self) -> np.ndarray:
         """log(z) / T of the eigenvalues z, in 1/s, the slowest first."""
-        found = np.linalg.eigvals(self.A).astype(complex)
-        found = found[(np.abs(found - 1.0) > LEFT_OUT) & (np.abs(found) > 1e-9)]
-        poles = np.log(found) / self.period
-        return poles[np.argsort(-poles.real)]
+        found = self._logarithms(np.linalg.eigvals(self.A))
+        found = found[np.isfinite(found)]
+        return found[np.argsort(-found.real)]
+
+    def _logarithms(self, values: np.ndarray) -> np.ndarray:
+        """log(z) / T, and -inf for what is left out."""
+        z = values.astype(complex)
+        poles = np.log(np.where(np.abs(z) > 1e-9, z, 1.0)) / self.period
+        poles[(np.abs(poles) < HELD) & (np.abs(poles.imag) < 1e-3)] = -np.inf
+        return poles
 
     @property
     def decay(self) -> float:
@@ -63,15 +70,13 @@ class LinearLoop:
         return float(np.min(-poles.real / np.abs(poles), initial=1.0))
 
     def participation(self, ratio: float) -> FloatArray:
-        """The shares of all x in the worst mode: the one with the least of decay and `ratio`...."""
+        """The shares of all x in the worst mode: decays count in 1/s, damping ratios by `ratio`."""
         values, left, right = scipy.linalg.eig(self.A, left=True)
-        with np.errstate(divide="ignore"):
-            s = np.log(values.astype(complex)) / self.period
-        rank = np.minimum(-s.real, 1e3)
-        inside = np.abs(s.imag) < pi / (2.0 * self.period)
-        rank = np.where(inside, np.minimum(rank, -s.real / np.abs(s) / ratio), rank)
-        rank[(np.abs(values - 1.0) <= LEFT_OUT) | (np.abs(values) <= 1e-9)] = np.inf
-        worst = int(np.argmin(rank))
+        poles = self._logarithms(values)
+        with np.errstate(invalid="ignore"):
+            damped = np.where(np.isfinite(poles), -poles.real / np.abs(poles) / ratio, np.inf)
+        inside = np.abs(poles.imag) < pi / (2.0 * self.period)
+        worst = int(np.argmin(np.minimum(-poles.real, np.where(inside, damped, np.inf))))
         shares: FloatArray = np.abs(left[:, worst] * right[:, worst])
         return shares
 
@@ -89,7 +94,7 @@ class LinearLoop:
         return _roots(change @ spread @ change.T + direct @ direct.T)
 
     def after_push(self, name: str, push: FloatArray) -> FloatArray:
-        """The rms of each row over `EVERY`, where from its start on a deviation adds w to x[k+1]."""
+        """The rms of each row over `EVERY`, with w added to x[k+1] at each sample."""
         size = len(self.A)
         whole = np.zeros((size + 1, size + 1))
         whole[:size, :size], whole[:size, size], whole[size, size] = self.A, push, 1.0

@@ -4,6 +4,9 @@ from .beyond.disturbance import Observation as Observation
 from .beyond.disturbance import with_disturbance as with_disturbance
 from .beyond.identified import IdentifiedTerms as IdentifiedTerms
 from .beyond.lags import Lags as Lags
+from .beyond.one_direction import SensedContact as SensedContact
+from .beyond.one_direction import SensorNoise as SensorNoise
+from .beyond.one_direction import direction_gains as direction_gains
 from .contacts import PainleveOutcome as PainleveOutcome
 from .contacts import UnilateralInput as UnilateralInput
 from .contacts import painleve_outcome as painleve_outcome

@@ -9,19 +9,19 @@ import numpy as np
 from scipy.linalg import expm
 
 from drake_dae.analysis.contact_gains import DAMPING, DECAY, FORCE, ContactGains, contact_gains
+from drake_dae.analysis.sampled_loop import EVERY
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Structure
-from drake_dae.dae.tracking.model_of_law import damping_gains
-from drake_dae.dae.beyond.one_direction import EVERY
 from drake_dae.dae.tracking.deflection import Deflection
+from drake_dae.dae.tracking.model_of_law import damping_gains
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.references import Reference, SinusoidReference
 from drake_dae.robots import RobotModel
+from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at
 from drake_dae.scenario.motion import reference_and_start, references_of
-from drake_dae.scenario import parts as parts
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.task_controller import opening_contact
@@ -63,8 +63,8 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         The scenario, and the choices in words.
 
     Raises:
-        ScenarioError: There are no default gains for such a scenario, or none are smooth and stable;
-            or `largest_roughness` is given and not used.
+        ScenarioError: There are no default gains for such a scenario, or none are smooth and
+            stable; or `largest_roughness` is given and not used.
     """
     material = scenario.plant.material
     law, sensors = scenario.law, scenario.sensors
@@ -103,8 +103,14 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     with at("law.gains"):
         best = contact_gains(
             model,
-            PointMaterial(material.time_step, stiffness, material.dissipation, None,
-                          material.stiction_tolerance, material.radius),
+            PointMaterial(
+                material.time_step,
+                stiffness,
+                material.dissipation,
+                None,
+                material.stiction_tolerance,
+                material.radius,
+            ),
             references,
             LoopSettings(
                 sensor=force.sensor(model.dae.num_constraints),
@@ -180,10 +186,14 @@ def _motion(
         middle = outputs(state, dae.parameter_values).full()[:, 0]
         middle[list(forces)] = _FORCE
         turns = {name: pi / 2.0 * i for i, name in enumerate(points)}
-        return [
-            SinusoidReference(value, _ROUND * (name in points), _FAST, turns.get(name, 0.0))
-            for name, value in zip(names, middle.tolist(), strict=True)
-        ], state, None
+        return (
+            [
+                SinusoidReference(value, _ROUND * (name in points), _FAST, turns.get(name, 0.0))
+                for name, value in zip(names, middle.tolist(), strict=True)
+            ],
+            state,
+            None,
+        )
     with at("start"):
         _, guess = reference_and_start(scenario, model, structure)
     stated = scenario.law.contact_stiffness
@@ -231,7 +241,7 @@ def _least_damping(structure: Structure, damping: parts.Gains) -> float:
 def _note(best: ContactGains, chosen: Scenario, stiffness: float) -> str:
     """The choice of gains as sentences."""
     law, estimator = chosen.law, chosen.estimator
-    assert estimator is not None and law.constraint_damping is not None
+    assert estimator is not None
     observed = f"an estimator of {estimator.rate:g} 1/s that identifies: "
     observed += ", ".join(estimator.identify) or "none"
     if estimator.state_rate is not None:
@@ -244,20 +254,21 @@ def _note(best: ContactGains, chosen: Scenario, stiffness: float) -> str:
     }.get(best.binds, "sampling and delay")
     text = (
         f"recommended for a contact of {stiffness:.2g} N/m: Butterworth's poles of positions at "
-        f"{_rounded(best.position_rate):g} 1/s, and of forces one at {-_rounded(best.force_gain):g} "
+        f"{_rounded(best.position_rate):g} 1/s, of forces one at {-_rounded(best.force_gain):g} "
         f"1/s, with integrals of {', '.join(law.integral or ())}, damping of the constraint "
-        f"{_rounded(best.constraint_damping):g} 1/s, {observed}. On the loop itself, with stiffness "
-        f"and tool's mass from 1/2 to 2 times the model's and friction to 0.8, the slowest mode "
-        f"decays at {best.decay:.2g} 1/s, the least damping ratio is {best.damping:.2g}, and the "
-        f"controls change by {best.roughness:.2g} N m from sample to sample; {binds} keeps the gains "
-        f"from being faster. Expected are {1e3 * best.position_error:.2g} mm and "
-        f"{best.force_error:.2g} N rms, if an unknown force of {FORCE:g} N appears every {EVERY:g} s"
+        f"{_rounded(best.constraint_damping):g} 1/s, {observed}. On the loop itself, with "
+        "stiffness and tool's mass from 1/2 to 2 times the model's and friction up to 0.8, the "
+        f"slowest mode decays at {best.decay:.2g} 1/s, the least damping ratio is "
+        f"{best.damping:.2g}, and noise changes the controls by {best.roughness:.2g} N m from "
+        f"sample to sample; {binds} keeps the gains from being faster. Expected are "
+        f"{1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N rms, if an unknown force "
+        f"of {FORCE:g} N appears every {EVERY:g} s"
     )
-    if best.keeps_margins:
+    if best.margin >= 1.0:
         return text
     return (
-        f"{text}. {DECAY:g} 1/s and {DAMPING:g} are recommended: more inertia at the tool, a shorter "
-        "delay, a softer contact or less noise would help"
+        f"{text}. {DECAY:g} 1/s and {DAMPING:g} are recommended: more inertia at the tool, a "
+        "shorter delay, a softer contact or less noise would help"
     )
 
 

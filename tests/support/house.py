@@ -33,6 +33,7 @@ FLOORS = (
     ("compiler",),
     ("diagrams",),
     ("analysis",),
+    ("analysis",),
     ("running",),
     ("pictures",),
     ("scenario",),

@@ -266,6 +266,7 @@ class SensedContact:
         inertia: sqrt(tr M M): the torque per acceleration of all joints, in kg m^2.
         noise: That of a joint's angle and velocity, in rad and rad/s, and of the force in N.
         estimates: Whether the state is estimated from positions.
+        leads: Whether the law knows the deflection of a force that changes.
     """
 
     period: float
@@ -278,6 +279,7 @@ class SensedContact:
     inertia: float
     noise: SensorNoise
     estimates: bool
+    leads: bool = False
 
     def of(self, lever: float) -> SensorNoise:
         """The noise of a distance that is computed from noisy angles."""
@@ -299,8 +301,8 @@ class Part:
 def direction_gains(situation: SensedContact, roughness: float) -> tuple[Part, Part]:
     """The gains of free directions and of the contact with the least errors, each for itself.
 
-    Free directions have Butterworth's poles at p = 1.5 w and the estimator's rate 2 w; a contact the
-    damping c = 2.3 w, at most 2 sqrt(A k), the integral 0.4 c and the estimator's rate w. The
+    Free directions have Butterworth's poles at p = 1.5 w and the estimator's rate 2 w; a contact
+    the damping c = 2.3 w, at most 2 sqrt(A k), the integral 0.4 c and the estimator's rate w. The
     product of both rms errors is least, by noise and by `MODEL_ERROR`, among those that change the
     controls by `roughness` from sample to sample at most; and where all are rougher, the roughness.
     Nothing here knows of friction, tilt and posture: see `contact_gains`.
@@ -348,7 +350,8 @@ def _contact(situation: SensedContact, w: float, state_rate: float | None) -> Pa
     direction = Direction(situation.period, situation.delay, A, k)
     loop = sampled_loop(direction, gains, situation.of(situation.contact_lever))
     by_noise, jump = loop.deviations()
-    errors = by_noise, MODEL_ERROR * A * _rms(loop), c * RAMP / (A * k)
+    ramp = 0.0 if situation.leads else c * RAMP / (A * k)
+    errors = by_noise, MODEL_ERROR * A * _rms(loop), ramp
     return Part(w, gains, float(np.linalg.norm(errors)), situation.contact_lever * jump / A)
 
 
