@@ -48,7 +48,6 @@ from drake_dae.robots import Constraint, Links, Surface
 from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.systems import Controller, Observing, Plant, PointMaterial
 
 
@@ -162,7 +161,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     Links: lambda: arm("two_link").model.links,
     MultibodyPlant: lambda: arm("two_link").plant,
     Recorded: lambda: Recorded(np.zeros((2, 1)), (dd.Signal("a"),)),
-    RunResult: lambda: RunResult(Outcome.FINISHED, figures={"steps": 1.0}),
     Scenario: scenario,
     Surface: lambda: dd.Plane((0, 0, 0), (0, 0, 1)),
     System: lambda: loop().diagram,
@@ -187,7 +185,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "size of StateSensor": lambda: 4,
     "components": lambda: "xy",
     "duration": lambda: 0.01,
-    "law of DisturbanceObserver": observed_law,
     "law of StateEstimator": observed_law,
     "gains of AdvisedGains": lambda: dd.contact_gains(1e5, 0.03, 1e-3),
     "observing of StateEstimator": lambda: Observing(10.0, state_rate=40.0),
@@ -246,13 +243,9 @@ PLACES: dict[str, Callable[[], Any]] = {
     "mass_matrix": lambda: ca.SX(2.0),
     "bias": lambda: ca.SX(0.0),
     "path": lambda: find_scenario("two_link_wall"),
-    "values of grid_variations": lambda: {"duration": [1.0, 2.0]},
-    "values of listed_variations": lambda: {"duration": [1.0, 2.0]},
     "size of MeasuredSurface": lambda: (0.4, 0.3),
     "heights": lambda: [[0.0, 0.1], [0.0, 0.2]],
     "file": lambda: None,
-    "ranges": lambda: {"duration": (1.0, 2.0)},
-    "variations of Study": lambda: ({"duration": 1.0},),
     "log": lambda: loop().log,
     "groups": lambda: [np.eye(1), np.eye(1)],
     "starts": state,

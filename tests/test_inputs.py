@@ -27,7 +27,6 @@ from drake_dae import (
     Torus,
     TrackingLaw,
     build_scenario,
-    dynamic_extension,
     find_structure,
     load_scenario,
     make_animation,
@@ -281,7 +280,6 @@ ARGUMENTS = {
     "constant(nan)": lambda: ConstantReference(np.nan),
     "point_to_point(nan)": lambda: PointToPointReference(0.0, 1.0, np.nan, 1.0),
     "Torus(inf)": lambda: Torus((0, 0, 0), (0, 0, 1), np.inf, 1.0),
-    "max_integrators=-1": lambda: dynamic_extension(arm("two_link").model.dae, max_integrators=-1),
     "spread=-1": lambda: find_structure(arm("two_link").model.dae, spread=-1.0),
     "a row as a state": lambda: law("two_link").control(
         np.zeros((1, 4)), np.zeros(law("two_link").layout.reference_size)

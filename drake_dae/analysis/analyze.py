@@ -26,15 +26,15 @@ from drake_dae.dae import (
     ZeroDynamics,
     why_no_law,
 )
-from drake_dae.dae.states.contact_margin import ContactMargins
-from drake_dae.dae.states.margins import find_margin, is_regular
-from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.structure.constrained import (
+from drake_dae.dae.margins import ContactMargins, find_margin, is_regular
+from drake_dae.dae.samples import Samples
+from drake_dae.dae.structure import (
     check_system,
     constraint_violation,
+    control_violation,
     examine_constraints,
+    examine_outputs,
 )
-from drake_dae.dae.structure.structure import control_violation, examine_outputs
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.references import Reference
 

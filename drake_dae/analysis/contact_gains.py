@@ -35,7 +35,7 @@ from drake_dae.errors import GainError, ModelError
 from drake_dae.references import Reference, references_by_name
 from drake_dae.references.reference import stack_references
 from drake_dae.robots import RobotModel, velocities_are_rates
-from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import PointMaterial
 from drake_dae.systems.sensing.force_sensor import ForceSensor
@@ -117,7 +117,7 @@ def contact_gains(
     references: Sequence[Reference] | Mapping[str, Reference | float],
     settings: LoopSettings,
     *,
-    times: ArrayLike = (0.0, 10.0),
+    times: tuple[float, float] = (0.0, 10.0),
     guess: ArrayLike | None = None,
     structure: Structure | None = None,
     identify: Sequence[str] = (),
@@ -174,7 +174,8 @@ def contact_gains(
     }
     trials = _Trials(model, replace(material, friction=0.0), references, settings, identify, law)
     trials.structure = structure or find_structure(model.dae)
-    trials.go_along(np.linspace(*np.asarray(times, dtype=float), 25), guess, roughness)
+    begin, end = times
+    trials.go_along(np.linspace(begin, end, 25), guess, roughness)
     free, contact, binds, found = 1.0, 1.0, "", list[ContactGains]()
     for _ in range(TRIES):
         gains, is_of_contact = trials.examined(trials.gains(free, contact), roughness)
@@ -268,7 +269,8 @@ class _Trials:
         ]
         values = [system.mass_matrix[v, v], *rows, ca.jacobian(slip, system.state[v]), slip, N]
         function = ca.Function("f", [system.state, system.parameter_symbol], values)
-        along, across, ways, sizes = list[float](), list[float](), list[FloatArray](), []
+        along, across, ways = list[float](), list[float](), list[FloatArray]()
+        sizes = list[dict[str, float]]()
         for state, force in zip(motion.states, motion.constraint_inputs, strict=True):
             M, J, J_p, J_t, speed, to_q = (
                 value.full() for value in function(state, system.parameter_values)
@@ -284,7 +286,16 @@ class _Trials:
             J_p = J_p if J_p.size else J
             free = float(np.max(np.einsum("ij,ji->i", J_p, np.linalg.solve(M, J_p.T))))
             levers = (float(np.max(np.linalg.norm(each, axis=1))) for each in (J_p, J))
-            sizes.append((along[-1], free, *levers, float(np.linalg.norm(M))))
+            lever, contact_lever = levers
+            sizes.append(
+                {
+                    "mobility": along[-1],
+                    "free_mobility": free,
+                    "lever": lever,
+                    "contact_lever": contact_lever,
+                    "inertia": float(np.linalg.norm(M)),
+                }
+            )
         chosen = int(np.argmax(across)), int(np.argmax(along))
         self.path = [
             (round(times[i] / self.period) * self.period, motion.states[i], ways[i], cases)
@@ -293,9 +304,9 @@ class _Trials:
         rest = motion.states[0].copy()
         rest[v] = 0.0
         self.begin = round(times[0] / self.period) * self.period, rest
-        self.start = direction_gains(self._situation(*sizes[chosen[1]]), 0.8 * roughness)
+        self.start = direction_gains(self._situation(sizes[chosen[1]]), 0.8 * roughness)
 
-    def _situation(self, *sizes: float) -> SensedContact:
+    def _situation(self, sizes: dict[str, float]) -> SensedContact:
         settings, k = self.settings, self.material.stiffness
         delay = 0.0 if settings.sampling is None else settings.sampling.delay
         encoders, noise, estimates = settings.encoders, SensorNoise(), False
@@ -311,7 +322,9 @@ class _Trials:
             noise = replace(noise, force=float(np.max(settings.sensor.noise_deviation)))
         samples = int(np.ceil(delay / self.period - 1e-9))
         leads = self.law["contact_stiffness"] is not None
-        return SensedContact(self.period, samples, k, *sizes, noise, estimates, leads)
+        return SensedContact(
+            self.period, samples, k, noise=noise, estimates=estimates, leads=leads, **sizes
+        )
 
     def gains(self, free: float, contact: float) -> ContactGains:
         """The gains with factors for free directions and for the contact."""

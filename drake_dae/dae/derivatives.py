@@ -49,7 +49,7 @@ class Derivatives:
         constraint_matrix: A(x) of Assumption (2), shape (m, m).
         pivot: A scalar that is 0 exactly where A(x) is singular, see `trace.factorization`. With
             frictional contacts it is not positive where the Painleve paradox occurs, see
-            `dae.system.contacts`.
+            `dae.contacts`.
     """
 
     def __init__(self, system: DaeSystem, constraint: ca.SX, damping: ca.SX | None = None) -> None:

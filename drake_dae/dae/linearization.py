@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
-from drake_dae.dae.manifold.manifold import coordinates
+from drake_dae.dae.manifold import coordinates
 from drake_dae.dae.signals import DerivativeLayout, Indices, Signal
-from drake_dae.dae.structure.constrained import ConstraintStructure, constraint_structure_of
+from drake_dae.dae.structure import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system import DaeSystem
-from drake_dae.dae.tracking.tracking import TrackingLaw
+from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
 

@@ -9,14 +9,14 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, show, vector
+from drake_dae.dae.margins import RankMargin, find_margin
+from drake_dae.dae.samples import Samples
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.states.margins import RankMargin, find_margin
-from drake_dae.dae.states.samples import Samples
-from drake_dae.dae.structure.structure import Structure, structure_of
+from drake_dae.dae.structure import Structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.expressions import find_flaw
-from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton
+from drake_dae.trace.newton import NewtonModel, newton
 from drake_dae.trace.round_off import unit_rows
 
 TRANSVERSAL = 0.05
@@ -83,9 +83,9 @@ class NormalForm:
         chains = ca.vertcat(residual, structure.chain)  # (21)
         samples = Samples(structure.manifold, structure.states)
         if completion is None:
-            chosen = choose_completion(structure, chains, samples)
+            chosen = _chosen_completion(structure, chains, samples)
         else:
-            chosen = check_completion(structure, chains, samples, completion)
+            chosen = _checked_completion(structure, chains, samples, completion)
         self.completion, self.completion_signals, self.margin = chosen  # (22)
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
@@ -163,7 +163,7 @@ class NormalForm:
         solution = self._newton(x, target, p)  # (24)
         if solution is not None:
             return solution
-        start, first = self._at(x, p)
+        start, _ = self._at(x, p)
         if not np.all(np.isfinite(start)):
             raise ModelError(
                 f"{self.system.name}: the coordinates (20)-(22) are not finite at the guess "
@@ -178,7 +178,16 @@ class NormalForm:
             elif stride > 1e-4:
                 stride /= 2.0
             else:
-                raise self._out_of_reach(x, start, target, first, p)
+                missing = target - self._at(x, p)[0]
+                worst = int(np.argmax(np.abs(missing)))
+                raise InconsistentStateError(
+                    f"{self.system.name}: no way from the guess to the given coordinates: "
+                    f"{self.coordinate_signals[worst].name} does not reach {target[worst]:.6g}; "
+                    f"the search ended at x = {show(x)}. Start from a guess that is nearer. If the "
+                    "coordinates become dependent there, A(x) of Assumption (2) or B(x) of (16) "
+                    "loses its rank (Theorem 2.1), or xi does not complete the chains any more",
+                    missing,
+                )
         return x
 
     def _newton(
@@ -200,34 +209,6 @@ class NormalForm:
         solution, converged = newton(state / scale, linearize)
         return scale * solution if converged else None
 
-    def _out_of_reach(
-        self,
-        state: FloatArray,
-        start: FloatArray,
-        target: FloatArray,
-        first: FloatArray,
-        parameters: FloatArray,
-    ) -> InconsistentStateError:
-        """Returns the error that names the coordinate which does not reach its target."""
-        values, jacobian = self._at(state, parameters)
-        missing = target - values
-        rows, columns = np.linalg.norm(first * self._scale, axis=1), self._scale
-        rows[rows == 0.0] = 1.0
-        weak, sizes, _ = np.linalg.svd(jacobian * columns / rows[:, None])
-        weakest = weak[:, sizes <= 10.0 * sizes[-1] + ROUND_OFF * sizes[0]]
-        blocked = weakest @ (weakest.T @ (missing / rows))
-        worst = int(np.argmax(np.abs(blocked * missing / rows)))
-        completion = ", ".join(signal.name for signal in self.completion_signals)
-        message = (
-            f"{self.system.name}: no way from the guess to the given coordinates: "
-            f"{self.coordinate_signals[worst].name} can be brought from {start[worst]:.6g} to "
-            f"{values[worst]:.6g}, but not to {target[worst]:.6g}; the search ended at x = "
-            f"{show(state)}. Start from a guess that is nearer. If the coordinates become "
-            "dependent there, A(x) of Assumption (2) or B(x) of (16) loses its rank (Theorem 2.1), "
-            f"or the completion ({completion or 'none'}) does not complete the chains any more"
-        )
-        return InconsistentStateError(message, missing)
-
     def _at(self, state: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Phi and its Jacobian at a state."""
         values, jacobian = self._map(state, parameters)
@@ -243,7 +224,7 @@ def _solver(matrix: FloatArray) -> Callable[[FloatArray], FloatArray] | None:
     return None if info else lambda right: dgetrs(factors, pivots, right / rows)[0]
 
 
-def check_completion(
+def _checked_completion(
     structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX
 ) -> Completion:
     """The user's completion, with its signals and its margin."""
@@ -264,17 +245,7 @@ def check_completion(
     flaw = find_flaw(xi, system.state, system.parameter_symbol, "the state")
     if flaw:
         raise ModelError(f"{system.name}: the completion {flaw}")
-    signals = tuple(
-        next(
-            (
-                signal
-                for j, signal in enumerate(system.state_signals)
-                if ca.is_equal(xi[i], system.state[j])
-            ),
-            Signal(f"xi{i}"),
-        )
-        for i in range(count)
-    )
+    signals = tuple(_signal_of(entry, f"xi{i}", system) for i, entry in enumerate(ca.vertsplit(xi)))
     gradient = ca.jacobian(ca.vertcat(chains, xi), system.state)
     margin = find_margin(samples, gradient)
     if not margin.is_singular:
@@ -285,10 +256,10 @@ def check_completion(
             f"{show(margin.state)}: A(x) of Assumption (2) or B(x) of (16) is close to singular "
             "there"
         )
-    # A row that vanishes at a state has no direction there; the others are compared by direction.
+    # A row that vanishes at a state has no direction there; else by the distance of each
+    # differential from the span of those before it.
     worst = -1 if margin.vanishing_row is None else margin.vanishing_row - chains.numel()
     if worst < 0:
-        # The distance of each differential from the span of those before it.
         rows = unit_rows(margin.matrix * samples.scale)
         worst = int(np.argmin(np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]))
     raise ModelError(
@@ -299,15 +270,23 @@ def check_completion(
     )
 
 
-def choose_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
+def _signal_of(expression: ca.SX, name: str, system: DaeSystem) -> Signal:
+    """The signal of the state that an expression is, or one of a given name."""
+    for signal, state in zip(system.state_signals, ca.vertsplit(system.state), strict=True):
+        if ca.is_equal(expression, state):
+            return signal
+    return Signal(name)
+
+
+def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
     """Single states whose differentials complete those of the chains, or else linear combinations.
 
     They complete them if they are regular on the null spaces of the chains' differentials. The
-    arguments are those of `check_completion`.
+    arguments are those of `_checked_completion`.
     """
     system, count = structure.system, structure.zero_dynamics_dimension
     if not count:
-        return check_completion(structure, chains, samples, ca.SX(0, 1))
+        return _checked_completion(structure, chains, samples, ca.SX(0, 1))
     gradients = samples.values(gradient=ca.jacobian(chains, system.state))
     spaces = np.array(
         [np.linalg.svd(unit_rows(g * samples.scale))[2][-count:].T for (g,) in gradients]

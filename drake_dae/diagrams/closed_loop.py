@@ -14,13 +14,13 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
 from drake_dae.dae import Signal
-from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.record import Record, computed_record, recorded_values
 from drake_dae.diagrams.sources import seed_noise
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller, PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.observing.estimator import StateEstimator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
@@ -61,7 +61,7 @@ class ClosedLoop:
     exogenous: ReferenceGenerator | None = None
     plant_exogenous: ReferenceGenerator | None = None
     encoders: MeasuredState | None = None
-    observer: Observer | None = None
+    observer: StateEstimator | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:

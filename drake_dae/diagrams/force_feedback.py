@@ -6,11 +6,11 @@ import numpy as np
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import RandomSource
 
-from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.sources import add_noise
 from drake_dae.errors import WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.observing.estimator import StateEstimator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
@@ -21,7 +21,7 @@ def add_force_feedback(
     controller: Controller,
     sensor: ForceSensor | None,
     sampling: Sampling | None,
-    others: Sequence[Observer] = (),
+    others: Sequence[StateEstimator] = (),
 ) -> RandomSource | None:
     """Connects the constraint force to the controller, through the sensor if there is one.
 

@@ -1,19 +1,17 @@
 """The observer of a closed loop, and its connections."""
 
+import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from drake_dae.dae import TrackingLaw
+from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.observing.estimator import StateEstimator
-from drake_dae.systems.observing.observer import DisturbanceObserver
-from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.encoders import Encoders
-
-Observer = DisturbanceObserver | StateEstimator
 
 
 def add_observer(
@@ -27,7 +25,7 @@ def add_observer(
     reference: OutputPort,
     limits: ControlLimits | None,
     encoders: Encoders | None,
-) -> Observer:
+) -> StateEstimator:
     """Adds the observer and connects it to the controller's exogenous port.
 
     If it estimates the state, it is connected to the controller's state port as well. Its port
@@ -72,16 +70,19 @@ def add_observer(
         )
     late = 0.0 if sampling is None else sampling.delay + step
     lag, delay = control_lag(plant, sampling), late + period / 2.0
-    observer: Observer
-    if observing.state_rate is None:
+    noise = np.zeros(()), np.zeros(())
+    if estimates:
+        noise = _check_encoders(encoders)
+    try:
         observer = builder.AddSystem(
-            DisturbanceObserver(controller.law, observing, period, lag, delay, plant.is_ideal)
+            StateEstimator(
+                controller.law, observing, period, lag, delay, step, *noise, plant.is_ideal
+            )
         )
-        builder.Connect(state, observer.GetInputPort("estimated_state"))
-    else:
-        timing = period, lag, delay
-        observer = builder.AddSystem(_estimator(controller.law, observing, timing, step, encoders))
-        builder.Connect(state, observer.GetInputPort("measured_state"))
+    except ModelError as error:
+        raise WiringError(str(error)) from None
+    builder.Connect(state, observer.GetInputPort("measured_state"))
+    if estimates:
         state = observer.GetOutputPort("estimated_state")
     builder.Connect(state, controller.GetInputPort("estimated_state"))
     builder.Connect(control, observer.GetInputPort("control"))
@@ -108,13 +109,8 @@ def control_lag(plant: Plant, sampling: Sampling | None) -> float:
     return min((rest + step) / period, 1.0) if period else 0.0
 
 
-def _estimator(
-    law: TrackingLaw,
-    observing: Observing,
-    timing: tuple[float, float, float],
-    step: float,
-    encoders: Encoders | None,
-) -> StateEstimator:
+def _check_encoders(encoders: Encoders | None) -> tuple[FloatArray, FloatArray]:
+    """The deviations of encoders from which a state is to be estimated."""
     if encoders is None:
         raise WiringError(
             "a state_rate is for encoders, whose noise the observer filters: give the loop "
@@ -125,8 +121,4 @@ def _estimator(
             "an observer that estimates the state takes positions and forms no differences: leave "
             "the encoders' velocity_bandwidth out"
         )
-    noise = encoders.position_deviation, encoders.velocity_noise
-    try:
-        return StateEstimator(law, observing, *timing, step, *noise)
-    except ModelError as error:
-        raise WiringError(str(error)) from None
+    return encoders.position_deviation, np.asarray(encoders.velocity_noise, dtype=float)

@@ -1,10 +1,14 @@
 """The record of a run: every signal over time, with names and units."""
 
+import csv
 import html
 import json
+import platform
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO, Self, TypeVar
 
@@ -15,11 +19,25 @@ from pydrake.systems.primitives import VectorLogSink
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, numbers
 from drake_dae.dae import Signal
-from drake_dae.diagrams.record_columns import Recorded as Recorded
-from drake_dae.diagrams.record_columns import label, read_csv, write_csv
-from drake_dae.diagrams.versions import versions
 from drake_dae.errors import ModelError
 from drake_dae.files import MOST_RECORDED, check_file, open_file
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A vector signal over time.
+
+    Attributes:
+        values: The values, one row per time, shape (k, size).
+        signals: The name and unit of each column.
+    """
+
+    values: FloatArray
+    signals: tuple[Signal, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", numbers("the values of a signal", self.values))
+        object.__setattr__(self, "signals", tuple(self.signals))
 
 
 def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:
@@ -97,7 +115,7 @@ class Record:
         """A table of the signals, as a notebook shows it."""
         rows = "".join(
             f"<tr><td>{html.escape(name)}</td><td>{len(recorded.signals)}</td>"
-            f"<td>{html.escape(listed(map(label, recorded.signals))[1:-1])}</td></tr>"
+            f"<td>{html.escape(listed(map(_label, recorded.signals))[1:-1])}</td></tr>"
             for name, recorded in self.signals.items()
         )
         return (
@@ -121,9 +139,7 @@ class Record:
     def while_finite(self) -> Self:
         """The record up to the first time at which some signal is not finite."""
         count = _finite_rows(self.time.size, [r.values for r in self.signals.values()])
-        if count == self.time.size:
-            return self
-        return self._rows(slice(count))
+        return self if count == self.time.size else self._rows(slice(count))
 
     def _rows(self, rows: slice) -> Self:
         signals = {
@@ -192,26 +208,12 @@ class Record:
 
         The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
         """
-        write_csv(path, self.time, self.signals)
-
-    @classmethod
-    def from_csv(cls, path: str | Path, columns: Mapping[str, str] | None = None) -> Self:
-        """Reads a file of `to_csv`, or the log of a robot.
-
-        A row has the values just before its time: a control with a zero-order hold is the one that
-        acted up to this row.
-
-        Args:
-            path: The file, with a line of names and then a line for each time.
-            columns: A column of the file -> its name in the record, "time" or "<signal>.<name>" as
-                in `to_csv`, with or without a unit in brackets; other columns are left out. None if
-                the file has these names itself.
-
-        Raises:
-            ModelError: The file cannot be read, it lacks a column, some entry is not a number, or
-                times do not increase.
-        """
-        return cls(*read_csv(path, columns))
+        pairs = [(name, signal) for name, r in self.signals.items() for signal in r.signals]
+        rows = np.column_stack([self.time, *(r.values for r in self.signals.values())])
+        with open(path, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time [s]", *(f"{name}.{_label(signal)}" for name, signal in pairs)])
+            writer.writerows(rows.tolist())
 
     def to_dataframe(self) -> Any:
         """The record as a pandas DataFrame, one row for each time, "time [s]".
@@ -222,36 +224,16 @@ class Record:
         Raises:
             ModelError: pandas is not installed.
         """
-        pandas = _optional_module("pandas", "to_dataframe")
-        pairs = [
-            (name, label(signal))
-            for name, recorded in self.signals.items()
-            for signal in recorded.signals
-        ]
+        try:
+            pandas: Any = import_module("pandas")
+        except ImportError:
+            raise ModelError("to_dataframe needs pandas: pip install 'drake_dae[data]'") from None
+        pairs = [(name, _label(signal)) for name, r in self.signals.items() for signal in r.signals]
         return pandas.DataFrame(
             np.hstack([np.zeros((self.time.size, 0)), *(r.values for r in self.signals.values())]),
             index=pandas.Index(self.time, name="time [s]"),
             columns=pandas.MultiIndex.from_tuples(pairs, names=["signal", "name"]),
         )
-
-    def to_xarray(self) -> Any:
-        """The record as an xarray Dataset, one variable for each signal.
-
-        Its dimensions are "time" in s and "<signal>.name"; the units stand beside the names, as the
-        coordinate "<signal>.unit": `data["control"].sel({"control.name": "joint1_motor"})`.
-
-        Raises:
-            ModelError: xarray is not installed.
-        """
-        xarray = _optional_module("xarray", "to_xarray")
-        variables: dict[str, Any] = {}
-        coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"})}
-        for name, recorded in self.signals.items():
-            along = f"{name}.name"
-            variables[name] = (("time", along), recorded.values)
-            coordinates[along] = [signal.name for signal in recorded.signals]
-            coordinates[f"{name}.unit"] = (along, [signal.unit for signal in recorded.signals])
-        return xarray.Dataset(variables, coordinates)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -280,8 +262,20 @@ class Record:
 RecordAfter = Callable[[float | None], Record]
 """From a time in s, or None, to what a run has recorded later."""
 
-
 R = TypeVar("R", bound=Record)
+
+
+def versions() -> dict[str, str]:
+    """The versions of the library, its dependencies and Python, and the machine."""
+    versions_of = {"python": platform.python_version(), "machine": platform.platform()}
+    for name in ("drake_dae", "drake", "casadi", "numpy"):
+        with suppress(PackageNotFoundError):  # Drake may be built from its source.
+            versions_of[name] = version(name)
+    return versions_of
+
+
+def _label(signal: Signal) -> str:
+    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
 
 
 def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
@@ -290,18 +284,6 @@ def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
     for values in columns:
         finite &= np.isfinite(values).all(axis=1)
     return count if finite.all() else int(np.argmin(finite))
-
-
-def _optional_module(module: str, user: str) -> Any:
-    """Imports a package of the extra `data`.
-
-    Raises:
-        ModelError: It is not installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError:
-        raise ModelError(f"{user} needs {module}: pip install 'drake_dae[data]'") from None
 
 
 def _read_rows(file: BinaryIO, kind: type[R]) -> R:
@@ -325,3 +307,35 @@ def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:
     labels = zip(file[f"{name}.names"], file[f"{name}.units"], strict=True)
     signals = tuple(Signal(str(label), str(unit)) for label, unit in labels)
     return Recorded(file[name], signals)
+
+
+@dataclass(frozen=True)
+class PhaseSpan:
+    """A phase of a task in a record: its name, "Press" for example, its begin and end in s."""
+
+    name: str
+    begin: float
+    end: float
+
+
+def phase_spans(record: Record) -> list[PhaseSpan]:
+    """The phases of a record in order; none without a task."""
+    if "phase" not in record.signals or not record.time.size:
+        return []
+    signals = record.signals["phase"].signals
+    names = [signal.name.partition(" ")[2] or signal.name for signal in signals]
+    places = np.argmax(record["phase"], axis=1)
+    # A sample at the time of a change has the values before it.
+    last = np.flatnonzero(np.append(np.diff(places) != 0, True))
+    begins = [record.time[0], *record.time[last[:-1]]]
+    return [
+        PhaseSpan(names[places[row]], float(begin), float(record.time[row]))
+        for row, begin in zip(last, begins, strict=True)
+    ]
+
+
+def phases_at(record: Record, times: FloatArray) -> list[str]:
+    """The name of the phase at each time in s; "" without a task."""
+    spans = phase_spans(record)
+    ends = [span.end for span in spans[:-1]]
+    return [spans[i].name if spans else "" for i in np.searchsorted(ends, times)]

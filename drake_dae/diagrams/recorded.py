@@ -6,11 +6,11 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort, TriggerType
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
 
 from drake_dae.dae import Signal, TrackingLaw
-from drake_dae.diagrams.observing import Observer
 from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
+from drake_dae.systems.observing.estimator import StateEstimator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
@@ -24,13 +24,7 @@ def log_signals(
     controller: Controller,
     named: Named,
 ) -> VectorLogSink:
-    """Exports all signals, and logs them as one vector.
-
-    Args:
-        builder: The builder of the diagram.
-        plant, controller: The blocks.
-        named: The signals.
-    """
+    """Exports all signals, and logs them as one vector."""
     for name, (port, _) in named.items():
         builder.ExportOutput(port, name)
     for name in controller.shown:
@@ -44,7 +38,7 @@ def signals_of_plant(
     plant: Plant,
     moving: ReferenceGenerator | None,
     reference: ReferenceGenerator | None,
-    law: TrackingLaw,
+    law: TrackingLaw | None,
     control: OutputPort,
 ) -> Named:
     """The signals of every plant and its inputs that a record contains."""
@@ -54,7 +48,7 @@ def signals_of_plant(
         named["exogenous"] = (moving.get_output_port(), signals)
     for name, signals in plant.port_signals.items():
         named[name] = (plant.GetOutputPort(name), signals)
-    if reference is not None:
+    if reference is not None and law is not None:
         named["reference"] = (reference.GetOutputPort("reference"), law.reference_signals)
     return {**named, "control": (control, dae.control_signals)}
 
@@ -64,7 +58,7 @@ def signals_of_parts(
     controller: Controller,
     measured: MeasuredState | None,
     limits: ControlLimits | None,
-    observer: Observer | None,
+    observer: StateEstimator | None,
     sensor: ForceSensor | None,
 ) -> Named:
     """The further signals of controller, parts and plant that a record contains."""
@@ -86,7 +80,7 @@ def signals_of_parts(
     return named | further_signals(plant)
 
 
-def further_signals(block: Plant | Controller | Observer | ReferenceGenerator) -> Named:
+def further_signals(block: Plant | Controller | StateEstimator | ReferenceGenerator) -> Named:
     """The further signals of a block."""
     return {name: (block.GetOutputPort(name), s) for name, s in block.further_signals.items()}
 
@@ -96,11 +90,6 @@ def log_steps(builder: DiagramBuilder, ports: Sequence[OutputPort], plant: Plant
 
     For a discrete plant the log is periodic, since after the last step of a run the state of the
     plant belongs to a time that the run has not reached.
-
-    Args:
-        builder: The builder of the diagram.
-        ports: The ports.
-        plant: The plant.
     """
     stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
     stacked.set_name("logged_signals")

@@ -9,7 +9,7 @@ from drake_dae.arguments import checked
 from drake_dae.errors import WiringError
 from drake_dae.references import Reference
 from drake_dae.systems.control.sampling import Sampling
-from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
@@ -30,7 +30,7 @@ class LoopSettings:
         control_limits: The largest |u| of the drives, shape (p,), such as `model.control_limits`;
             the record has "excess", the part beyond. Integrals are not updated meanwhile. None for
             no limits.
-        observer: The settings of a `DisturbanceObserver`, for a sampled law with measured force of
+        observer: The settings of a `StateEstimator`, for a sampled law with measured force of
             a system that `with_disturbance` made. The record has its "disturbance" and "friction",
             and integrals are not updated while a contact is lost.
         exogenous: The references of all exogenous signals w of plant and law, in their order; w is

@@ -14,12 +14,11 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.record import Record
+from drake_dae.diagrams.record import Record, phase_spans
 from drake_dae.errors import ModelError
 from drake_dae.pictures.events import events_of, kinds_of
 from drake_dae.pictures.motion import follow, run_points, run_view
-from drake_dae.robots.surfaces.surface import axes_along
-from drake_dae.running.phases import phase_spans
+from drake_dae.robots import axes_along
 from drake_dae.scene.arrows import FORCE_COLOR, LEAST_SCALE, MOMENT_COLOR, PATH_COLOR, path_of
 from drake_dae.scene.camera import view_angles
 from drake_dae.scene.surroundings import diagonal, floor_below, scene_points, surroundings

@@ -37,11 +37,10 @@ from pydrake.systems.sensors import CameraInfo
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.record import Record
+from drake_dae.diagrams.record import Record, phases_at
 from drake_dae.errors import ModelError
 from drake_dae.pictures.motion import RunMotion, follow, run_points, run_view
-from drake_dae.robots.constraint_wrenches import own_values
-from drake_dae.running.phases import phases_at
+from drake_dae.robots import own_values
 from drake_dae.scene.camera import view_angles
 from drake_dae.scene.surroundings import diagonal, floor_below, surroundings
 from drake_dae.scene.view import ARROW, PIECE

@@ -12,9 +12,7 @@ from drake_dae.blocks.traced_system import context_in
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import InconsistentStateError
-from drake_dae.robots import RobotModel
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches, own_values
-from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.robots import ConstraintWrenches, RobotModel, Wrenches, own_values, tangents
 from drake_dae.scene.camera import direction_of, framed
 from drake_dae.scene.surroundings import scene_points
 from drake_dae.scene.view import FRAME_RATE

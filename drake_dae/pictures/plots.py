@@ -16,13 +16,12 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.record import Record, Recorded
+from drake_dae.diagrams.record import Record, Recorded, phase_spans
 from drake_dae.errors import ModelError
 from drake_dae.files import complete
 from drake_dae.pictures.events import RunEvent, events_of, kinds_of
 from drake_dae.pictures.motion import ContactPath, contact_paths, follow
 from drake_dae.running.judgement import output_sizes
-from drake_dae.running.phases import phase_spans
 
 _FIRST = ("controlled_output", "constraint_force", "control", "state")
 """The signals in which an entry's name is looked up first; of these the first has the outputs."""

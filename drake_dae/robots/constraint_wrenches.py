@@ -17,12 +17,9 @@ from drake_dae.trace.functions import TracedFunction
 
 @dataclass(frozen=True, eq=False)
 class Wrenches:
-    """The wrenches of constraints on a robot at one time, in the world, one row per constraint.
+    """The wrenches of k constraints on a robot at one time, in the world, shapes (k, 3).
 
-    Attributes:
-        points: The points of application, m, shape (k, 3).
-        forces: The forces at these points, N, shape (k, 3).
-        moments: The moments, N m, shape (k, 3).
+    Points of application in m, forces at these points in N, and moments in N m.
     """
 
     points: FloatArray
@@ -59,16 +56,8 @@ class ConstraintWrenches:
         }
         self.function = TracedFunction(
             "constraint loads",
-            {
-                "q": links.q,
-                "v": links.v,
-                "force": force,
-                "parameters": model.dae.parameter_symbol,
-            },
-            {
-                name: kinematics.value(ca.horzcat(ca.SX(3, 0), *column))
-                for name, column in columns.items()
-            },
+            {"q": links.q, "v": links.v, "force": force, "parameters": model.dae.parameter_symbol},
+            {name: kinematics.value(ca.horzcat(ca.SX(3, 0), *c)) for name, c in columns.items()},
         )
         self._parameters = model.dae.parameter_vector(parameters).copy()
         self._parts = np.cumsum([links.q.numel(), links.v.numel()])
@@ -76,13 +65,7 @@ class ConstraintWrenches:
     def __call__(
         self, state: FloatArray, constraint_force: ArrayLike, parameters: ArrayLike | None = None
     ) -> Wrenches:
-        """The wrenches at one time.
-
-        Args:
-            state: x, or only its first part, the link state (q, v).
-            constraint_force: lambda, shape (m,).
-            parameters: Values of all parameters at that time, if some are exogenous.
-        """
+        """The wrenches at a state x, or link state (q, v), for lambda, shape (m,)."""
         q, v, _ = np.split(state, self._parts)
         values = self._parameters if parameters is None else parameters
         tables = self.function(q, v, constraint_force, values)

@@ -1,36 +1,20 @@
 """The equations of a robot in contact as a DaeSystem.       (43)-(45), (64)-(68), (74)-(78)"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import DaeSystem, Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.actuation.chain import ActuationChain
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.known_forces import Load
+from drake_dae.robots.actuation.stage import ActuationChain, diagonal_parameter
+from drake_dae.robots.constraints.constraint_set import ConstraintSet, LoopState
 from drake_dae.robots.links.links import Links
-from drake_dae.robots.loop_state import LoopState
+from drake_dae.robots.loads import Load
 from drake_dae.trace.factorization import BlockFactors, Factors, PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
-
-
-@dataclass(frozen=True, eq=False)
-class Outputs:
-    """The controlled outputs z = (h_1(q), S(q) lambda) of a robot.
-
-    Attributes:
-        positions: h_1, shape (p - k, 1).
-        forces: S, shape (k, m).
-        signals: Names and units of z.
-    """
-
-    positions: ca.SX
-    forces: ca.SX
-    signals: tuple[Signal, ...]
 
 
 def robot_equations(
@@ -40,40 +24,38 @@ def robot_equations(
     driven: ActuationChain,
     loop_joints: LoopState,
     known_forces: Sequence[Load],
-    outputs: Outputs,
+    h_1: ca.SX,
+    S: ca.SX,
+    output_signals: tuple[Signal, ...],
     choice: tuple[Parameter, ...],
     nominal: FloatArray,
 ) -> DaeSystem:
-    """(43)-(45), with M on the left; the rows of stages follow those of links.
+    """(43)-(45) with the outputs z = (h_1(q), S(q) lambda), and M on the left.
 
-    Args:
-        name: The robot's name in messages.
-        links, bound, driven, loop_joints, known_forces, outputs: The parts of the robot.
-        choice: The parameters of the choice of the control, if any; see `control_choice`.
-        nominal: A configuration of the robot at work, shape (nq,).
+    The rows of stages follow those of links. `choice` are the parameters of `control_choice`.
     """
     nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
     controls = (*driven.control_signals, *bound.motors)
     m, nu = bound.size, len(controls)
-    h_1, S = outputs.positions, outputs.forces
     B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
     velocity = ca.mtimes(links.velocity_map, links.v)
-    torque = (
-        ca.mtimes(B, driven.joint_force) + _known_force(links, known_forces) + bound.drag(links)
-    )
+    kinematics, known = links.kinematics(), ca.SX(nv, 1)
+    for load in known_forces:
+        known += links.generalized_force(kinematics, load.reaction(kinematics))
+    torque = ca.mtimes(B, driven.joint_force) + known + bound.drag(links)
     torque += loop_joints.force
-    motors = loop_joints.motors
-    rotors = _moved_rotors(links, driven)
+    reflected = links.actuation_matrix * links.reflected_inertia @ links.actuation_matrix.T
+    # Rotors move with the links, or with a stage.
+    moved = ca.SX(ca.sparsify(ca.DM(reflected * driven.carries_rotors)))
 
     def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
         acceleration = rate[nq : nq + nv]
         inertial, constraint_rate = bound.implicit(links, acceleration, constraint_force)
         slip = ca.sparsify(rate[:nq] - velocity)
         if slip.nnz():  # q' is an unknown of its own where N is not the identity.
-            kinematics = links.kinematics()
-            motion = kinematics.value(bound.rate(kinematics))
-            constraint_rate += ca.jtimes(motion, links.q, slip)
-        balance = inertial - ca.mtimes(rotors, acceleration) - torque  # (37)
+            moving = links.kinematics()
+            constraint_rate += ca.jtimes(moving.value(bound.rate(moving)), links.q, slip)
+        balance = inertial - ca.mtimes(moved, acceleration) - torque  # (37)
         stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
         return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 
@@ -81,7 +63,7 @@ def robot_equations(
         first = rows[0] if rows else 0
         if first > nq or list(rows) != list(range(first, nq + nv + k)):
             return None
-        bodies = links.articulated_bodies(_rotors_in_links(links, driven))
+        bodies = links.articulated_bodies(np.diag(reflected) * (not driven.carries_rotors))
         if bodies is None:
             return None
         others = (ca.SX.eye(nq - first), driven.mass)
@@ -90,13 +72,13 @@ def robot_equations(
 
     return DaeSystem(
         state=ca.vertcat(links.q, links.v, driven.state),
-        mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - rotors, driven.mass),
+        mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - moved, driven.mass),
         f=ca.vertcat(velocity, torque - links.bias, driven.drift),  # (43)
         g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
         h=ca.vertcat(
             ca.SX(nq, nu),
-            ca.horzcat(ca.mtimes(B, driven.direct), motors),
-            ca.horzcat(driven.drive, ca.SX(k, motors.shape[1])),
+            ca.horzcat(ca.mtimes(B, driven.direct), loop_joints.motors),
+            ca.horzcat(driven.drive, ca.SX(k, loop_joints.motors.shape[1])),
         ),
         k=bound.constraint_output(links.kinematics()),  # (44)
         l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
@@ -108,15 +90,11 @@ def robot_equations(
             *(parameter for load in known_forces for parameter in load.parameters),
             *choice,
         ),
-        state_signals=(
-            *links.position_signals,
-            *links.velocity_signals,
-            *driven.state_signals,
-        ),
+        state_signals=(*links.position_signals, *links.velocity_signals, *driven.state_signals),
         constraint_input_signals=bound.force_signals,
         constraint_output_signals=bound.residual_signals,
         control_signals=controls,
-        output_signals=outputs.signals,
+        output_signals=output_signals,
         nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
         state_scale=np.ones(nq + nv + k),  # For SI units and angles.
         name=name,
@@ -130,16 +108,7 @@ def robot_equations(
 
 
 def check_mass_matrix(dae: DaeSystem, links: Links, nominal: FloatArray) -> None:
-    """Refuses an M, without rotors that move with a stage, that is not positive definite.
-
-    Args:
-        dae: The robot's system.
-        links: The links, with nq positions and nv velocities.
-        nominal: The positions at which M is examined, shape (nq,).
-
-    Raises:
-        ModelError: M is not symmetric, or not positive definite.
-    """
+    """Refuses an M, without rotors that move with a stage, that is not positive definite."""
     nq, nv = links.q.numel(), links.v.numel()
     inputs = {"q": links.q, "parameters": dae.parameter_symbol}
     expression = dae.mass_matrix[nq : nq + nv, nq : nq + nv]
@@ -157,26 +126,76 @@ def check_mass_matrix(dae: DaeSystem, links: Links, nominal: FloatArray) -> None
         )
 
 
-def _known_force(links: Links, known_forces: Sequence[Load]) -> ca.SX:
-    """The generalized force of the known_forces, shape (nv, 1)."""
-    total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
-    for load in known_forces:
-        total += links.generalized_force(kinematics, load.reaction(kinematics))
-    return total
+def check_outputs(
+    name: str,
+    links: Links,
+    motors: Sequence[Signal],
+    forces: int,
+    positions: Sequence[Signal],
+    is_chosen: bool,
+) -> None:
+    """Refuses a number of outputs that does not fit that of the actuators.
+
+    `motors` are those in joints that close loops; `is_chosen` says whether weights choose u.
+    """
+    of_joints, count = len(links.actuator_signals), len(positions)
+    nu = of_joints + len(motors)
+    if nu == 0 and count + forces:
+        raise ModelError(
+            f"{name}: there are no actuators, so no output can be controlled, but {count} "
+            f"positions and {forces} constraint forces are outputs. To simulate it leave "
+            "`positions` empty, and `forces` out; to steer it give joints actuators, by "
+            "plant.AddJointActuator before Finalize or a <transmission> in its file"
+        )
+    if is_chosen:
+        if not 0 < count + forces < nu:
+            raise ModelError(
+                f"{name}: control_weights choose among the controls of more actuators than "
+                f"outputs, but there are {nu} actuators and {count + forces} outputs; leave them "
+                "out"
+            )
+        return
+    rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if of_joints else 0
+    if rank < of_joints:
+        actuators = ", ".join(signal.name for signal in links.actuator_signals)
+        raise ModelError(
+            f"{name}: the {of_joints} actuators {actuators} move the joints in only {rank} "
+            "independent ways, for example if two drive one joint; leave one out, or give "
+            "control_weights and fewer outputs"
+        )
+    if forces > nu:
+        raise ModelError(
+            f"{name}: {forces} constraint forces are outputs, but {nu} actuators can steer {nu} "
+            "outputs; name in `forces` those to be steered ([] is none), remove constraints, or "
+            "add actuators"
+        )
+    if count + forces and count + forces != nu:  # A robot that is only simulated needs no outputs.
+        names = ", ".join(signal.name for signal in positions) or "none"
+        fewer = ". For fewer, control_weights choose the control" if count + forces < nu else ""
+        if forces and count + forces > nu:
+            fewer = ". Name in `forces` those that shall be steered; [] is none"
+        raise ModelError(
+            f"{name}: {nu} actuators can steer {nu} outputs. The {forces} constraint forces "
+            f"are outputs already, so {nu - forces} position outputs are needed; given are "
+            f"{count} ({names}){fewer}"
+        )
 
 
-def _moved_rotors(links: Links, driven: ActuationChain) -> ca.SX:
-    """The part of M that moves with a stage instead of the links, shape (nv, nv)."""
-    return ca.SX(ca.sparsify(ca.DM(_rotors(links) * driven.carries_rotors)))
+def control_choice(
+    name: str, weights: ArrayLike | None, controls: Sequence[Signal]
+) -> tuple[Parameter, ...]:
+    """The parameters "control_weights" and "free_control" of the least sum w_i (u_i - u_0i)^2.
 
-
-def _rotors_in_links(links: Links, driven: ActuationChain) -> FloatArray:
-    """The diagonal of the part of M from rotors that move with the links, shape (nv,)."""
-    return np.diag(_rotors(links)) * (not driven.carries_rotors)
-
-
-def _rotors(links: Links) -> FloatArray:
-    """The part of M from rotors, shape (nv, nv)."""
-    B = links.actuation_matrix
-    rotors: FloatArray = B * links.reflected_inertia @ B.T
-    return rotors
+    Nothing without weights; these are one for all controls, or one for each.
+    """
+    if weights is None:
+        return ()
+    units = sorted({signal.unit for signal in controls})
+    if np.ndim(weights) == 0 and len(units) > 1:
+        raise ModelError(
+            f"{name}: the controls are in {' and '.join(units)}, which one weight cannot compare; "
+            "give each a weight, as 1 / limit^2"
+        )
+    nu = len(controls)
+    chosen, _ = diagonal_parameter("control_weights", weights, nu, "", positive=True)
+    return chosen, Parameter("free_control", np.zeros(nu), units[0] if len(units) == 1 else "")

@@ -10,8 +10,7 @@ from drake_dae.arguments import checked
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.links.kinematics import Kinematics
-from drake_dae.robots.links.links import Links
+from drake_dae.robots.links.links import Kinematics, Links
 from drake_dae.trace.expressions import length_of
 
 
@@ -140,11 +139,7 @@ class Squeeze(ForceOutput):
 def as_force_outputs(
     forces: Sequence[str | ForceOutput] | None, constraints: ConstraintSet
 ) -> tuple[ForceOutput, ...]:
-    """The force outputs of a list: a name is that force, None are all forces.
-
-    Raises:
-        ModelError: There is no such force, or a name occurs twice.
-    """
+    """The force outputs of a list: a name is that force, None are all forces."""
     if forces is None:
         return tuple(NamedForce(signal.name) for signal in constraints.force_signals)
     outputs = tuple(NamedForce(f) if isinstance(f, str) else f for f in forces)
@@ -156,11 +151,7 @@ def as_force_outputs(
 
 
 def force_rows(outputs: Sequence[ForceOutput], constraints: ConstraintSet, links: Links) -> ca.SX:
-    """S(q) of z_2 = S lambda, shape (k, m).
-
-    Raises:
-        ModelError: An output is not linear in the constraint forces, or does not fit.
-    """
+    """S(q) of z_2 = S lambda, shape (k, m); ModelError if an output is not linear in lambda."""
     kinematics, force = links.kinematics(), ca.SX.sym("force", constraints.size)
     blocks = [ca.SX(0, constraints.size)]
     for output in outputs:

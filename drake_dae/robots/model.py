@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Self
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -14,22 +14,20 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, vector
 from drake_dae.dae import Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.actuation.chain import chain
-from drake_dae.robots.actuation.stage import Stage
+from drake_dae.robots.actuation.stage import Stage, chain
 from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.constraints.constraint_set import ConstraintSet
-from drake_dae.robots.constraints.plant_constraints import plant_constraints
-from drake_dae.robots.control_choice import check_outputs, control_choice
+from drake_dae.robots.constraints.constraint_set import ConstraintSet, LoopState
+from drake_dae.robots.constraints.couplers import plant_constraints
 from drake_dae.robots.equations import (
-    Outputs,
     check_mass_matrix,
+    check_outputs,
+    control_choice,
     robot_equations,
 )
 from drake_dae.robots.force_outputs import ForceOutput, as_force_outputs, force_rows
-from drake_dae.robots.known_forces import Load
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
-from drake_dae.robots.loop_state import LoopState
+from drake_dae.robots.loads import Load
 from drake_dae.robots.outputs import PositionOutput
 from drake_dae.robots.statics import StaticBalance, StaticPlacement
 from drake_dae.trace.compiled import Compiled
@@ -40,58 +38,38 @@ class RobotModel:
     """A robot in contact, equations (37)-(40):
 
         M(q) v' + H(q, v) = J(q)^T lambda + B tau,    q' = N(q) v,
-        0 = phi(q),    z_1 = h_1(q),    z_2 = lambda,
+        0 = phi(q),    z_1 = h_1(q),    z_2 = S(q) lambda,
 
-    with J = (dphi/dq) N. With friction, G(q, v) takes the place of J^T; viscous friction is part of
-    H. A nonholonomic constraint has its rate in place of phi, and r = 1. With rigid joints tau = u;
-    stages of actuation add dynamics between u and tau: E s' = drift(q, v, s) + drive u, tau =
-    tau(q, v, s), as in (64)-(65) and (74)-(75). The state is x = (q, v, s); the constraint input is
-    lambda, and the controlled outputs are z = (z_1, z_2), so the number of position outputs is that
-    of actuators minus constraints. If fewer forces are controlled (wheels, mimic joints), or
-    combinations of them (a grasp), `forces` chooses them: z_2 = S(q) lambda, and the number of
-    position outputs is that of actuators minus these. The plant's port always has all of lambda.
-    With fewer outputs than actuators, as in a redundantly actuated parallel robot,
-    `control_weights` w chooses the control with the least sum w_i (u_i - u_0i)^2 among all with the
-    same outputs; see `DaeSystem`. u_0 is the parameter "free_control", zero by default: it affects
-    internal forces and motions that are not outputs. With flexible joints each additional actuator
-    leaves one undamped deflection: rather make the internal force an output.
+    with J = (dphi/dq) N; with friction, G(q, v) takes the place of J^T. A nonholonomic constraint
+    has its rate in place of phi, and r = 1. With rigid joints tau = u; stages of actuation add
+    E s' = drift(q, v, s) + drive u, tau = tau(q, v, s), as in (64)-(65) and (74)-(75). The state is
+    x = (q, v, s), the constraint input lambda, and the outputs are z = (z_1, z_2): the number of
+    position outputs is that of actuators minus force outputs.
 
     Args:
         links: The links, which provide M, H and the frames.
         constraints: The constraints phi in their order; none for a robot in free motion. Those of
             the links' MultibodyPlant are appended: see `plant_constraints`.
-        outputs: The position outputs h_1 in their order; None for a robot that is only simulated,
-            without force outputs unless `forces` names them.
-        nominal_positions: A configuration of the robot at work, shape (nq,), near which the
-            structure is examined; `links.default_positions` if None, or, if no configuration on the
-            constraints is near them, a random one that is.
+        outputs: The position outputs h_1 in their order; None for a robot that is only simulated.
+        nominal_positions: A configuration at work, shape (nq,), near which the structure is
+            examined; if None the default one, or a random one on the constraints.
         name: The robot's name in messages.
         actuation: The stages from the joints toward the motor; none for rigid joints.
-        forces: The force outputs z_2, in their order: names of constraint forces, and combinations
-            of forces, as a `Squeeze`; all constraint forces if None, none without actuators.
+        forces: The force outputs z_2: names of constraint forces, and combinations, as a `Squeeze`;
+            all constraint forces if None, none without actuators or outputs.
         exogenous: The names of parameters that are exogenous signals w with known derivatives,
             "wall.position" for example; see `DaeSystem`.
         known_forces: Known forces on frames, zero by default, and friction of joints.
-        compliances: For a robot whose constraints are redundant: name of a constraint force -> its
-            relative compliance, 1 if not named, {} for equal ones. The forces are then shared by
-            least squares, see `share_forces`. An output that depends on the split is refused, since
-            it is not determined. None refuses redundant constraints.
-        control_weights: w, positive, for more actuators than outputs: one for each, shape (nu,), or
-            a number for all if all controls have the same unit. Weights 1 / limit^2 share the
-            effort in proportion to the limits. It becomes the parameter "control_weights".
+        compliances: For redundant constraints: name of a constraint force -> its relative
+            compliance, 1 if not named. The forces are shared by least squares, see `share_forces`.
+        control_weights: w, positive, for more actuators than outputs: the least sum
+            w_i (u_i - u_0i)^2 chooses u; see `DaeSystem`. They and u_0 become the parameters
+            "control_weights" and "free_control". Weights 1 / limit^2 share the effort.
         compiled: Whether functions become machine code: True, False or "auto"; see `DaeSystem`.
 
-    Attributes:
-        dae: The `DaeSystem` (43)-(45).
-        links, outputs, nominal_positions, name, known_forces: The arguments.
-        constraints: The constraints, with those of the plant.
-        forces: The force outputs; a name is a `NamedForce`.
-        stages: The attached stages.
-        joint_force: tau as an expression of `dae.state`; None with rigid joints.
-        control_limits: The largest |u| per actuator; infinite without a limit or if u is not a
-            joint force. Those in joints that close loops come last.
-        loop_joints: The joints that close loops, with their coordinates and limits.
-        placing, balance: The equations of `configuration` and `rest_state`.
+    Attributes: the arguments, and `dae`, the `DaeSystem` (43)-(45); `stages`, attached;
+    `joint_force`, tau as an expression, None with rigid joints; `control_limits`, the largest |u|;
+    `loop_joints`, the joints that close loops.
 
     Raises:
         ModelError: There are too many or too few outputs, M is not positive definite, stages do not
@@ -113,21 +91,17 @@ class RobotModel:
         control_weights: ArrayLike | None = None,
         compiled: Compiled = "auto",
     ) -> None:
-        self.links = links
-        all_constraints = (*constraints, *plant_constraints(links))
-        self.constraints = tuple(constraint.moving(exogenous) for constraint in all_constraints)
-        self.outputs = tuple(outputs or ())
-        self.name = name
-        self.known_forces = tuple(known_forces)
+        self.links, self.name = links, name
+        every = (*constraints, *plant_constraints(links))
+        self.constraints = tuple(constraint.moving(exogenous) for constraint in every)
+        self.outputs, self.known_forces = tuple(outputs or ()), tuple(known_forces)
         bound = ConstraintSet(self.constraints)
         if forces is None and (outputs is None or not (links.actuator_signals or bound.motors)):
             forces = ()  # The robot is only simulated.
         self.forces = as_force_outputs(forces, bound)
         S = force_rows(self.forces, bound, links)  # (40)
         self._num_forces = S.shape[0]
-        h_1 = ca.vertcat(
-            ca.SX(0, 1), *[output.expression(links) for output in self.outputs]
-        )  # (39)
+        h_1 = ca.vertcat(ca.SX(0, 1), *[o.expression(links) for o in self.outputs])  # (39)
         signals = [signal for output in self.outputs for signal in output.signals(links)]
         weighted = control_weights is not None
         check_outputs(name, links, bound.motors, self._num_forces, signals, weighted)
@@ -138,19 +112,17 @@ class RobotModel:
                 "drive theirs through stages: the control would reach the outputs at different "
                 "orders. Cut the loop at a joint without motor"
             )
-        controls = (*driven.control_signals, *bound.motors)
-        choice = control_choice(name, control_weights, controls)
+        choice = control_choice(name, control_weights, (*driven.control_signals, *bound.motors))
         self.stages = driven.stages
         self.joint_force = driven.joint_force if driven.stages else None
-        is_joint_force = driven.control_signals == tuple(links.actuator_signals)
         efforts = links.effort_limits
-        if not is_joint_force:
+        if driven.control_signals != tuple(links.actuator_signals):  # u is no joint force.
             efforts = np.full(efforts.size, np.inf)
         motors = [joint.effort_limit for _, joint in bound.joints if joint.motor is not None]
         self.control_limits = np.concatenate([efforts, motors])
-        self.loop_joints = LoopState.of(bound, links)
-        self.nominal_positions = nominal = self._nominal(nominal_positions)
-        steered = (*signals, *(s for f in self.forces for s in f.signals(bound)))
+        self.loop_joints = LoopState(bound, links)
+        nominal = links.default_positions if nominal_positions is None else nominal_positions
+        nominal = vector(f"{name}: nominal_positions", nominal, links.q.numel())
         equations = robot_equations(
             name,
             links,
@@ -158,7 +130,9 @@ class RobotModel:
             driven,
             self.loop_joints,
             self.known_forces,
-            Outputs(h_1, S, steered),
+            h_1,
+            S,
+            (*signals, *(signal for force in self.forces for signal in force.signals(bound))),
             choice,
             nominal,
         )
@@ -171,52 +145,28 @@ class RobotModel:
         rows = [row for row in ca.vertsplit(self.dae.k) if not ca.depends_on(row, links.v)]
         phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
         self.placing = StaticPlacement(self.dae, links.q, phi, h_1)
-        chosen = self.dae.m[h_1.numel() :, :]
-        self.balance = StaticBalance(self.dae, links, chosen, bool(self.stages))
+        self.balance = StaticBalance(self.dae, links, self.dae.m[h_1.numel() :, :])
         if nominal_positions is None:
-            self.nominal_positions = nominal = self._on_constraints(nominal)
-            nominal_state = self.dae.nominal_state.copy()
-            nominal_state[: nominal.size] = nominal
-            self.dae = replace(self.dae, nominal_state=nominal_state)
-        if self.stages:
-            self.dae = replace(self.dae, nominal_state=self._nominal_rest(nominal))
+            nominal = self._on_constraints(nominal)
+            state = np.concatenate([nominal, self.dae.nominal_state[nominal.size :]])
+            self.dae = replace(self.dae, nominal_state=state)
+        self.nominal_positions = nominal
+        if self.stages:  # At rest on the constraints, with unstrained shafts.
+            with suppress(InconsistentStateError):
+                nominal = self.configuration(None, nominal)
+            values = self.dae.parameter_values
+            state, _, _ = self.balance.rest(nominal, np.zeros(self._num_forces), values)
+            self.dae = replace(self.dae, nominal_state=state)
 
     @classmethod
-    def from_multibody(
-        cls,
-        plant: MultibodyPlant,
-        constraints: Sequence[Constraint] = (),
-        outputs: Sequence[PositionOutput] | None = None,
-        nominal_positions: ArrayLike | None = None,
-        name: str = "robot",
-        actuation: Sequence[Stage] = (),
-        forces: Sequence[str | ForceOutput] | None = None,
-        exogenous: Sequence[str] = (),
-        known_forces: Sequence[Load] = (),
-        compliances: Mapping[str, float] | None = None,
-        control_weights: ArrayLike | None = None,
-        compiled: Compiled = "auto",
-    ) -> Self:
-        """The robot of a finalized MultibodyPlant; see `MultibodyExpressions` for what it reads.
+    def from_multibody(cls, plant: MultibodyPlant, *arguments: Any, **options: Any) -> Self:
+        """The robot of a finalized MultibodyPlant; the other arguments are those of `RobotModel`.
 
         Raises:
             ModelError: The plant has an element that cannot be represented; the message names it.
+                See `MultibodyExpressions` for what it reads.
         """
-        links = MultibodyExpressions(plant)
-        return cls(
-            links,
-            constraints,
-            outputs,
-            nominal_positions,
-            name,
-            actuation,
-            forces,
-            exogenous,
-            known_forces,
-            compliances,
-            control_weights,
-            compiled,
-        )
+        return cls(MultibodyExpressions(plant), *arguments, **options)
 
     def __repr__(self) -> str:
         constraints = listed(constraint.name for constraint in self.constraints)
@@ -322,10 +272,6 @@ class RobotModel:
                     "velocities"
                 )
 
-    def _nominal(self, positions: ArrayLike | None) -> FloatArray:
-        nominal = self.links.default_positions if positions is None else positions
-        return vector(f"{self.name}: nominal_positions", nominal, self.links.q.numel())
-
     def _on_constraints(self, default: FloatArray) -> FloatArray:
         """The default configuration, or a random one if none on the constraints is near it."""
         low, high = np.clip(self.links.position_limits, default - np.pi, default + np.pi)
@@ -338,10 +284,3 @@ class RobotModel:
             f"{self.name}: no configuration on the constraints is found from the default one, nor "
             "from 20 random ones; give nominal_positions near one, or check the constraints"
         )
-
-    def _nominal_rest(self, nominal: FloatArray) -> FloatArray:
-        """The state at rest on the constraints, with unstrained shafts."""
-        with suppress(InconsistentStateError):
-            nominal = self.configuration(None, nominal)
-        forces = np.zeros(self._num_forces)
-        return self.balance.rest(nominal, forces, self.dae.parameter_values)[0]

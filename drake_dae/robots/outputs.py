@@ -11,8 +11,7 @@ from drake_dae.arrays import check_axes
 from drake_dae.dae import Signal, as_expression
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.links.kinematics import position_index
-from drake_dae.robots.links.links import Links
+from drake_dae.robots.links.links import Links, position_index
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.trace.expressions import result_of
 

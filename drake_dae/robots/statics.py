@@ -18,14 +18,7 @@ MOST = 1000
 
 
 class StaticPlacement:
-    """The equations 0 = phi(q), h_1(q) = z_1, to be solved for q: q = psi(z_1) of (58).
-
-    Args:
-        dae: The robot's system, for its parameters.
-        q: Positions, shape (nq, 1).
-        phi: Constraints, shape (k, 1).
-        h_1: Position outputs, shape (p, 1).
-    """
+    """The equations 0 = phi(q), h_1(q) = z_1, to be solved for q: q = psi(z_1) of (58)."""
 
     def __init__(self, dae: DaeSystem, q: ca.SX, phi: ca.SX, h_1: ca.SX) -> None:
         of_outputs = ca.SX.sym("of outputs", dae.parameter_symbol.numel())
@@ -64,16 +57,10 @@ class StaticPlacement:
         parameters: FloatArray,
         of_outputs: FloatArray,
     ) -> FloatArray:
-        """A solution near a guess; arguments are not checked.
+        """A solution near a guess; InconsistentStateError if there is none. Nothing is checked.
 
-        Args:
-            outputs: The first components of z_1; the others are free.
-            guess: Where to start, shape (nq,).
-            parameters: Values of all parameters, for phi.
-            of_outputs: The same for h_1.
-
-        Raises:
-            InconsistentStateError: There is none near the guess.
+        `outputs` are the first components of z_1, the others are free; `parameters` are the values
+        of all parameters for phi, `of_outputs` those for h_1.
         """
         count = outputs.size
         is_traced = self._is_traced and count == self._outputs["h_1"].numel()
@@ -114,18 +101,11 @@ class StaticPlacement:
 class StaticBalance:
     """The equations 0 = f + g lambda + h u at v = 0, S lambda = z_2, for the stages' s, u, lambda.
 
-    Entries of lambda that are outputs themselves (a row of the identity) are not unknowns.
-
-    Args:
-        dae: The robot's system, with the state (q, v, s).
-        robot: The links, with positions and velocities.
-        S: The matrix of the given combinations of lambda, shape (k, m); without redundant
-            constraints.
-        has_stages: Whether there are stages; without them any state of the links is one at rest.
+    S is without redundant constraints. Entries of lambda that are outputs themselves (a row of the
+    identity) are not unknowns. Without stages any state of the links is one at rest.
     """
 
-    def __init__(self, dae: DaeSystem, robot: Links, S: ca.SX, has_stages: bool) -> None:
-        self._has_stages = has_stages
+    def __init__(self, dae: DaeSystem, robot: Links, S: ca.SX) -> None:
         q, v = robot.q, robot.v
         links = q.numel() + v.numel()
         control = ca.SX.sym("u", dae.num_controls)
@@ -158,12 +138,8 @@ class StaticBalance:
         )
 
     def state(self, q: FloatArray, forces: FloatArray, parameters: FloatArray) -> FloatArray:
-        """The state at rest; arguments are those of `rest`.
-
-        Raises:
-            ModelError: No drive holds the robot there.
-        """
-        if not self._has_stages:  # Forces enter no state.
+        """The state at rest; ModelError if no drive holds the robot there."""
+        if not self._stages:  # Forces enter no state.
             return np.concatenate([q, self._still])
         state, _, left = self.rest(q, forces, parameters)
         if left > 1e-6 * (1.0 + float(np.max(np.abs(forces), initial=0.0))):
@@ -176,13 +152,7 @@ class StaticBalance:
     def rest(
         self, q: FloatArray, forces: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
-        """The state at rest, lambda, and the largest remaining residual.
-
-        Args:
-            q: Positions, shape (nq,).
-            forces: The force outputs z_2, shape (k,).
-            parameters: Values of all parameters.
-        """
+        """The state at rest, lambda, and the largest remaining residual, at positions, for z_2."""
         evaluated = once(lambda unknown: self._function(q, forces, unknown, parameters))
 
         def residual(unknown: FloatArray) -> FloatArray:

@@ -51,17 +51,9 @@ class CompiledRun:
     The rest, such as Drake's MultibodyPlant and sources of random numbers, are copies. States, logs
     and time of the diagram as wired follow after every few steps.
 
-    Args:
-        diagram: The diagram as wired.
-        context: Its context after the initialization events; changed in place.
-        config: Drake's integrator settings.
-
     Attributes:
         composed: The block.
         steps: The number of steps until the context was set.
-
-    Raises:
-        DrakeDaeError, RuntimeError: It cannot be composed.
     """
 
     def __init__(self, diagram: Diagram, context: Context, config: SimulatorConfig) -> None:
@@ -121,14 +113,7 @@ class CompiledRun:
     def of(
         cls, diagram: System, context: Context, config: SimulatorConfig, duration: float
     ) -> Self | None:
-        """Returns a run; None if the diagram has to run as wired, or is as fast.
-
-        Args:
-            diagram: The diagram.
-            context: Its context after the initialization events.
-            config: Drake's integrator settings.
-            duration: The duration of the run, in s.
-        """
+        """Returns a run; None if the diagram has to run as wired, or is as fast."""
         if not isinstance(diagram, Diagram):
             return None
         leaves, plants = Leaves.of(diagram).systems, _plants(diagram)
@@ -144,17 +129,7 @@ class CompiledRun:
         return None
 
     def run(self, end: float, seen: Callable[[Context, int], bool]) -> bool:
-        """Runs until a time, including the updates of that time.
-
-        Args:
-            end: The time, in s.
-            seen: A function of the context and the number of steps since its last call; it returns
-                whether to go on.
-
-        Returns:
-            Whether the run is at its end. Otherwise something failed within the next steps; the
-            diagram as wired, which goes on from the context, says what.
-        """
+        """Runs until a time, including the updates of that time."""
         goes_on, last, count = True, self._own.get_time(), 0
         refused: DrakeDaeError | None = None
 

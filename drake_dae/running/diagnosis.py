@@ -71,16 +71,7 @@ def explained(
     start: tuple[float, FloatArray] | None = None,
     parameters: FloatArray | None = None,
 ) -> SimulationError:
-    """The error of a run with its cause, if A(x) or B(x) is singular, or a path leaves its reach.
-
-    Args:
-        error: The error, with time and state.
-        plant: The plant.
-        structure: The structure of the law's system; None without a law.
-        reference: The function t -> R(t) that the law follows; None without one.
-        start: The time in s and the state of the plant at which the run began.
-        parameters: The parameters of the plant; the defaults if None.
-    """
+    """The error of a run with its cause: A(x) or B(x) is singular, or a path leaves its reach."""
     name, state = plant.dae.name, error.state
     if isinstance(error, PainleveError) or (
         isinstance(error, SingularityError) and error.constraints
@@ -202,14 +193,7 @@ def _end_of_path(
 
 
 class RunDiagnosis:
-    """What is needed to say why a simulation of a diagram ends.
-
-    Args:
-        diagram: The diagram.
-        context: Its context at the start; it is not kept.
-        config: The integrator settings.
-        duration: The duration of the run, in s.
-    """
+    """What is needed to say why a simulation of a diagram ends."""
 
     def __init__(
         self, diagram: System, context: Context, config: SimulatorConfig, duration: float
@@ -287,16 +271,7 @@ class RunDiagnosis:
         return [signals[i].name for i in np.flatnonzero(excess)]
 
     def look(self, context: Context, steps: int) -> None:
-        """Looks at the pace of a run under error control, from time to time.
-
-        Warns:
-            UserWarning: The loop is stiff: stability, not accuracy, makes the steps so short that
-                they are very many.
-
-        Raises:
-            SimulationError: Steps have collapsed, and the cause is known. Thousands of ever shorter
-                ones would lead to the same.
-        """
+        """Looks at the pace of a run under error control, from time to time."""
         before, self._steps = self._steps, self._steps + steps
         if self._steps // EVERY > before // EVERY:
             self._check_collapse(context)

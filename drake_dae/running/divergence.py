@@ -79,10 +79,6 @@ class DivergenceWatch:
     initial values in its unit, and only at the end of the run: if it is large before, as near a
     singular configuration, the run fails with a better message. So no verdict depends on units, and
     the force of an impact, the sag under a payload or a distant start are not divergence.
-
-    Args:
-        plant: The plant.
-        duration: The duration of the run, in s.
     """
 
     def __init__(self, plant: Plant, duration: float) -> None:
@@ -91,15 +87,7 @@ class DivergenceWatch:
         self._errors: _Growth | None = None
 
     def look(self, record: Record, *, is_last: bool = False) -> None:
-        """Checks the next rows of a record; without a reference, its states alone.
-
-        Args:
-            record: The rows.
-            is_last: Whether the run ends with them.
-
-        Raises:
-            SimulationError: The run diverges; with the time of the first row that shows it.
-        """
+        """Checks the next rows of a record; without a reference, its states alone."""
         if not record.time.size:
             return
         dae, time, states = self._plant.dae, float(record.time[0]), record["state"]
@@ -173,11 +161,6 @@ class DiagramWatch:
     """`DivergenceWatch` of each `Plant` in a diagram while it runs.
 
     The errors of a `Controller` are checked if there is exactly one plant.
-
-    Args:
-        diagram: The diagram.
-        context: Its context at the start of the run.
-        duration: The duration of the run, in s.
     """
 
     def __init__(self, diagram: System, context: Context, duration: float) -> None:
@@ -202,19 +185,7 @@ class DiagramWatch:
         is_last: bool = False,
         states_only: bool = False,
     ) -> None:
-        """Checks an accepted step; of consecutive steps only every 32nd is checked.
-
-        Args:
-            context: The context of the diagram.
-            steps: The number of steps since the last call.
-            always: Whether this step is checked in any case.
-            is_last: Whether it is the last one.
-            states_only: Whether to leave the outputs out, which may have no values after the
-                failure of a run.
-
-        Raises:
-            SimulationError: The run diverges.
-        """
+        """Checks an accepted step; of consecutive steps only every 32nd is checked."""
         self._steps += steps
         if self._steps < EVERY and not (always or is_last or states_only):
             return

@@ -22,11 +22,6 @@ def ending_signals(
 
     Python allows this in the main thread only; in other threads nothing changes. A SIGHUP that is
     ignored, as under nohup, stays so.
-
-    Args:
-        handle: The function, called between two instructions of Python. It is not called in
-            callbacks from CasADi, which loses exceptions.
-        in_callbacks: Whether it is called in callbacks as well, since it raises no exception.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

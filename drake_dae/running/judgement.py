@@ -139,18 +139,6 @@ def judge(
     Without phases, each output must be within its tolerance from the first half of the run on, or
     from the time at which the predicted error is. If the predicted error exceeds the tolerance even
     at the end, and the run follows it, the run is undecided. With phases, the last one must end.
-
-    Args:
-        record: A record with state, desired_output, tracking_error, constraint_force and control.
-        predicted: The tracking error by theory, shape (k, p).
-        ranges: The signals with limits, along the record.
-        tolerances: Output name -> tolerated |z - r|. For the others it is 1 % of the range of the
-            references in their unit, or of their largest value where they do not move.
-        changes: The starts of phases of a task.
-        ended: Why the run ended early; empty if it is complete.
-        accuracy: The accuracy of error control; None with fixed steps.
-        reasons: Why errors may be off the prediction, such as "the law is sampled".
-        more: Further findings.
     """
     outputs, found = qualities(record, predicted, tolerances or {}), list[RunFinding]()
     if ended:

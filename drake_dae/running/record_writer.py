@@ -13,8 +13,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief
-from drake_dae.diagrams.record import Record
-from drake_dae.diagrams.versions import versions
+from drake_dae.diagrams.record import Record, versions
 from drake_dae.errors import ModelError
 from drake_dae.trace.expressions import result_of
 
@@ -32,23 +31,16 @@ class RecordWriter:
         with RecordWriter("run.part", loop.record) as writer:
             simulate(loop.diagram, context, 10.0, config, look=writer.update)
 
-    `Record.load` reads the file up to the last append, however the process ends. The file consists
-    of a line of JSON with names and units, and rows of numbers (little-endian float64): the time in
-    s and the signals in the order of that line. A truncated last row is ignored. Events of contacts
-    are not included; the closed contacts are a signal.
-
-    The file is created with the first append and never replaces another file. If an append fails,
-    for example on a full disk, a warning is printed once, and the next append is tried later; the
-    run continues.
+    `Record.load` reads the file up to the last append, however the process ends: a line of JSON
+    with names and units, and rows of little-endian float64, the time in s and the signals. It never
+    replaces another file. If an append fails, as on a full disk, a warning is printed once, and the
+    next one is tried later; the run continues.
 
     Args:
         path: The file.
         record: A function of a context and a time in s (or None) that returns the record after this
             time, such as `ClosedLoop.record`.
         about: The data to repeat the run, as in `Record`.
-
-    Attributes:
-        path, about: The arguments.
     """
 
     def __init__(
@@ -75,10 +67,9 @@ class RecordWriter:
             self._file = None
 
     def update(self, context: Context) -> None:
-        """Appends the new part of the record, if an update is due.
+        """Appends the new part of the record, if an update is due, but for its last row.
 
-        The last row is not written yet: at the end of a run it is replaced by the row after the
-        projection.
+        At the end of a run that is replaced by the row after the projection.
 
         Warns:
             UserWarning: The file cannot be written to; once.
@@ -126,7 +117,11 @@ class RecordWriter:
         if self._file is None:
             self._file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         if self._end == 0:
-            data = _head(record, self.about) + data
+            signals = {n: [[s.name, s.unit] for s in r.signals] for n, r in record.signals.items()}
+            rows = "little-endian float64: time in s, then the signals in this order"
+            about = {"versions": versions(), **self.about}
+            head = {"about": about, "rows": rows, "signals": signals}
+            data = json.dumps(head).encode() + b"\n" + data
         # At a fixed place: the remains of a failed append are overwritten.
         done = 0
         while done < len(data):
@@ -134,15 +129,3 @@ class RecordWriter:
         os.fsync(self._file)
         self._end += done
         self._time = float(record.time[stop - 1])
-
-
-def _head(record: Record, about: Mapping[str, Any]) -> bytes:
-    layout = {
-        "about": {"versions": versions(), **about},
-        "rows": "little-endian float64: time in s, then the signals in this order",
-        "signals": {
-            name: [[signal.name, signal.unit] for signal in recorded.signals]
-            for name, recorded in record.signals.items()
-        },
-    }
-    return json.dumps(layout).encode() + b"\n"

@@ -5,7 +5,6 @@ import signal
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from math import isfinite
 from typing import Self
 
 import numpy as np
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import (
     ApplySimulatorConfig,
     GetIntegrationSchemes,
@@ -39,12 +37,6 @@ BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 
 PATIENCE = 1.0
 """The time in s after a signal at which a step is ended in its middle."""
-
-MANY_STEPS = 1e7
-"""A number of steps that takes over an hour, and gigabytes of memory for the log."""
-
-TYPICAL_STEP = 5e-4
-"""The time of a step of a robot with seven joints, in s: five evaluations of its closed loop."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +98,6 @@ def simulate(
         look: A function that is called with the context after some steps, at least after every
             32nd, such as `RecordWriter.update`.
 
-    Warns:
-        UserWarning: The largest step allowed is so small that the run takes hours.
-
     Raises:
         ModelError: The duration or the settings are not valid.
         InconsistentStateError: The start state is not on the manifold.
@@ -119,7 +108,6 @@ def simulate(
     check_duration(duration)
     check_config(config)
     _check_times(config.start_time, duration)
-    _warn_of_many_steps(duration, _longest_step(diagram, config.max_step_size))
     simulator = Simulator(diagram, context)
     ApplySimulatorConfig(config, simulator)
     _clear_later(diagram, context, config.start_time)
@@ -221,41 +209,8 @@ def _clear_later(system: System, context: Context, start: float) -> None:
             log.Clear()
 
 
-def _longest_step(system: System, max_step_size: float) -> tuple[str, float]:
-    """What limits the length of a step, in words, and the longest step in s."""
-    least = "max_step_size", max_step_size
-    if isinstance(system, Diagram):
-        for part in system.GetSystems():
-            least = min(least, _longest_step(part, least[1]), key=lambda pair: pair[1])
-        return least
-    if isinstance(system, MultibodyPlant):
-        what, period = "the plant's time step", system.time_step()
-    else:
-        what, period = "the sample period", getattr(system, "sample_period", None) or 0.0
-    if 0.0 < period < max_step_size:
-        return f"{what} of '{system.get_name()}',", period
-    return least
-
-
-def _warn_of_many_steps(duration: float, longest: tuple[str, float]) -> None:
-    what, step = longest
-    least = duration / step
-    if least > MANY_STEPS:
-        hours = least * TYPICAL_STEP / 3600.0
-        warnings.warn(
-            f"{what} {step:g} s takes at least {least:.2g} steps for {duration:g} "
-            f"s, about {hours:.2g} hours if a step takes {1e3 * TYPICAL_STEP:g} ms, and each is "
-            "kept in memory; Ctrl-C ends the run and keeps its record",
-            stacklevel=3,
-        )
-
-
 def check_duration(duration: float) -> None:
-    """Checks that a duration is positive.
-
-    Raises:
-        ModelError: The duration is not positive.
-    """
+    """Checks that a duration is positive."""
     if not (isfinite(duration) and duration > 0.0):
         raise ModelError(f"a duration must be positive, got {duration} s")
 
@@ -282,11 +237,7 @@ def _has_error_control(scheme: str) -> bool:
 
 
 def check_config(config: SimulatorConfig) -> None:
-    """Checks for settings that Drake accepts but that hang, fail late, or are ignored.
-
-    Raises:
-        ModelError: A setting is not valid; the message names it and valid ones.
-    """
+    """Checks for settings that Drake accepts but that hang, fail late, or are ignored."""
     scheme = config.integration_scheme
     schemes = _schemes()
     if scheme not in schemes:

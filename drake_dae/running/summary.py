@@ -229,10 +229,6 @@ def figures_of(record: Record, ranges: Sequence[SignalRange]) -> dict[str, float
     value. For each control: the largest |u|. Then the "margin" of each limited signal, its least
     distance from its limits, which is negative beyond them; the largest constraint residual before
     a projection, and the time at which the record ends. An empty record has none.
-
-    Args:
-        record: The record of a closed loop.
-        ranges: Its signals with limits, along the record.
     """
     if not record.time.size:
         return {}

@@ -1,19 +1,34 @@
 """A scenario as a closed loop."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import casadi as ca
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, DiagramBuilder
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive, unknown_name
-from drake_dae.dae import Structure, TrackingLaw, find_structure, outputs_named, with_disturbance
+from drake_dae.blocks.block import NOTHING, Block
+from drake_dae.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.blocks.traced_system import TracedSystem
+from drake_dae.dae import (
+    ConstraintStructure,
+    Structure,
+    TrackingLaw,
+    find_constraint_structure,
+    find_structure,
+    outputs_named,
+    with_disturbance,
+)
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.drives import hold_before
+from drake_dae.diagrams.parts import add_block
+from drake_dae.diagrams.recorded import further_signals, log_signals, signals_of_plant
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.diagrams.state_feedback import make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
@@ -23,15 +38,23 @@ from drake_dae.robots import Links, RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
 from drake_dae.scenario.gains import advised, latency_of
-from drake_dae.scenario.model import completed_model, scenario_structure
-from drake_dae.scenario.motion import exogenous_references, references_of
+from drake_dae.scenario.model import (
+    completed_model,
+    exogenous_references,
+    references_of,
+    scenario_structure,
+)
 from drake_dae.scenario.parts import Poles
+from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.start import start_scenario
-from drake_dae.scenario.task_controller import check_task, task_controller
+from drake_dae.scenario.start import opening_contact, start_scenario
+from drake_dae.scene.view import add_live_view
+from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.task.contacts import open_contact
+from drake_dae.systems.task.controller import TaskController
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -56,19 +79,15 @@ def build_completed(
 ) -> tuple[Completed, ClosedLoop]:
     """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly.
 
-    Args:
-        scenario, meshcat: As for `build_scenario`.
-        commanded: Whether a person changes references during the run; signals for which a task
-            waits are then inputs of the diagram.
-
-    Returns:
-        The scenario with outputs, start and gains, the choices in words, and the loop.
+    `commanded` is whether a person changes references during the run; signals for which a task
+    waits are then inputs of the diagram.
     """
     # The robot, with the outputs and the start that the scenario leaves out.
-    if scenario.task is not None:
-        check_task(scenario)
+    check_task(scenario)
     scene_graph = SceneGraph()
     completed, model, structure = completed_model(scenario, scene_graph)
+    if not model.dae.num_controls:
+        return completed, _mechanism(completed.scenario, model, scene_graph, meshcat)
     if structure is None:
         try:
             structure = scenario_structure(model)
@@ -81,14 +100,26 @@ def build_completed(
     chosen = advised(completed.scenario, model, structure)
     scenario, task = chosen.scenario, chosen.scenario.task
 
-    # The plant, which may carry payloads and disturbances that the law does not know.
-    plant, plant_exogenous, scene_graph = _plant(scenario, model, structure, scene_graph)
+    # The plant. In an ideal one a payload is a further body, and the course of a disturbance an
+    # exogenous signal; the law knows neither. Masses and forces are parameters, set at the start.
+    plant_exogenous, has_more = None, scenario.plant.payloads or scenario.plant.disturbances
+    _check_disturbances(scenario.plant.disturbances, model.links)
+    if has_more and not scenario.plant.carries:
+        pushes = {f"plant_disturbance_{i}": d for i, d in enumerate(scenario.plant.disturbances)}
+        forces = [ScaledForce(d.frame, d.point, name, d.force) for name, d in pushes.items()]
+        known = [*scenario.robot.known_forces, *forces]
+        moving: dict[str, Any] = {f"{name}.course": [d.course] for name, d in pushes.items()}
+        robot = replace(scenario.robot, known_forces=known)
+        own = replace(scenario, robot=robot, exogenous={**scenario.exogenous, **moving})
+        scene_graph = SceneGraph()
+        _, of_plant, _ = completed_model(own, scene_graph, scenario.plant.payloads)
+        plant = make_plant(own, of_plant, scenario_structure(of_plant))
+        plant_exogenous = exogenous_references(own, plant.dae, plant.exogenous_layout.degrees)
+    else:
+        plant = make_plant(scenario, model, structure)
 
-    # The law, of a model with a disturbance if there is an estimator of it.
-    law = tracking_law(scenario, model, structure)
-
-    # The controller, and the signals of time that it follows.
-    references, exogenous = [], []
+    # The law, of a model with a disturbance if there is an estimator of it; and what it follows.
+    law, references, exogenous = tracking_law(scenario, model, structure), list[Reference](), []
     if task is None:
         names = [signal.name for signal in law.system.output_signals]
         references = references_of(scenario, names, law.layout.reference_degrees)
@@ -99,11 +130,15 @@ def build_completed(
     force = scenario.sensors.force
     with at("sensors.force"):
         sensor = None if force is None else force.sensor(model.dae.num_constraints)
+    with at("saturation"):
+        limits = model.control_limits if scenario.saturation else None
+        if limits is not None and not np.any(np.isfinite(limits)):
+            raise ModelError("the robot's file has no effort limits, or not of these controls")
     settings = LoopSettings(
         sensor=sensor,
         encoders=scenario.sensors.encoders,
         sampling=scenario.sampling,
-        control_limits=_limits(scenario, model),
+        control_limits=limits,
         observer=scenario.estimator,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
@@ -124,11 +159,11 @@ def build_completed(
             if tolerated is not None:
                 positive(name, tolerated)
 
-    # The loop.
+    # The controller and the loop.
     drawn = {"scene_graph": scene_graph, "meshcat": meshcat}
     if task is not None:
         with at("task"):
-            controller = task_controller(scenario, model, law, period)
+            controller = _task_controller(scenario, model, law, period)
             loop = wire_loop(plant, controller, None, settings, **drawn)
     else:
         keys = ["estimator"] if scenario.estimator is not None else []
@@ -139,18 +174,8 @@ def build_completed(
     return Completed(scenario, (*completed.notes, *chosen.notes)), loop
 
 
-def make_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> Plant:
-    """Makes the plant of a scenario.
-
-    Args:
-        scenario: The scenario.
-        model: The robot, with payloads if the plant does not add them itself.
-        structure: The structure of the model's system.
-
-    Raises:
-        ScenarioError: The robot cannot be simulated so; the message names the key.
-    """
-    check_disturbances(scenario.plant.disturbances, model.links)
+def make_plant(scenario: Scenario, model: RobotModel, structure: ConstraintStructure) -> Plant:
+    """The plant of a scenario, for a robot with payloads if the plant does not add them itself."""
     add = partial(add_robot, scenario.robot, payloads=scenario.plant.payloads)
     try:
         return scenario.plant.plant(model, structure, add)
@@ -158,34 +183,7 @@ def make_plant(scenario: Scenario, model: RobotModel, structure: Structure) -> P
         raise ScenarioError(("start.positions", str(error))) from error
 
 
-def _plant(
-    scenario: Scenario, model: RobotModel, structure: Structure, scene_graph: SceneGraph
-) -> tuple[Plant, list[Reference] | None, SceneGraph]:
-    """The plant, the references of its exogenous signals (None: the law's), and its geometry.
-
-    In an ideal plant a payload is a further body, and the course of a disturbance an exogenous
-    signal. Masses and forces are parameters, which `start_scenario` sets in a context.
-    """
-    payloads, disturbances = scenario.plant.payloads, scenario.plant.disturbances
-    if scenario.plant.carries or not (payloads or disturbances):
-        return make_plant(scenario, model, structure), None, scene_graph
-    check_disturbances(disturbances, model.links)
-    named = {f"plant_disturbance_{index}": entry for index, entry in enumerate(disturbances)}
-    forces = [ScaledForce(d.frame, d.point, name, d.force) for name, d in named.items()]
-    moving: dict[str, Any] = {f"{name}.course": [entry.course] for name, entry in named.items()}
-    own = replace(
-        scenario,
-        robot=replace(scenario.robot, known_forces=[*scenario.robot.known_forces, *forces]),
-        exogenous={**scenario.exogenous, **moving},
-    )
-    scene_graph = SceneGraph()
-    _, model, _ = completed_model(own, scene_graph, payloads)
-    plant = make_plant(own, model, scenario_structure(model))
-    degrees = plant.exogenous_layout.degrees
-    return plant, exogenous_references(own, plant.dae, degrees), scene_graph
-
-
-def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -> None:
+def _check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -> None:
     """Refuses disturbances that do not act on a frame of the robot."""
 
     def check(disturbance: DisturbanceForce) -> None:
@@ -197,9 +195,9 @@ def check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -
 
 
 def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) -> TrackingLaw:
-    """The law of a scenario, after `advised`."""
+    """The law of a scenario, after `advised`; of a system with a disturbance for an estimator."""
     settings, is_measured = scenario.law, scenario.sensors.force is not None
-    damping = settings.constraint_damping
+    damping, estimator = settings.constraint_damping, scenario.estimator
     keys = ["sensors.force", "law.gains"] if is_measured else ["law.gains"]
     keys += [f"law.{key}" for key in ("constraint_damping", "integral") if getattr(settings, key)]
     if settings.contact_stiffness is not None:
@@ -207,7 +205,23 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
         if scenario.task is not None:
             text = "is not for scenarios with `task`; leave it out"
             raise ScenarioError(("law.contact_stiffness", text))
-    structure = _observed(scenario, model, structure)
+    if estimator is not None:
+        if estimator.rate is None:
+            text = "needed, since no gains are computed; leave `law.gains` out with Drake's contact"
+            raise ScenarioError(("estimator.rate", text))
+        with at("estimator"):
+            if scenario.exogenous:
+                raise ModelError("not beside exogenous signals, whose port it feeds")
+            known = [parameter.name for parameter in model.dae.parameters]
+            for name in estimator.identify:
+                if name not in known:
+                    hint = "; give the constraint friction: 0.0 if it is unknown"
+                    text = unknown_name("parameter", name, known)
+                    raise ModelError(f"identify: {text}{hint * name.endswith('.friction')}")
+            velocities = [signal.name for signal in model.links.velocity_signals]
+            with at("estimator.identify"):
+                observed = with_disturbance(model.dae, velocities, estimator.identify)
+            structure = find_structure(observed)
     with at(" or ".join(keys)):
         return TrackingLaw(
             structure.system,
@@ -222,34 +236,97 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
         )
 
 
-def _observed(scenario: Scenario, model: RobotModel, structure: Structure) -> Structure:
-    """The structure of the law's system, with a disturbance if the scenario has an estimator."""
-    estimator = scenario.estimator
-    if estimator is None:
-        return structure
-    if estimator.rate is None:
-        text = "needed, since no gains are computed; leave `law.gains` out with Drake's contact"
-        raise ScenarioError(("estimator.rate", text))
-    with at("estimator"):
-        if scenario.exogenous:
-            raise ModelError("not beside exogenous signals, whose port it feeds")
-        known = [parameter.name for parameter in model.dae.parameters]
-        for name in estimator.identify:
-            if name not in known:
-                hint = "; give the constraint friction: 0.0 if it is unknown"
-                text = unknown_name("parameter", name, known)
-                raise ModelError(f"identify: {text}{hint * name.endswith('.friction')}")
-        velocities = [signal.name for signal in model.links.velocity_signals]
-        with at("estimator.identify"):
-            observed = with_disturbance(model.dae, velocities, estimator.identify)
-        return find_structure(observed)
+def check_task(scenario: Scenario) -> None:
+    """Checks that the keys of a scenario fit its task, if it has one."""
+    if (task := scenario.task) is None:
+        return
+    problems = []
+    if scenario.references:
+        problems.append(("references", "a task has the references of its phases; leave them out"))
+    names = [name for name in task.make().watched("signal") if name not in task.signals]
+    problems += [(f"task.signals.{name}", "needed: a phase watches it") for name in names]
+    if isinstance(scenario.plant, IdealConstraints):
+        text = (
+            "ideal constraints neither open nor strike, as a task needs it: take !CompliantContact "
+            "or !MultibodyPlant"
+        )
+        problems.append(("plant", text))
+    if scenario.start.errors:
+        problems.append(("start.errors", "a task begins at start.positions; leave them out"))
+    if problems:
+        raise ScenarioError(*problems)
 
 
-@at("saturation")
-def _limits(scenario: Scenario, model: RobotModel) -> FloatArray | None:
-    """The limits of the controls, if the scenario has saturation."""
-    if not scenario.saturation:
-        return None
-    if not np.any(np.isfinite(model.control_limits)):
-        raise ModelError("the robot's file has no effort limits, or they are not on the control")
-    return model.control_limits
+def _task_controller(
+    scenario: Scenario, model: RobotModel, law: TrackingLaw, period: float
+) -> TaskController:
+    """The controller of a task: the law in contact, and one with the contact open."""
+    task = scenario.task
+    assert task is not None
+    assert scenario.law.gains is not None  # advised.
+    noise = float(np.max(scenario.sensors.force_noise))
+    points = opening_contact(scenario, model)
+    forces = [signal.name for point in points for signal in point.force_signals]
+    free_system = open_contact(law.system, forces)
+    with at("task.gains" if task.gains else "law.gains"):
+        structure = find_structure(free_system)
+        gains = (task.gains or scenario.law.gains).design()
+        free_law = TrackingLaw(free_system, gains, structure=structure, latency=law.latency)
+    # The noise of the sum over the points.
+    made = task.make(noise * len(points) ** 0.5)
+    return TaskController(made, law, free_law, sample_period=period or 1e-3)
+
+
+class _NoController(TracedSystem, Controller):
+    """Steers nothing: the place of a controller in the loop of a mechanism without drive."""
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self, structure: ConstraintStructure) -> None:
+        self._structure = structure
+        # Of a law, records ask for its system.
+        self.law = cast(TrackingLaw, SimpleNamespace(system=structure.system, structure=None))
+        x = ca.SX.sym("x", structure.system.num_states)
+        ports = {"estimated_state": x}, {"control": NOTHING}
+        super().__init__(Block("no_controller", *ports))
+
+    @property
+    def start_structure(self) -> ConstraintStructure:
+        return self._structure
+
+    def check_plant(self, plant: Plant) -> None:
+        pass
+
+    def derived(
+        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
+    ) -> Derived:
+        none = np.zeros((*values["state"].shape[:-1], 0))
+        return {name: (none, ()) for name in ("desired_output", "tracking_error")}
+
+    def predicted_error(
+        self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
+    ) -> FloatArray:
+        return np.zeros((times.size, 0))
+
+
+def _mechanism(
+    scenario: Scenario, model: RobotModel, scene_graph: SceneGraph, meshcat: Meshcat | None
+) -> ClosedLoop:
+    """The loop of a mechanism that nothing drives."""
+    for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
+        if getattr(scenario, key):
+            raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
+    structure = find_constraint_structure(model.dae)
+    plant, controller = make_plant(scenario, model, structure), _NoController(structure)
+    builder = DiagramBuilder()
+    for block in (plant, controller):
+        add_block(builder, block)
+    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
+    control = controller.GetOutputPort("control")
+    builder.Connect(control, plant.GetInputPort("control"))
+    named = signals_of_plant(plant, None, None, None, control) | further_signals(plant)
+    log = log_signals(builder, plant, controller, named)
+    if meshcat is not None:
+        add_live_view(builder, plant, scene_graph, meshcat, None)
+    diagram, signals = builder.Build(), {name: tuple(of) for name, (_, of) in named.items()}
+    return ClosedLoop(diagram, plant, controller, None, log, signals, scene_graph)

@@ -64,15 +64,6 @@ def completions(
     For the rule see `complete_scenario`. Starts and sets of joints are compared by the least
     `Postures.quality` along the reference; it is zero where a joint leaves its limits of position
     or speed.
-
-    Args:
-        scenario: The scenario.
-        links: Its robot.
-        constraints: Its constraints; those in the robot's file are appended.
-        guess: The default configuration with start.positions, shape (nq,).
-
-    Raises:
-        ScenarioError: The robot cannot reach the start, or no choice of outputs is independent.
     """
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
     outputs = [make(form, constraints) for form in scenario.outputs]

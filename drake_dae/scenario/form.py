@@ -216,14 +216,7 @@ _WORDS = {
 
 
 class Reader(Generic[T]):
-    """Makes a dataclass of plain data, and plain data of it.
-
-    Args:
-        form: The dataclass.
-        families: Type in annotations -> the family that stands for it in data.
-        values: Type in annotations -> the pydantic type of its data.
-        keys: The keys of classes that are no dataclasses, or differ from them in data.
-    """
+    """Makes a dataclass of plain data, and plain data of it."""
 
     def __init__(
         self,
@@ -258,10 +251,6 @@ class Reader(Generic[T]):
         """Makes the dataclass of plain data; names of files are relative to a folder.
 
         `place_of` says where a key stands, for the messages.
-
-        Raises:
-            ScenarioError: Keys are unknown or missing, or values are wrong; all problems are
-                listed.
         """
         try:
             return self._adapter.validate_python(data, context=folder)
@@ -287,11 +276,7 @@ class Reader(Generic[T]):
         return str(value) if isinstance(value, Path) else value
 
     def put(self, data: Any, key: str, value: Any) -> None:
-        """Sets an entry of plain data at a dotted key, in place; chosen names may have dots too.
-
-        Raises:
-            ScenarioError: There is no such entry.
-        """
+        """Sets an entry of plain data at a dotted key, in place; chosen names may have dots too."""
         parts, path, hint = key.split("."), "", self._form
         if not all(parts):
             raise ScenarioError((brief(key), "expected a dotted key, for example start.errors"))

@@ -12,8 +12,8 @@ from drake_dae.analysis.contact_gains import DAMPING, DECAY, FORCE, ContactGains
 from drake_dae.analysis.sampled_loop import EVERY
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Structure
-from drake_dae.dae.tracking.deflection import Deflection
-from drake_dae.dae.tracking.model_of_law import damping_gains
+from drake_dae.dae.law_model import damping_gains
+from drake_dae.dae.law_terms import Deflection
 from drake_dae.diagrams.settings import LoopSettings
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.references import Reference, SinusoidReference
@@ -21,10 +21,10 @@ from drake_dae.robots import RobotModel
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at
-from drake_dae.scenario.motion import reference_and_start, references_of
+from drake_dae.scenario.model import reference_and_start, references_of
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.task_controller import opening_contact
+from drake_dae.scenario.start import opening_contact
 from drake_dae.systems.plants.contact.contact_material import PointMaterial
 from drake_dae.systems.task.automaton import SMOOTH, fading
 from drake_dae.systems.task.phases import Approach, Press
@@ -99,7 +99,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     frictional = [c.friction_parameter for c in model.constraints if c.friction_parameter]
     identify = list(dict.fromkeys([*frictional, *estimator.identify]))
     references, guess, stated = _motion(scenario, model, structure, stiffness)
-    begin = scenario.integrator.start_time
+    begin, given = scenario.integrator.start_time, law.constraint_damping
     with at("law.gains"):
         best = contact_gains(
             model,
@@ -123,7 +123,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             structure=structure,
             identify=identify,
             integral=integral,
-            constraint_damping=law.constraint_damping and law.constraint_damping.design(),
+            constraint_damping=None if given is None else given.design(),
             contact_stiffness=stated,
             latency=latency_of(scenario, model),
             roughness=law.largest_roughness,
@@ -136,12 +136,15 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     }
     damping = law.constraint_damping or parts.Poles(all=[-_rounded(best.constraint_damping)])
     if estimator.rate is None:
-        rates = {
-            name: None if value is None else _rounded(value)
-            for name, value in vars(best.observing).items()
-            if name in ("rate", "force_rate", "friction_rate", "state_rate")
-        }
-        estimator = replace(estimator, **rates, identify=identify)
+        own, fast = best.observing, best.observing.state_rate
+        estimator = replace(
+            estimator,
+            rate=_rounded(own.rate),
+            force_rate=_rounded(own.force_rate or own.rate),
+            friction_rate=_rounded(own.friction_rate),
+            identify=identify,
+            state_rate=None if fast is None else _rounded(fast),
+        )
     task, touch_note = scenario.task, ""
     if task is not None and task.gains is None:
         task = replace(task, gains=_free_gains(scenario, model, best))

@@ -28,18 +28,23 @@ from drake_dae.diagrams.record import Record
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
-from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind
+from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind, own_values
 from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
-from drake_dae.scenario.build import tracking_law
+from drake_dae.scenario.build import check_task, tracking_law
 from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
-from drake_dae.scenario.model import completed_model, examine_scenario, scenario_structure
-from drake_dae.scenario.motion import exogenous_references, reference_and_start, references_of
+from drake_dae.scenario.model import (
+    completed_model,
+    examine_scenario,
+    exogenous_references,
+    reference_and_start,
+    references_of,
+    scenario_structure,
+)
 from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.task_controller import check_task
 from drake_dae.systems.control.contract import PhaseChange
 from drake_dae.trace.functions import TracedFunction
 
@@ -175,13 +180,6 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     """Analyzes the robot of a scenario, and what its reference requires of drives and joints.
 
     All numbers are those of the law's model without errors: the minimum requirements.
-
-    Args:
-        scenario: A scenario, as `load_scenario` returns it.
-
-    Raises:
-        ScenarioError: The scenario is not valid; the message names the key. A violated assumption
-            is no error: the analysis reports it.
     """
     return complete_and_examine(scenario, SceneGraph())[1]
 
@@ -189,16 +187,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
 def complete_and_examine(
     scenario: Scenario, scene_graph: SceneGraph, robot: RobotLinks | None = None
 ) -> tuple[Scenario, Feasibility]:
-    """Returns a scenario with what `complete_scenario` adds, and what `find_feasibility` finds.
-
-    Args:
-        scenario: The scenario.
-        scene_graph: The scene graph of the robot's geometry.
-        robot: What `robot_links` made of the robot with this scene graph; None to read it.
-
-    Raises:
-        ScenarioError: As for `find_feasibility`.
-    """
+    """Returns a scenario with what `complete_scenario` adds, and what `find_feasibility` finds."""
     if scenario.task is not None:
         check_task(scenario)
     completed, model, _ = completed_model(scenario, scene_graph, drawn=False, robot=robot)
@@ -268,13 +257,6 @@ def sample_times(
 
     Equidistant times would miss a sinusoid whose period is the interval. Each interval is tested at
     a random time and divided if the reference is not linear there, until no interval is divided.
-
-    Args:
-        reference: The function t -> R(t).
-        begin, end: The first and the last time, in s.
-
-    Returns:
-        From SAMPLES to MOST_SAMPLES increasing times in s, and whether these suffice.
     """
     random = np.random.default_rng(0)
     times = np.linspace(begin, end, SAMPLES)
@@ -308,16 +290,7 @@ def judge_run(
     statistics: RunStatistics | None = None,
     failure: str = "",
 ) -> RunSummary:
-    """Judges a run by its record.
-
-    Args:
-        scenario: The completed scenario.
-        loop: The loop that ran.
-        context: The context of the loop at the end of the run.
-        record: The record of the run, of at least one time.
-        statistics: The statistics of the run; None for a failed run, or one of an earlier time.
-        failure: Why it ended early; empty if it did not.
-    """
+    """Judges a run by its record."""
     model, changes = loop.plant.robot("a scenario"), loop.changes(record)
     limits = robot_limits(model, scenario.judgement.friction_cones)
     own, stop = loop.plant_parameters(record, context), record.time.size
@@ -331,7 +304,12 @@ def judge_run(
         behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
     is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
     remedies = _slower(loop, model, limits, record) if is_paced else []
-    notes = [constraint.remark for constraint in model.constraints]
+    notes = []
+    for constraint in model.constraints:
+        values = own_values(constraint, model.dae, model.dae.parameter_values)
+        surface = constraint.surface_at(values)
+        if surface is not None and surface.remark:
+            notes.append(f"{constraint.name}: {surface.remark}")
     notes += [_beyond_edge(constraint, model, record) for constraint in model.constraints]
     notes += _remarks([scenario.references, scenario.exogenous, scenario.task])
     notes += _early_touches(changes)
@@ -374,8 +352,9 @@ def _slower(loop: ClosedLoop, model: RobotModel, limits: SignalLimits, record: R
 
 def _beyond_edge(constraint: Constraint, model: RobotModel, record: Record) -> str:
     """When a point is beyond the edge of its surface's data first; "" if it is not."""
-    extent, dae = constraint.extent, model.dae
-    if extent is None:
+    dae = model.dae
+    surface = constraint.surface_at(own_values(constraint, dae, dae.parameter_values))
+    if surface is None or (extent := surface.extent) is None:
         return ""
     coordinates = constraint.coordinates(model.links)
     if any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):

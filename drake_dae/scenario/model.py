@@ -1,7 +1,7 @@
-"""The robot model of a scenario, completed."""
+"""The robot model of a scenario, completed, and what its references demand of it."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,17 +10,22 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.tree import BodyIndex
 
 from drake_dae.analysis.analyze import examine
+from drake_dae.analysis.limits import robot_limits
 from drake_dae.analysis.report import Analysis
 from drake_dae.arguments import checked
-from drake_dae.arrays import unknown_name
-from drake_dae.dae import Structure, find_structure
+from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.dae import DaeSystem, PinnedMotion, Structure, ZeroDynamics, find_structure
 from drake_dae.errors import (
     AssumptionError,
+    DrakeDaeError,
     GeometryWarning,
     InconsistentStateError,
     ModelError,
     ScenarioError,
 )
+from drake_dae.references import ConstantReference, Reference
+from drake_dae.references.by_name import assign, in_order
+from drake_dae.references.reference import stack_references
 from drake_dae.robots import (
     Constraint,
     ConstraintSet,
@@ -32,34 +37,35 @@ from drake_dae.robots import (
     chain,
     control_choice,
     force_rows,
+    links_behind,
     plant_constraints,
 )
 from drake_dae.scenario.completion import Completed, completions
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.motion import in_the_way
 from drake_dae.scenario.parts import make
 from drake_dae.scenario.robot_file.reading import RobotLinks, robot_links
 from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.start import start_guess
+from drake_dae.scenario.start import start_guess, start_state
 
 NOTHING_FOUND = "no start was found"
 """How the note begins if no outputs and start are good along the references."""
+
+_TIMES = 201
+"""The number of times at which a completed scenario is examined."""
+
+_NEARLY_SINGULAR = 0.1
+"""B(x) is nearly singular where its smallest singular value is this part of the usual one."""
+
+_SLACK = 1e-6
+"""The excess over a limit that counts, in its unit."""
 
 _LARGE = 30.0
 """The ratio of the size of a surface to that of the robot above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
-    """The robot model of a scenario: constraints, outputs and actuation.
-
-    Args:
-        scenario: What `load_scenario` returns.
-        scene_graph: The scene graph of the robot's geometry; needed to draw it.
-
-    Raises:
-        ScenarioError: Something does not fit; the message names its key.
-    """
+    """The robot model of a scenario: constraints, outputs and actuation."""
     return completed_model(scenario, scene_graph)[1]
 
 
@@ -105,18 +111,7 @@ def completed_model(
     drawn: bool = True,
     robot: RobotLinks | None = None,
 ) -> tuple[Completed, RobotModel, Structure | None]:
-    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads.
-
-    Args:
-        scenario: What `load_scenario` returns.
-        scene_graph: The scene graph of the robot's geometry, or None.
-        payloads: The payloads.
-        drawn: Whether the scene graph, if there is one, will be drawn.
-        robot: What `robot_links` made of the other arguments; None to read the robot.
-
-    Returns:
-        The completed scenario, its robot, and the structure if it was examined already.
-    """
+    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads."""
     if robot is None:
         drawn = drawn and scene_graph is not None
         robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)
@@ -169,7 +164,7 @@ def _checked_constraints(
     constraints += loops
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
     actuators = (*links.actuator_signals, *bound.motors)
-    if not actuators:
+    if not actuators and scenario.robot.actuators != []:
         text = (
             f"no joint of '{Path(scenario.robot.file).name or name}' is driven; write all, or a "
             "list of joints. Without this key those are driven to which the file gives an "
@@ -216,7 +211,7 @@ def _model(
             start_guess(scenario, links),
             scenario.robot.title,
             scenario.actuation,
-            scenario.forces,
+            [] if scenario.robot.actuators == [] else scenario.forces,
             tuple(scenario.exogenous),
             scenario.robot.known_forces,
             scenario.compliances,
@@ -231,41 +226,28 @@ def _model(
 
 
 def scenario_structure(model: RobotModel) -> Structure:
-    """The structure of a scenario's robot.
-
-    Raises:
-        AssumptionError: The robot violates an assumption of the theory.
-        ScenarioError: The robot's start is not near its constraints.
-    """
-    _check_outputs(model)
-    with _near_constraints():
+    """The structure of a scenario's robot."""
+    with _examining(model):
         return find_structure(model.dae)
 
 
 def examine_scenario(model: RobotModel) -> Analysis:
-    """What `analyze` finds of a scenario's robot, without its motion.
-
-    Raises:
-        ScenarioError: The robot's start is not near its constraints.
-    """
-    _check_outputs(model)
-    with _near_constraints():
+    """What `analyze` finds of a scenario's robot, without its motion."""
+    with _examining(model):
         return examine(model.dae)
 
 
-def _check_outputs(model: RobotModel) -> None:
-    if model.dae.num_outputs == 0:
-        actuators = model.dae.num_controls
+@contextmanager
+def _examining(model: RobotModel) -> Iterator[None]:
+    """Refuses a robot that nothing is to control, and names the keys of a start off constraints."""
+    if not model.dae.num_controls:
+        raise ScenarioError(("robot.actuators", "nothing is driven, and a law has nothing to do"))
+    if not model.dae.num_outputs:
         text = (
             "there are none, and they cannot be completed without references or force outputs: "
-            f"name {actuators}, one for each actuator, or give references of some of them"
+            f"name {model.dae.num_controls}, one for each actuator, or give references of some"
         )
         raise ScenarioError(("outputs", text))
-
-
-@contextmanager
-def _near_constraints() -> Iterator[None]:
-    """Names the keys of a start that is not near the constraints."""
     try:
         yield
     except InconsistentStateError as error:
@@ -298,3 +280,97 @@ def _outputs(
     outputs = each("outputs", scenario.outputs, lambda form: make(form, constraints))
     each("outputs", outputs, lambda output: output.expression(links))
     return outputs
+
+
+def references_of(
+    scenario: Scenario, outputs: Sequence[str], degrees: Sequence[int]
+) -> list[Reference]:
+    """The references in the order of the outputs, each smooth enough for its degree."""
+    smooth = []
+    for name, reference in scenario.references.items():
+        with at(f"references.{name}"):
+            smooth.append(assign(name, reference, outputs, degrees))
+    with at("references"):
+        return in_order(smooth, outputs)
+
+
+def exogenous_references(
+    scenario: Scenario, system: DaeSystem, needed: Sequence[int] | None = None
+) -> list[Reference]:
+    """The references of the exogenous parameters, in the order of the system."""
+    moving: list[Reference] = []
+    degrees = list(needed or ())
+    for parameter in system.exogenous.moving:
+        key = f"exogenous.{parameter.name}"
+        entries = scenario.exogenous[parameter.name]
+        references = [e if isinstance(e, Reference) else ConstantReference(e) for e in entries]
+        size = sum(reference.size for reference in references)
+        if size != parameter.value.size:
+            text = f"{size} values, but the parameter has {parameter.value.size}"
+            raise ScenarioError((key, text))
+        for index, reference in enumerate(references if needed is not None else ()):
+            with at(f"{key}.{index}"):
+                reference.derivatives(degrees[: reference.size])
+            del degrees[: reference.size]
+        moving += references
+    return moving
+
+
+def reference_and_start(
+    scenario: Scenario, model: RobotModel, structure: Structure
+) -> tuple[Callable[[float], FloatArray], FloatArray]:
+    """R(t) of the law's model, and a state where the motion along it begins."""
+    names = [signal.name for signal in model.dae.output_signals]
+    degrees = structure.layout.reference_degrees
+    stacked = stack_references(references_of(scenario, names, degrees), degrees)
+
+    def reference(time: float) -> FloatArray:
+        return stacked(time).copy()
+
+    outputs = reference(scenario.integrator.start_time)[structure.layout.lowest]
+    parameters = model.dae.parameter_values
+    with at("start"):
+        return reference, start_state(scenario, model, outputs, parameters, parameters)
+
+
+def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> str:
+    """What is in the way of a scenario along its references, as a sentence; empty if nothing is.
+
+    It is decided as a run is: by the inverse dynamics of the law's model, and the limits of joints,
+    drives, contacts and links in front of surfaces.
+    """
+    try:
+        reference, start = reference_and_start(scenario, model, structure)
+        begin, end = scenario.integrator.start_time, scenario.duration
+        times = begin + np.linspace(0.0, end, _TIMES)
+        exogenous = exogenous_references(scenario, model.dae)
+        motion = ZeroDynamics(model.dae, structure=structure).motion(
+            reference, times, start, exogenous=exogenous
+        )
+    except DrakeDaeError as error:
+        return str(error)
+    if motion.ending is not None:
+        return str(motion.ending)
+    limits = robot_limits(model, scenario.judgement.friction_cones)
+    for one in limits.ranges(motion.times, limits.of_motion(motion)):
+        # A start may be on the limit of a joint.
+        if one.excess and abs(one.excess.value - one.excess.limit) > _SLACK:
+            return f"{one.excess}{_singularity(model, motion)}"
+    behind = links_behind(model, motion.times, motion.states, motion.parameters)
+    return "; ".join(map(str, behind))
+
+
+def _singularity(model: RobotModel, motion: PinnedMotion) -> str:
+    """A phrase on the time at which B(x) is nearly singular, and the joints that are fast there."""
+    margins = motion.control_margins
+    row = int(np.argmin(margins))
+    if margins[row] > _NEARLY_SINGULAR * np.median(margins):
+        return ""
+    nq, nv = model.links.q.numel(), model.links.v.numel()
+    speeds = np.abs(motion.states[row, nq : nq + nv])
+    first, second = np.sort(np.argsort(-speeds, kind="stable")[:2])
+    names = [signal.name for signal in model.links.position_signals]
+    return (
+        f"; the robot is nearly singular at {motion.times[row]:.4g} s, where {names[first]} and "
+        f"{names[second]} turn fast and the tool hardly moves, as by a straight wrist"
+    )

@@ -22,7 +22,7 @@ from drake_dae.robots import (
     WeldedFrames,
 )
 from drake_dae.scenario.robot_file.robot import Pose
-from drake_dae.systems.observing.observer_rates import Observing
+from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.sensing.encoders import Encoders
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.task.phases import Phase
@@ -160,7 +160,7 @@ class Sensors:
 
 @dataclass(frozen=True)
 class Estimator(Observing):
-    """The settings of a `DisturbanceObserver` or `StateEstimator` of model errors.
+    """The settings of a `StateEstimator` of model errors.
 
     Attributes:
         rate: k_o in 1/s, the rate of disturbances along the free directions; it is computed with

@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
 from drake_dae.arrays import brief
-from drake_dae.dae import Structure
+from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import RobotModel
 from drake_dae.scenario.form import at
@@ -66,26 +66,18 @@ class ScenarioPlant(ABC):
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
-        """Sets the numbers of `in_context` in a context of the plant.
-
-        Raises:
-            ModelError: They do not fit the plant.
-        """
+        """Sets the numbers of `in_context` in a context of the plant."""
 
     @abstractmethod
-    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
-        """Makes the plant of a robot, with the structure of its system.
-
-        Raises:
-            ScenarioError: The robot cannot be simulated so; the message names the key.
-        """
+    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+        """Makes the plant of a robot, with the structure of its system."""
 
 
 @dataclass(frozen=True)
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
 
-    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
         return RobotPlant(model, structure=structure)
 
 
@@ -112,11 +104,11 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
         names = [f.name for f in (*fields(PointMaterial), *fields(ScenarioPlant))]
         return CompliantContact(**{name: getattr(self, name) for name in names})
 
-    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
         with at("plant or plant.parameters"):
             return ContactPlant(
                 model,
-                add_robot,
+                add,
                 self,
                 structure=structure,
                 parameters=self.parameters,
@@ -145,7 +137,7 @@ class CompliantContact(PointMaterial, ScenarioPlant):
     def begin(self, plant: Plant, context: Context) -> None:
         cast(CompliantPlant, plant).set_contact(context, self)
 
-    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
         with at("plant or plant.parameters"):  # Whose numbers are set in a context.
             return CompliantPlant(model, self, structure=structure)
 
@@ -160,10 +152,6 @@ class OwnPlant(ScenarioPlant):
 
     Attributes:
         maker: The module and the class in it, as "my_plants:SpringyPlant".
-
-    Raises:
-        ModelError: The text is not a module and class; or, when the plant is made, there is no such
-            class.
     """
 
     maker: str
@@ -177,7 +165,7 @@ class OwnPlant(ScenarioPlant):
                 f"'{brief(self.maker)}'"
             )
 
-    def plant(self, model: RobotModel, structure: Structure, add_robot: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
         module, _, name = self.maker.partition(":")
         with at("plant.maker"):
             try:

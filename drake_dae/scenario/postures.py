@@ -104,14 +104,6 @@ class Posture:
 class Postures:
     """The configurations of a robot with constraints.
 
-    Args:
-        links, bound: The robot and its constraints.
-        rows: h(q), shape (c, 1).
-        forces: S of the force outputs, shape (s, m).
-        touches: The contacts with a free side, with the outward axis of the tool in the world,
-            shape (3, 1).
-        values: Parameter name -> value, for the parameters that differ from their defaults.
-
     Attributes:
         low, high: The limits of q, shape (nq,) each.
         size: The largest distance between its bodies, in m, in its default configuration.
@@ -136,7 +128,7 @@ class Postures:
         slopes = ca.jacobian(equations, links.q)
         self._slopes = TracedFunction("slopes of postures", inputs, {"slopes": slopes})
         self._count = residual.numel()
-        drives = ca.SX(ca.DM(links.actuation_matrix)), LoopState.of(bound, links).motors
+        drives = ca.SX(ca.DM(links.actuation_matrix)), LoopState(bound, links).motors
         outputs = {
             "rows": rows,
             "gradients": ca.mtimes(slopes[self._count :, :], links.velocity_map),
@@ -178,16 +170,7 @@ class Postures:
     def solve(
         self, rows: Sequence[int], wanted: FloatArray, guess: FloatArray
     ) -> FloatArray | None:
-        """A configuration on the constraints in which some rows have given values, near a guess.
-
-        Args:
-            rows: The rows.
-            wanted: Their values.
-            guess: The initial guess of Newton's method, shape (nq,).
-
-        Returns:
-            q, shape (nq,); None if none is found, or it is outside of the limits of joints.
-        """
+        """A configuration on the constraints in which some rows have given values, near a guess."""
         residual, slopes = self._residual(rows, wanted)
 
         def linearize(q: FloatArray) -> NewtonModel | None:

@@ -51,15 +51,7 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
 
 
 def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
-    """The times of the rows of a rollout's record, in s: equidistant, or those of fixed steps.
-
-    Args:
-        scenario: The scenario.
-        time_step: The step of a plant that Drake steps, in s; 0 for any other plant.
-
-    Raises:
-        ModelError: There are too many.
-    """
+    """The times of the rows of a rollout's record, in s: equidistant, or those of fixed steps."""
     config, duration = scenario.integrator, scenario.duration
     start, end = config.start_time, config.start_time + duration
     fixed = time_step or (0.0 if config.use_error_control else config.max_step_size)
@@ -85,20 +77,7 @@ def roll_scenario(
     lasting: float | None = None,
     look: Callable[[RecordAfter], bool] = lambda record: False,
 ) -> Rollout:
-    """Runs a scenario by `rollout`; a diverging run ends, as by `simulate`.
-
-    Args:
-        scenario: The scenario.
-        loop: Its closed loop.
-        context: The start, by `start_scenario`.
-        lasting: The expected total duration of runs of this loop, in s, for the decision whether to
-            compile it; None for a single run, which uses the cache.
-        look: As for `run_loop`.
-
-    Raises:
-        ModelError: The loop cannot be rolled out.
-        InconsistentStateError: The start is not on N*.
-    """
+    """Runs a scenario by `rollout`; a diverging run ends, as by `simulate`."""
     start, parameters = start_values(loop, context)
     sensors, seeds = scenario.sensors, dict[str, int]()
     if sensors.force is not None:

@@ -19,11 +19,7 @@ def shipped_scenarios() -> dict[str, Path]:
 
 
 def find_scenario(name: str) -> Path:
-    """The file of a shipped scenario, or a path as it is.
-
-    Raises:
-        ScenarioError: There is neither such a scenario nor such a file.
-    """
+    """The file of a shipped scenario, or a path as it is."""
     shipped = shipped_scenarios()
     if name in shipped:
         return shipped[name]

@@ -1,6 +1,6 @@
 """The start of the runs of a scenario."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -11,10 +11,9 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Signal, ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots import Links, RobotModel
+from drake_dae.robots import Constraint, Links, RobotModel
 from drake_dae.scenario.form import at
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.scenario.task_controller import opening_contact
 
 _SLACK = 1e-6
 """The allowed excess over a joint limit at the start, rad or m: references may start at the
@@ -26,34 +25,28 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
 
     The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
     references plus the errors, with outputs as in its model, where `plant.parameters` may differ,
-    and on the plant's constraints; a task at start.positions, in contact if its first phase needs
-    it.
-
-    Args:
-        scenario: The scenario of the loop; start, plant.parameters, integrator, the numbers of
-            uncoupled gains, and the seed of the sensor may be others than those it was built with.
-        loop: What `build_completed` made.
-
-    Raises:
-        ScenarioError: There is no such start, or something does not fit; the message names the key.
+    and on the plant's constraints; a task and a mechanism without drive at start.positions. start,
+    plant.parameters, integrator, the numbers of uncoupled gains, and the seed of the sensor may be
+    others than those that the loop was built with.
     """
-    context, plant = loop.diagram.CreateDefaultContext(), loop.plant
+    context, plant, controller = loop.diagram.CreateDefaultContext(), loop.plant, loop.controller
     _set_numbers(scenario, loop, context)
     model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
-    parameters = plant.current_parameters(at_plant)
-    if loop.controller.takes_over:
-        forces = np.zeros(model.dae.num_outputs - len(model.position_signals))
-        with at("start"):
+    parameters, count = plant.current_parameters(at_plant), len(model.position_signals)
+    forces = np.zeros(model.dae.num_outputs - count)
+    with at("start"):
+        if controller.takes_over or not model.dae.num_controls:
             state = _at_rest(scenario, loop, model, forces, parameters)
             plant.set_state(at_plant, state)
-    else:
-        outputs = _outputs_at_start(scenario.start.errors, loop, context.get_time())
-        forces = outputs[len(model.position_signals) :]
-        with at("start"):
-            of_law = _of_law(loop, parameters)
+        else:
+            outputs = _outputs_at_start(scenario, loop, context.get_time())
+            forces, of_law = outputs[count:], _of_law(loop, parameters)
             state = start_state(scenario, model, outputs, parameters, of_law)
-            moving = _in_motion(loop, context, outputs, state) if scenario.exogenous else state
-            moving, speeds = moving.copy(), model.links.velocity_signals
+    if not controller.takes_over:
+        moving, speeds = state.copy(), model.links.velocity_signals
+        with at("start"):
+            if scenario.exogenous:
+                moving = _in_motion(loop, context, outputs, state).copy()
             for name, value in scenario.start.velocities.items():
                 with at("start.velocities"):
                     moving[model.links.q.numel() + index_of(name, speeds, "velocity")] = value
@@ -135,6 +128,29 @@ def _at_rest(
     return state
 
 
+def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, ...]:
+    """The constraints of the points of the contact of a task."""
+    assert scenario.task is not None
+    fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
+    given = scenario.task.contact
+    names = [given] if isinstance(given, str) and given else list(given)
+    with at("task.contact"):
+        for name in names:
+            if name not in fitting:
+                raise ModelError(
+                    f"'{name}' is not a unilateral constraint with one force; these are "
+                    f"{', '.join(fitting) or 'none'}"
+                )
+        if len(set(names)) < len(names):
+            raise ModelError(f"a point is named twice: {', '.join(names)}")
+        if not names and len(fitting) != 1:
+            raise ModelError(
+                "needed, since the unilateral constraints with one force are "
+                f"{', '.join(fitting) or 'none'}; give one, or a list of points"
+            )
+    return tuple(c for name, c in fitting.items() if not names or name in names)
+
+
 def _check_outside(
     scenario: Scenario, model: RobotModel, state: FloatArray, parameters: FloatArray
 ) -> None:
@@ -180,10 +196,7 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
 def _in_motion(
     loop: ClosedLoop, context: Context, outputs: FloatArray, guess: FloatArray
 ) -> FloatArray:
-    """The state with these outputs, whose rates are those of the references.
-
-    With exogenous motion the robot cannot start at rest.
-    """
+    """The state with these outputs, whose rates are those of the references."""
     law, controller = loop.controller.law, loop.controller
     goal = loop.reference.reference(context.get_time())
     goal[law.layout.lowest] = outputs
@@ -192,13 +205,13 @@ def _in_motion(
 
 
 @at("start.errors")
-def _outputs_at_start(errors: Mapping[str, float], loop: ClosedLoop, time: float) -> FloatArray:
+def _outputs_at_start(scenario: Scenario, loop: ClosedLoop, time: float) -> FloatArray:
     """z at the start: the references plus the errors, shape (p,)."""
-    degrees = loop.controller.law.degrees
-    outputs = loop.controller.law.layout.values(loop.reference.reference(time))
-    for name, error in errors.items():
+    law = loop.controller.law
+    outputs = law.layout.values(loop.reference.reference(time))
+    for name, error in scenario.start.errors.items():
         index = index_of(name, loop.plant.dae.output_signals, "output")
-        if degrees[index] == 0:
+        if law.degrees[index] == 0:
             raise ModelError(
                 f"'{name}' has degree 0: the law meets it at once and it has no start error"
             )
@@ -213,17 +226,9 @@ def start_state(
     parameters: FloatArray,
     of_law: FloatArray,
 ) -> FloatArray:
-    """The state at rest near start.positions, within limits, with given outputs.
+    """The state at rest near start.positions, within limits, with given outputs z, shape (p,).
 
-    Args:
-        scenario: The scenario.
-        model: Its robot.
-        outputs: z, shape (p,), as the law sees them.
-        parameters: Values of all parameters of the plant, for its constraints.
-        of_law: The same as the law assumes them, for the outputs.
-
-    Raises:
-        ModelError: There is none.
+    The constraints have the parameters of the plant, and the outputs those that the law assumes.
     """
     count = len(model.position_signals)
     # By default near the start of the completion.
@@ -265,10 +270,7 @@ def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
 def _unwound(
     model: RobotModel, solve: Callable[[FloatArray], FloatArray], guess: FloatArray
 ) -> FloatArray:
-    """A solution near a guess without whole turns of joints, as far as limits and outputs permit.
-
-    Newton's method may add whole turns to a joint. `solve` returns a configuration near a guess.
-    """
+    """A solution near a guess without the whole turns of joints that Newton's method may add."""
     q, turn, (low, high) = solve(guess), 2 * np.pi, model.links.position_limits
     for index, signal in enumerate(model.links.position_signals):
         is_inside = low[index] - _SLACK <= q[index] <= high[index] + _SLACK

@@ -103,16 +103,7 @@ _Dumper.add_representer(dict, _Dumper.represent_tagged)
 
 
 def load_yaml(text: str, name: str) -> Any:
-    """YAML as lists, dictionaries and plain values; a tag becomes the entry "_tag".
-
-    Args:
-        text: A text in YAML.
-        name: The name of the text in messages.
-
-    Raises:
-        ScenarioError: The YAML is broken, or a key is not text or occurs twice; the message has the
-            line.
-    """
+    """YAML as lists, dictionaries and plain values; a tag becomes the entry "_tag"."""
     return load_lines(text, name)[0]
 
 

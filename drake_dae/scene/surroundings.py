@@ -63,11 +63,11 @@ def surroundings(
         low, high = contacts.min(axis=0), contacts.max(axis=0)
         nearest = np.argmin(np.linalg.norm(contacts - (low + high) / 2, axis=1))
         extent = max(size, 1.4 * float(np.linalg.norm(high - low)))
-        picture = constraints[row].picture(values, contacts[nearest], extent)
-        if picture is None:
+        surface, pose = constraints[row].surface_at(values), constraints[row].placement(values)
+        if surface is None:
             return None
-        pose = constraints[row].placement(values)
-        return DrawnSurface(constraints[row], pose, picture.moved(pose.inverse()))
+        picture = surface.picture(pose.inverse() @ contacts[nearest], extent)
+        return None if picture is None else DrawnSurface(constraints[row], pose, picture)
 
     groups = list[list[int]]()
     for row in range(len(constraints)):

@@ -18,6 +18,9 @@ CREATE TABLE IF NOT EXISTS runs (
 );
 """
 
+_AGAIN = f"({', '.join(repr(str(each)) for each in Outcome if not each.is_final)})"
+"""The outcomes of runs that are tried again, in SQL."""
+
 
 class Journal:
     """An open file of a sweep. Several processes may have it open; none loses a row of another."""
@@ -52,31 +55,24 @@ class Journal:
         }
 
 
-_AGAIN = f"({', '.join(repr(str(each)) for each in Outcome if not each.is_final)})"
-"""The outcomes of runs that are tried again, in SQL."""
-
-
 @contextmanager
 def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
-    """Creates the file of a sweep, or opens it to continue.
+    """Creates the file of a sweep with missing folders, or opens it to continue.
 
     Args:
-        path: The path of the file; missing folders are created.
+        path: The path of the file.
         head: What the sweep is, name -> text; equal sweeps have equal ones.
 
     Raises:
         ModelError: The file belongs to another sweep (the message names what differs), or is none,
             or cannot be written.
     """
-
-    def unusable(error: Exception) -> ModelError:
-        return ModelError(f"cannot use {brief(str(path))} as the file of a sweep: {error}")
-
+    unusable = f"cannot use {brief(str(path))} as the file of a sweep: "
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         database = sqlite3.connect(path, timeout=60.0)
     except (sqlite3.Error, OSError, ValueError) as error:  # ValueError: a null byte in the path.
-        raise unusable(error) from None
+        raise ModelError(f"{unusable}{error}") from None
     with closing(database):
         try:
             database.executescript(f"BEGIN IMMEDIATE; {_TABLES}")
@@ -84,21 +80,16 @@ def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
             if not there:
                 database.executemany("INSERT INTO sweep VALUES (?, ?)", list(head.items()))
             database.commit()
-            _check_same(path, there or head, head)
+            differing = [
+                f"{key} = {brief(there.get(key))} there, {brief(head.get(key))} here"
+                for key in {**there, **head}
+                if there and there.get(key) != head.get(key)
+            ]
+            if differing:
+                raise ModelError(
+                    f"'{path}' belongs to another sweep: {'; '.join(differing[:6])}. Choose "
+                    "another folder, or remove it"
+                )
             yield Journal(database)
         except sqlite3.Error as error:
-            raise unusable(error) from None
-
-
-def _check_same(path: Path, there: Mapping[str, str], here: Mapping[str, str]) -> None:
-    """Checks that a file is that of this sweep."""
-    differing = [
-        f"{key} = {brief(there.get(key))} there, {brief(here.get(key))} here"
-        for key in {**there, **here}
-        if there.get(key) != here.get(key)
-    ]
-    if differing:
-        raise ModelError(
-            f"'{path}' belongs to another sweep: {'; '.join(differing[:6])}. Choose another "
-            "folder, or remove it"
-        )
+            raise ModelError(f"{unusable}{error}") from None

@@ -74,7 +74,7 @@ class RunResult:
     exceeded: tuple[str, ...] = ()
 
 
-_OF_A_RUN = re.compile(
+_OF_A_RUN = (
     r"description|duration|judgement\.may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?|"
     r"sensors\.(encoders\.seed|force\.(seed|bias|drift))"
 )
@@ -82,38 +82,27 @@ _OF_A_RUN = re.compile(
 
 
 def structure_of(variation: Variation, base: Scenario) -> Variation:
-    """Returns the part of a variation that the closed loop depends on.
+    """The part of a variation of the sweep's scenario that the closed loop depends on.
 
     The other values are set in a context, so that runs with the same part share one loop: start,
     duration and integrator, parameters of the plant, gains that couple no outputs, seeds.
-
-    Args:
-        variation: Dotted key -> the value of a run.
-        base: The scenario of the sweep, with the plant that is simulated.
     """
-    plant, task = base.plant, base.task is not None
-    in_context = {f"start.positions.{joint}" for joint in base.start.positions}
+    plant = base.plant
+    patterns = [_OF_A_RUN, *(rf"start\.positions\.{re.escape(q)}" for q in base.start.positions)]
     if not base.is_advised:
-        in_context |= {f"plant.{name}" for name in plant.in_context}
-    if "friction" in plant.in_context:  # No gains are computed from it.
-        in_context.add("plant.friction")
-    patterns = [_OF_A_RUN, re.compile("|".join(map(re.escape, in_context)) or "$^")]
+        patterns += [rf"plant\.{re.escape(name)}" for name in plant.in_context]
+    elif "friction" in plant.in_context:  # No gains are computed from it.
+        patterns.append(r"plant\.friction")
     if not plant.carries:
-        patterns.append(re.compile(r"plant\.parameters(\..+)?"))
-        if plant.adjusts:
-            patterns.append(
-                re.compile(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
-            )
-    couples = isinstance(base.law.gains, Matrices)
-    if not (couples or base.is_advised or task):
-        patterns.append(re.compile(r"law\.gains\..+"))
+        patterns.append(r"plant\.parameters(\..+)?")
+    if plant.adjusts and not plant.carries:
+        patterns.append(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
+    if not (isinstance(base.law.gains, Matrices) or base.is_advised or base.task is not None):
+        patterns.append(r"law\.gains\..+")
         if np.any(base.sensors.force_noise):
-            patterns.append(re.compile(r"sensors\.force\.noise_deviation"))
-    own = {
-        key: value
-        for key, value in variation.items()
-        if not any(pattern.fullmatch(key) for pattern in patterns)
-    }
+            patterns.append(r"sensors\.force\.noise_deviation")
+    in_context = re.compile("|".join(patterns))
+    own = {key: value for key, value in variation.items() if not in_context.fullmatch(key)}
     # Another kind of plant may set other values in a context.
     of_kind = re.compile(r"plant(\.(?!parameters|payloads|disturbances)|$)")
     return variation if any(map(of_kind.match, own)) else own
@@ -139,7 +128,7 @@ class Runner:
         self.builds = 0
 
     def run(self, variation: Variation) -> RunResult:
-        """Returns the result of a run, whatever happens in it."""
+        """The result of a run, whatever happens in it."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Each run would report the same.
@@ -154,11 +143,10 @@ class Runner:
             return RunResult(Outcome.REFUSED, str(error))
         except Exception as error:  # A sweep of thousands of runs goes on.
             return RunResult(Outcome.CRASHED, f"{type(error).__name__}: {brief(str(error))}")
-        ranges = _limits(loop).ranges(record.time, _limits(loop).of_record(record))
-        figures, exceeded = (
-            figures_of(record, ranges),
-            tuple(r.signal.name for r in ranges if r.excess),
-        )
+        limits = _limits(loop)
+        ranges = limits.ranges(record.time, limits.of_record(record))
+        figures = figures_of(record, ranges)
+        exceeded = tuple(r.signal.name for r in ranges if r.excess)
         if failure is not None:
             return RunResult(Outcome.FAILED, str(failure), figures, exceeded)
         return RunResult(Outcome.FINISHED, "", {**figures, "steps": float(steps)}, exceeded)
@@ -204,7 +192,7 @@ class Runner:
     def _simulated(
         self, scenario: Scenario, loop: ClosedLoop, context: Context
     ) -> tuple[Record, int, SimulationError | None]:
-        """Returns record, number of steps, and failure if any."""
+        """The record, the number of steps, and the failure if any."""
         if self._lasting is not None:
             rollout = roll_scenario(scenario, loop, context, self._lasting)
             return rollout.record, rollout.steps, rollout.failure
@@ -245,9 +233,7 @@ _ALONE = Lock()
 def run_one(settings: str, variation: Variation) -> RunResult:
     """Makes one run, in whatever process or thread.
 
-    Args:
-        settings: The arguments of `Runner` as JSON; equal ones have one runner in a process.
-        variation: The run.
+    The settings are the arguments of `Runner` as JSON; equal ones have one runner in a process.
     """
     with _ALONE:  # The threads of a process share its loop.
         return _runner(settings).run(variation)

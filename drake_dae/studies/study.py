@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drake_dae.analysis.tables import Part, Table, count_of, to_text
-from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.studies.runs import Outcome, RunResult
@@ -28,7 +27,6 @@ MOST_AXES = 24
 """The largest number of figures in the plot."""
 
 
-@checked(ModelError)
 @dataclass(frozen=True, eq=False)
 class Study:
     """The results of a sweep.
@@ -41,18 +39,39 @@ class Study:
     variations: tuple[Variation, ...]
     results: tuple[RunResult, ...]
 
-    def __post_init__(self) -> None:
-        if len(self.variations) != len(self.results):
-            raise ModelError(
-                f"a study has a result for each variation, got {len(self.results)} for "
-                f"{len(self.variations)}"
-            )
-
     def __repr__(self) -> str:
         return f"Study({self._outcomes()})"
 
     def __str__(self) -> str:
-        return to_text(self._parts())
+        parts: list[Part] = [[self._outcomes()]]
+        others = list[str]()
+        for run, (changes, result) in enumerate(zip(self.variations, self.results, strict=True)):
+            if result.outcome is not Outcome.FINISHED:
+                name = ", ".join(f"{key}={_cell(value)}" for key, value in changes.items())
+                others.append(f"run {run}, {name}: {result.outcome}: {result.reason}")
+        if len(others) > MOST_REASONS:
+            others = [*others[:MOST_REASONS], f"and {len(others) - MOST_REASONS} more"]
+        if others:
+            parts.append(others)
+        beyond = Counter(name for result in self.results for name in result.exceeded)
+        if beyond:
+            counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
+            parts.append([f"beyond their limits: {', '.join(counted)}"])
+        if self.figures:
+            rows = []
+            for figure, extent in self.extent().items():
+                values = self.values(figure)
+                at = str(np.nanargmin(values)), str(np.nanargmax(values))
+                low, median, high = (f"{number:.4g}" for number in extent.values())
+                rows.append([figure, low, at[0], median, high, at[1]])
+            head = ["figure", "least", "at run", "median", "largest", "at run"]
+            parts.append(Table(head, rows))
+        return to_text(parts)
+
+    def _outcomes(self) -> str:
+        counts = Counter(result.outcome for result in self.results)
+        texts = [f"{counts[outcome]} {outcome}" for outcome in Outcome if counts[outcome]]
+        return f"{count_of(len(self.results), 'run')}: {', '.join(texts)}"
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -64,7 +83,6 @@ class Study:
         """Names of all figures, with units."""
         return tuple(dict.fromkeys(name for result in self.results for name in result.figures))
 
-    @checked(ModelError)
     def values(self, figure: str) -> FloatArray:
         """A figure of every run, shape (number of runs,); nan for runs without this figure.
 
@@ -108,12 +126,11 @@ class Study:
 
         A red cross is a run that did not finish.
         """
-        table = self.table()
-        columns = {key: _numbers(table[key]) for key in self.keys}
-        name, x = next(
-            ((key, column) for key, column in columns.items() if _varies(column)),
-            ("run", np.arange(len(self.results), dtype=float)),
-        )
+        name, x = "run", np.arange(len(self.results), dtype=float)
+        for key in reversed(self.keys):
+            column = _numbers([changes.get(key) for changes in self.variations])
+            if _varies(column):
+                name, x = key, column
         drawn = [each for each in self.figures if _varies(self.values(each))][:MOST_AXES]
         unfinished = np.array([r.outcome is not Outcome.FINISHED for r in self.results])
         rows = -(-max(len(drawn), 1) // 3)
@@ -122,20 +139,14 @@ class Study:
             axis, y = figure.add_subplot(rows, 3, index + 1), self.values(each)
             axis.plot(x, y, ".", color="C0")
             axis.plot(x[unfinished], y[unfinished], "x", color="C3")
-            axis.set_title(_text(each), fontsize=9)
-            axis.set_xlabel(_text(name), fontsize=8)
+            # Matplotlib would read mathematics in $.
+            axis.set_title(each.replace("$", r"\$"), fontsize=9)
+            axis.set_xlabel(name.replace("$", r"\$"), fontsize=8)
             axis.tick_params(labelsize=8)
         return figure
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Writes the table as `runs.csv`, and the plot as `runs.png`.
-
-        Args:
-            folder: The folder to write to; created if it does not exist.
-
-        Returns:
-            The paths of both files.
-        """
+        """Writes the table as `runs.csv` and the plot as `runs.png`; returns their paths."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         table, plot = (folder / name for name in FILES)
@@ -147,51 +158,10 @@ class Study:
         self.plot().savefig(plot, dpi=100)
         return [table, plot]
 
-    def _outcomes(self) -> str:
-        """The number of runs, and of each outcome, in words."""
-        counts = Counter(result.outcome for result in self.results)
-        texts = [f"{counts[outcome]} {outcome}" for outcome in Outcome if counts[outcome]]
-        return f"{count_of(len(self.results), 'run')}: {', '.join(texts)}"
-
-    def _parts(self) -> list[Part]:
-        parts: list[Part] = [[self._outcomes()]]
-        others = [
-            f"run {run}, {_name(self.variations[run])}: {result.outcome}: {result.reason}"
-            for run, result in enumerate(self.results)
-            if result.outcome is not Outcome.FINISHED
-        ]
-        if len(others) > MOST_REASONS:
-            others = [*others[:MOST_REASONS], f"and {len(others) - MOST_REASONS} more"]
-        if others:
-            parts.append(others)
-        beyond = Counter(name for result in self.results for name in result.exceeded)
-        if beyond:
-            counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
-            parts.append([f"beyond their limits: {', '.join(counted)}"])
-        if self.figures:
-            head = ["figure", "least", "at run", "median", "largest", "at run"]
-            parts.append(Table(head, [self._row(name) for name in self.figures]))
-        return parts
-
-    def _row(self, figure: str) -> list[str]:
-        values = self.values(figure)
-        least, largest = int(np.nanargmin(values)), int(np.nanargmax(values))
-        numbers = values[least], np.nanmedian(values), values[largest]
-        low, median, high = (f"{number:.4g}" for number in numbers)
-        return [figure, low, f"{least}", median, high, f"{largest}"]
-
-
-def _name(changes: Variation) -> str:
-    return ", ".join(f"{key}={_cell(value)}" for key, value in changes.items())
-
 
 def _cell(entry: Any) -> Any:
     """Lists and mappings as JSON, and other values unchanged."""
     return json.dumps(entry) if isinstance(entry, (dict, list)) else entry
-
-
-def _text(name: str) -> str:
-    return name.replace("$", r"\$")  # Matplotlib would read mathematics.
 
 
 def _numbers(column: Sequence[Any]) -> FloatArray:

@@ -5,12 +5,17 @@ import multiprocessing.context
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from contextlib import contextmanager, suppress
-from functools import partial
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from importlib.metadata import version
 from pathlib import Path
-from queue import SimpleQueue
 from types import ModuleType
 from typing import Any
 
@@ -70,7 +75,7 @@ def sweep(
     Args:
         scenario: A scenario from `load_scenario`.
         variations: For each run, dotted key of the scenario -> value; for example from
-            `grid_variations`, `random_variations` or `listed_variations`.
+            `drake_dae.studies.make_variations`.
         file: The file, an SQLite database: a row for each run that has ended. Several processes
             may continue one sweep in it at the same time.
         workers: The number of processes of this machine; None for the number of its cores.
@@ -112,44 +117,45 @@ def sweep(
         with open_journal(path, head) as journal:
             # Runs of one structure follow each other, so that a process keeps its loop.
             order = sorted(range(len(chosen)), key=structures.__getitem__)
-            todo = {run: chosen[run] for run in order if not journal.is_done(run)}
+            todo = [run for run in order if not journal.is_done(run)]
             if todo:
                 count = min(workers or num_cores(), len(todo))
-                running, ahead = _processes(count, time_limit, num_structures), 4 * count
-                if executor is not None:
-                    running, ahead = _submitted_to(executor), AHEAD
-                with running as submit, _bar(len(chosen), len(todo), progress) as bar:
-                    _run(todo, partial(submit, settings), ahead, journal, bar)
+                opened: AbstractContextManager[tuple[Submit, int]] = (
+                    _processes(count, time_limit, BUILDS if num_structures > BUILDS else 0)
+                    if executor is None
+                    else nullcontext((lambda *args: executor.submit(run_one, *args), AHEAD))
+                )
+                size = {"total": len(chosen), "initial": len(chosen) - len(todo), "unit": "run"}
+                is_hidden = not (progress and sys.stderr.isatty())
+                with opened as pool, tqdm(**size, disable=is_hidden, **default_size()) as bar:
+                    _run(todo, lambda run: pool[0](settings, chosen[run]), pool[1], journal, bar)
             results = journal.results()
     return Study(tuple(chosen), tuple(results[run] for run in range(len(chosen))))
 
 
 def _run(
-    runs: Mapping[int, Variation],
-    submit: Callable[[Variation], "Future[RunResult]"],
+    todo: Sequence[int],
+    submit: Callable[[int], "Future[RunResult]"],
     ahead: int,
     journal: Journal,
     bar: Any,
 ) -> None:
-    """Makes runs, and writes their results when they end."""
-    ended: SimpleQueue[tuple[int, Future[RunResult]]] = SimpleQueue()
-    waiting, running = list(runs.items())[::-1], 0
-    while waiting or running:
-        while waiting and running < ahead:
-            run, variation = waiting.pop()
-            if journal.is_done(run):  # By another process meanwhile.
-                bar.update()
-                continue
-            put = partial(lambda run, future: ended.put((run, future)), run)
-            submit(variation).add_done_callback(put)
-            running += 1
-        results = dict[int, RunResult]()
-        while running and (not results or not ended.empty()):
-            run, future = ended.get()
-            results[run] = _result(future)
-            running -= 1
-        journal.add(results)
-        bar.update(len(results))
+    """Makes runs, at most so many at a time, and writes their results when they end."""
+    waiting, running = list(todo)[::-1], dict[Future[RunResult], int]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < ahead:
+                run = waiting.pop()
+                if journal.is_done(run):  # By another process meanwhile.
+                    bar.update()
+                else:
+                    running[submit(run)] = run
+            ended = wait(running, return_when=FIRST_COMPLETED).done
+            journal.add({running.pop(future): _result(future) for future in ended})
+            bar.update(len(ended))
+    finally:
+        for future in running:
+            future.cancel()
 
 
 def _result(future: "Future[RunResult]") -> RunResult:
@@ -167,31 +173,14 @@ def _result(future: "Future[RunResult]") -> RunResult:
 
 
 @contextmanager
-def _processes(count: int, time_limit: float, num_structures: int) -> Iterator[Submit]:
-    """Processes of this machine. One that dies, or is too slow, is replaced, and loses its run."""
-    most = BUILDS if num_structures > BUILDS else 0
+def _processes(count: int, time_limit: float, most: int) -> Iterator[tuple[Submit, int]]:
+    """Processes of this machine, each for so many runs. One that dies, or is slow, is replaced."""
     pool = ProcessPool(count, max_tasks=most, context=_WithoutMain())
     try:
-        yield lambda *args: pool.schedule(run_one, args, timeout=time_limit)
+        yield (lambda *args: pool.schedule(run_one, args, timeout=time_limit)), 4 * count
     finally:
         pool.stop()  # type: ignore[no-untyped-call]
         pool.join()
-
-
-@contextmanager
-def _submitted_to(executor: Executor) -> Iterator[Submit]:
-    """An executor of the caller, whose runs without a result are cancelled at the end."""
-    futures = list["Future[RunResult]"]()
-
-    def submit(settings: str, variation: Variation) -> "Future[RunResult]":
-        futures.append(executor.submit(run_one, settings, variation))
-        return futures[-1]
-
-    try:
-        yield submit
-    finally:
-        for future in futures:
-            future.cancel()
 
 
 class _Process(multiprocessing.context.SpawnProcess):
@@ -210,19 +199,8 @@ class _WithoutMain(multiprocessing.context.SpawnContext):
     Process = _Process
 
 
-def _bar(total: int, missing: int, progress: bool) -> Any:
-    """A bar on a terminal."""
-    return tqdm(
-        total=total,
-        initial=total - missing,
-        unit="run",
-        disable=not (progress and sys.stderr.isatty()),
-        **default_size(),
-    )
-
-
 def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
-    """Checks that a scenario accepts keys and values, of some variations if there are many."""
+    """Checks keys and values, of some variations if there are many."""
     if not variations:
         raise ScenarioError(("", "a sweep needs at least one variation"))
     problems: dict[tuple[str, str], None] = {}
@@ -236,7 +214,7 @@ def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
 
 
 def _try(runner: Runner, variations: Sequence[Variation]) -> None:
-    """Checks that runs can be built, for example that the names of parameters exist.
+    """Checks that a run can be built, for example that the names of parameters exist.
 
     Raises:
         ScenarioError: The first, the middle and the last run all have an error in keys or values;
@@ -245,9 +223,7 @@ def _try(runner: Runner, variations: Sequence[Variation]) -> None:
     errors = []
     for index in dict.fromkeys((0, len(variations) // 2, len(variations) - 1)):
         try:
-            runner.check(variations[index])
+            return runner.check(variations[index])
         except ScenarioError as error:
             errors.append(error)
-        else:
-            return
     raise errors[0]

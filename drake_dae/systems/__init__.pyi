@@ -9,8 +9,7 @@ from .control.references import ReferenceGenerator as ReferenceGenerator
 from .control.sampling import ControlHold as ControlHold
 from .control.sampling import Sampling as Sampling
 from .observing.estimator import StateEstimator as StateEstimator
-from .observing.observer import DisturbanceObserver as DisturbanceObserver
-from .observing.observer_rates import Observing as Observing
+from .observing.observing import Observing as Observing
 from .plants.contact.compliant_plant import CompliantPlant as CompliantPlant
 from .plants.contact.contact_material import ContactMaterial as ContactMaterial
 from .plants.contact.contact_material import PointMaterial as PointMaterial

@@ -13,7 +13,7 @@ from problems.found import NO, findings
 
 from drake_dae.analysis.analyze import analyze
 from drake_dae.dae import DaeSystem, Manifold, Region
-from drake_dae.dae.states.region import ConsistentRegion
+from drake_dae.dae.samples import ConsistentRegion
 from drake_dae.errors import InconsistentStateError, ModelError
 
 

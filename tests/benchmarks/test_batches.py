@@ -15,7 +15,7 @@ from drake_dae.running import start_values
 from drake_dae.running.rollout import rollout as module
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import scenario_data
-from drake_dae.studies import grid_variations
+from drake_dae.studies import make_variations
 from drake_dae.studies.runs import Runner
 
 FIXED = [
@@ -115,7 +115,7 @@ def test_ten_thousand_short_runs(report):
 def test_a_run_of_a_sweep(report):
     """10 s of the 2-link wall at 1e-8 with 1,001 rows, from its keys to its figures."""
     runner = Runner(scenario_data(scenario("two_link_wall", "compiled=true")), 1e6)
-    variations = grid_variations({"start.errors.tool.z": np.linspace(-0.05, 0.05, 64)})
+    variations = make_variations({"start.errors.tool.z": np.linspace(-0.05, 0.05, 64)})
 
     def run():
         assert all(runner.run(each).reason == "" for each in variations)

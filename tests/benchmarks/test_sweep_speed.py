@@ -9,11 +9,11 @@ from runs import scenario
 
 from drake_dae import sweep
 from drake_dae.running.rollout.run import num_cores
-from drake_dae.studies import grid_variations
+from drake_dae.studies import make_variations
 
 
 def starts(count):
-    return grid_variations({"start.errors.tool.z": np.linspace(-0.05, 0.05, count)})
+    return make_variations({"start.errors.tool.z": np.linspace(-0.05, 0.05, count)})
 
 
 def children():

@@ -26,15 +26,14 @@ from drake_dae import (
     make_animation,
     make_closed_loop,
     poles,
+    robots,
     simulate,
     start_meshcat,
 )
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
 from drake_dae.pictures.motion import contact_paths, follow, frame_times
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
-from drake_dae.robots.surfaces import surfaces
-from drake_dae.robots.surfaces.surface import tangents
+from drake_dae.robots import ConstraintWrenches, tangents
 from drake_dae.scene.surroundings import diagonal, scene_points
 
 NAMES = ["two_link_wall", "seven_joint_wall", "seven_joint_dome"]
@@ -105,7 +104,7 @@ def test_the_arrow_stands_at_the_contact_along_the_normal(shown):
     assert len(position.times) == len(turn.times) == len(scale.times) == 33
     surface = contact.surface
     for point, quaternion in zip(position.values, turn.values, strict=True):
-        if isinstance(surface, surfaces.Plane):
+        if isinstance(surface, robots.Plane):
             assert np.dot(point - surface.point, surface.normal) == pytest.approx(0.0, abs=1e-4)
             normal = np.array(surface.normal)
         else:
@@ -194,7 +193,7 @@ def test_paths_on_a_surface(shown):
     assert path.name == contact.name
     assert path.actual.shape == path.desired.shape == (33, 2)
     points = course.points[:, 0] - contact.surface.position
-    if isinstance(contact.surface, surfaces.Plane):
+    if isinstance(contact.surface, robots.Plane):
         first, second = tangents(np.array(contact.surface.normal))
     else:
         normal = np.mean(points, axis=0)

@@ -7,7 +7,7 @@ from runs import run_scenario, scenario
 
 from drake_dae import LinkExpressions, PointCoordinates, PointOnSurface, RobotModel, Sphere
 from drake_dae.pictures.motion import RunMotion, contact_paths, follow
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
+from drake_dae.robots import ConstraintWrenches
 
 
 @pytest.mark.parametrize("turns", [0.25, 1.0])

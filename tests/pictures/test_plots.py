@@ -10,12 +10,11 @@ from runs import run_scenario, scenario
 from drake_dae import Record, plot_runs
 from drake_dae.cli import main
 from drake_dae.dae import Signal
-from drake_dae.diagrams.record import Recorded
+from drake_dae.diagrams.record import Recorded, phase_spans, phases_at
 from drake_dae.errors import ModelError
 from drake_dae.pictures import PLOTS
 from drake_dae.pictures.motion import ContactPath, contact_paths, follow
 from drake_dae.pictures.plots import figures_of_run, plot_paths, save_plots
-from drake_dae.running.phases import phase_spans, phases_at
 
 TIME = np.linspace(0.0, 2.0, 41)
 

@@ -1,12 +1,10 @@
 """Running a diagram: settings, statistics, progress, interruption, failure."""
 
 import io
-import itertools
 import os
 import signal
 import sys
 import threading
-import warnings
 
 import casadi as ca
 import numpy as np
@@ -23,7 +21,6 @@ from drake_dae.running import simulate as module
 from drake_dae.running.interruption import ENDING_SIGNALS
 from drake_dae.running.simulate import check_config, check_duration, simulate
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.systems.control.sampling import ControlHold, Sampling
 
 
 class Ramp(LeafSystem):
@@ -120,42 +117,6 @@ def test_every_other_scheme_passes():
         check_config(SimulatorConfig(integration_scheme=scheme, use_error_control=False))
 
 
-def test_endless_by_request():
-    """Ten billion steps, of which this takes some: neither silent nor a state without bound."""
-    count = itertools.count(1)
-
-    def enough(context):
-        if next(count) == 2500:
-            raise StopIteration
-
-    diagram, context, _ = ramp()
-    warned = pytest.warns(UserWarning, match=r"1e-09 s.*1e\+10")
-    with warned, pytest.raises(StopIteration):
-        simulate(diagram, context, 10.0, fixed(1e-9), after_step=enough)
-    assert context.get_time() == pytest.approx(2500e-9)
-
-
-def test_samples_without_end_are_reported_like_steps():
-    """Whatever samples: a held law, a force sensor, Drake's own plant."""
-    stopped = pytest.raises(StopIteration)
-
-    def stop(context):
-        raise StopIteration
-
-    for period, what in ((1e-12, "the sample period of 'control_hold',"), (1e-3, "")):
-        builder, hold = DiagramBuilder(), ControlHold(1, Sampling(period))
-        builder.AddSystem(hold)
-        builder.Connect(builder.AddSystem(ConstantVectorSource([1.0])).get_output_port(),
-                        hold.get_input_port())  # fmt: skip
-        diagram = builder.Build()
-        with warnings.catch_warnings(record=True) as told, stopped:
-            warnings.simplefilter("always")
-            simulate(diagram, diagram.CreateDefaultContext(), 1.0, fixed(0.1), after_step=stop)
-        assert [str(one.message).split(" takes")[0] for one in told] == (
-            [f"{what} 1e-12 s"] if what else []
-        )
-
-
 def test_drakes_settings_are_taken_where_none_are_given():
     diagram, context, _ = ramp()
     assert simulate(diagram, context, 1.0).simulated_time == pytest.approx(1.0)
@@ -179,14 +140,6 @@ def test_a_second_run_of_a_context_is_a_record_of_its_own(name):
     both = loop.record(context)
     assert (both.time[0], both.time[-1]) == (0.0, pytest.approx(0.2))
     np.testing.assert_array_equal(both["state"][: len(second.time) - 1], second["state"][:-1])
-
-
-def test_two_million_steps_are_no_reason_to_warn():
-    def stop(context):
-        raise StopIteration
-
-    with pytest.raises(StopIteration):
-        simulate(*ramp()[:2], 2000.0, fixed(1e-3), after_step=stop)
 
 
 def test_after_each_step():

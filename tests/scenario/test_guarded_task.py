@@ -11,12 +11,12 @@ from runs import scenario
 
 from drake_dae import Record, build_scenario, load_scenario, sweep
 from drake_dae.cli import main
+from drake_dae.diagrams.record import phase_spans
 from drake_dae.errors import ScenarioError
-from drake_dae.running.phases import phase_spans
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
-from drake_dae.studies import grid_variations
+from drake_dae.studies import make_variations
 
 # At rest 20 mm before the wall, which gives way.
 SHORT = """
@@ -128,7 +128,7 @@ def test_a_sweep_varies_a_guard(file, tmp_path):
     """Each run is that of its scenario alone; 9 N of 10 N are too few."""
     key = "task.phases.1.guards.0.above"
     chosen = load_scenario(file, ["task.phases.1.tolerance=3", "duration=0.46"])
-    variations = grid_variations({key: [9.0, 40.0]})
+    variations = make_variations({key: [9.0, 40.0]})
     study = sweep(chosen, variations, tmp_path / "runs.db", workers=1, rollout=True)
     held, pressed = study.values("largest wall.force [N]")
     assert 9.0 < held < 9.5

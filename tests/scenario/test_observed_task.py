@@ -9,7 +9,7 @@ from runs import run_scenario, some
 from drake_dae import Approach, Press, Record, Task, build_scenario, load_scenario, sweep
 from drake_dae.cli import main
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.studies import grid_variations
+from drake_dae.studies import make_variations
 
 # At rest 20 mm before the wall, whose friction the law takes for zero.
 OBSERVED = """
@@ -173,7 +173,7 @@ def test_a_study_varies_the_noise_that_a_task_knows(file, tmp_path):
     """Each run is that of its scenario alone: its low-pass is that of its own noise."""
     name = "sensors.force.noise_deviation"
     chosen = load_scenario(file, ["duration=0.4"])
-    variations = grid_variations({name: [0.1, 0.3]})
+    variations = make_variations({name: [0.1, 0.3]})
     study = sweep(chosen, variations, tmp_path / "runs.db", workers=1, rollout=True)
     for k, noise in enumerate((0.1, 0.3)):
         alone = rolled(file, tmp_path, "duration=0.4", f"{name}={noise}")

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from pydrake.math import RollPitchYaw
+from runs import run_scenario
+from vendors import joint, link, robot
 
 from drake_dae import build_scenario, load_scenario
 
@@ -36,3 +38,39 @@ def test_the_tilt_is_that_from_the_wall_of_the_law_on_the_wall_of_the_plant(plan
     across = np.array([np.sin(q1 + q2), 0.0, -np.cos(q1 + q2)])  # the tool's x axis
     assert_allclose(across @ [-1.0, 0.0, 0.0], 0.4, atol=1e-9)
     assert_allclose(rest, 0.0, atol=1e-9)
+
+
+MECHANISM = """
+robot: {file: arm.urdf, base: {weld: base}, actuators: []}
+constraints:
+- {frame: end, point: [0, 0, 1], surface: !Plane {point: [0.8, 0, 0], normal: [-1, 0, 0]}}
+start: {positions: {first: 0.9, second: -0.7}, velocities: {first_w: 0.8}}
+integrator: {accuracy: 1.0e-10}
+"""
+
+
+def test_a_mechanism_without_drive_starts_in_motion_and_keeps_its_energy(tmp_path):
+    """By MultibodyPlant's energies: an ideal constraint does no work, and no motor is there."""
+    (tmp_path / "arm.urdf").write_text(
+        robot(
+            "arm",
+            *(link(name, 1.0) for name in ("base", "one", "end")),
+            joint("first", "base", "one", "0 1 0", (0.0, 0.0, 0.0), limits=(-3, 3)),
+            joint("second", "one", "end", "0 1 0", (0.0, 0.0, 1.0), limits=(-3, 3)),
+        )
+    )
+    (tmp_path / "mechanism.yaml").write_text(MECHANISM)
+    chosen = load_scenario(tmp_path / "mechanism.yaml", ["duration=0.4"])
+    loop, _, record = run_scenario(chosen)
+    links = loop.plant.model.links
+    energies = []
+    for state in record["state"]:
+        at_links = links.plant.CreateDefaultContext()
+        links.plant.SetPositionsAndVelocities(at_links, state)
+        energy = links.plant.CalcKineticEnergy(at_links)
+        energies.append(energy + links.plant.CalcPotentialEnergy(at_links))
+    assert record["state"][0, 2] == 0.8
+    assert np.ptp(record["state"][:, 2]) > 1.0
+    assert_allclose(energies, energies[0], atol=1e-7)  # Of 30 J; steps of 1e-10 of the states.
+    assert record["control"].shape[1] == record["tracking_error"].shape[1] == 0
+    assert np.abs(record["constraint_residual"]).max() < 1e-7

@@ -25,7 +25,7 @@ from drake_dae import (
     start_meshcat,
 )
 from drake_dae.pictures.motion import follow, run_points
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches, Wrenches
+from drake_dae.robots import ConstraintWrenches, Wrenches
 from drake_dae.scene.arrows import ForceArrows
 from drake_dae.scene.camera import direction_of, framed
 from drake_dae.scene.surroundings import floor_below, surroundings

@@ -1,8 +1,6 @@
 """The file of a sweep: what any interruption leaves of it is read, and of another sweep nothing."""
 
-import multiprocessing
 import resource
-import sqlite3
 
 import pytest
 
@@ -42,33 +40,10 @@ def test_a_result_stays_as_it_was_told_first_unless_its_process_died(tmp_path):
         assert journal.results() == RESULTS
 
 
-def _write(path, first, barrier):
-    barrier.wait()
-    with open_journal(path, HEAD) as journal:
-        for run in range(first, first + 50):
-            journal.add({run: RESULTS[2]})
-
-
-def test_processes_that_begin_at_the_same_instant_lose_no_row(tmp_path):
-    path, context = tmp_path / "runs.db", multiprocessing.get_context("spawn")
-    barrier = context.Barrier(4)
-    writers = [
-        context.Process(target=_write, args=(path, 50 * place, barrier)) for place in range(4)
-    ]
-    for writer in writers:
-        writer.start()
-    for writer in writers:
-        writer.join()
-        assert writer.exitcode == 0
-    with open_journal(path, HEAD) as journal:
-        assert journal.results() == dict.fromkeys(range(200), RESULTS[2])
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"version": "2.0"}, r"version.*1.0.*2.0"),
-        ({"duration": "2.0"}, "duration"),
         ({"gains": "1"}, "gains"),
     ],
 )
@@ -88,19 +63,8 @@ def test_other_files_are_left_alone(tmp_path):
     with pytest.raises(ModelError, match=r"runs\.db"), open_journal(path, HEAD):
         pass
     assert path.read_bytes() == b"text\n" * 1000
-    path.unlink()
-    with sqlite3.connect(path) as other:
-        other.execute("CREATE TABLE runs (a, b)")
-        other.execute("CREATE TABLE sweep (a, b)")
-    other.close()
-    with pytest.raises(ModelError, match=r"runs\.db"), open_journal(path, HEAD):
-        pass
-
-
-def test_where_it_cannot_write_it_says_so(tmp_path):
-    (tmp_path / "file").write_text("")
-    for path in (tmp_path / "file" / "runs.db", tmp_path / "a\0b", tmp_path):
-        with pytest.raises(ModelError), open_journal(path, HEAD):
+    for other in (path / "runs.db", tmp_path / "a\0b", tmp_path):
+        with pytest.raises(ModelError), open_journal(other, HEAD):
             pass
 
 

@@ -12,8 +12,14 @@ from pydrake.systems.framework import BasicVector, LeafSystem
 
 from drake_dae import ForceOutput, PointOnSurface
 from drake_dae.dae import Signal
-from drake_dae.robots import Application, AttachedStage, Constraint, Stage, Surface
-from drake_dae.robots.actuation.numbers import diagonal_parameter
+from drake_dae.robots import (
+    Application,
+    AttachedStage,
+    Constraint,
+    Stage,
+    Surface,
+    diagonal_parameter,
+)
 from drake_dae.systems import Controller, Plant
 from drake_dae.systems.task.phases import Phase
 

@@ -10,7 +10,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
 from drake_dae.dae.beyond.identified import IdentifiedTerms, check_bounded
 from drake_dae.dae.signals import DerivativeLayout, Parameter
-from drake_dae.dae.structure.structure import Structure
+from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
@@ -33,7 +33,7 @@ def with_disturbance(
 
     where S holds the rows of some states: for a robot its velocities, so that d is a generalized
     force. A law for this system compensates d and the named coefficients of friction, which come
-    through the port `exogenous` of its controller; see `DisturbanceObserver`. With d = 0 it is the
+    through the port `exogenous` of its controller; see `StateEstimator`. With d = 0 it is the
     law of the original system.
 
     Args:

@@ -199,7 +199,7 @@ Update = Callable[[FloatArray, FloatArray, FloatArray], Rows]
 def _observed(
     rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
 ) -> tuple[Known, Update]:
-    """A `DisturbanceObserver`: the estimates that the law reads, and its next state."""
+    """With exact velocities: the estimates that the law reads, and the next state."""
     gain = -np.expm1(-rates.observer_rate * period)
 
     def estimates(position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, ...]:
@@ -215,7 +215,7 @@ def _observed(
 def _estimated(
     rates: DirectionGains, period: float, noise: SensorNoise, now: Rows
 ) -> tuple[Known, Update]:
-    """A `StateEstimator`: the same; q, w and a are its prediction."""
+    """With a state_rate: the same; q, w and a are the prediction."""
     ratio = noise.velocity / noise.position if noise.velocity and noise.position else None
     assert rates.state_rate is not None
     observer = _filter(rates.state_rate, rates.observer_rate, period, ratio)
@@ -310,13 +310,15 @@ def direction_gains(situation: SensedContact, roughness: float) -> tuple[Part, P
     highest = PHASE / (3.0 * (situation.delay + 0.5) * situation.period)
     fast: list[float | None] = [None]
     if situation.estimates:
-        fast = [share * highest / 2.0 for share in _STATE_RATES]
-        fast = [rate for rate in fast if rate * situation.period <= 0.5] or fast[:1]
+        most = 0.5 / situation.period
+        fast = [rate for share in _STATE_RATES if (rate := share * highest / 2.0) <= most]
     pairs = []
-    for rate in fast:
-        free = _best([_free(situation, 2.0 * share * highest, rate) for share in _RATES], roughness)
+    for state_rate in fast:
+        free = _best(
+            [_free(situation, 2.0 * share * highest, state_rate) for share in _RATES], roughness
+        )
         most = max((roughness**2 - free.roughness**2) ** 0.5, 0.7 * roughness)
-        contact = [_contact(situation, share * highest, rate) for share in _RATES]
+        contact = [_contact(situation, share * highest, state_rate) for share in _RATES]
         pairs.append((free, _best(contact, most)))
 
     def order(pair: tuple[Part, Part]) -> tuple[float, float]:

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.actuation.numbers import full_matrix, matrix_parameter
-from drake_dae.robots.actuation.stage import AttachedStage, Stage
+from drake_dae.robots.actuation.stage import AttachedStage, Stage, full_matrix, matrix_parameter
 from drake_dae.robots.links.links import Links
 
 
@@ -87,7 +86,20 @@ class FlexibleJoints(Stage):
         q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
         drag = ca.SX(p, 1)
         if self.friction is not None:
-            coefficients, creep = self._friction(p, rotary)
+            given = np.asarray(self.friction, dtype=float)
+            if given.shape not in ((), (p,)) or not np.all(given >= 0):
+                raise ModelError(
+                    f"flexible_joints.friction must be 0 or more, a number or shape ({p},), got "
+                    f"{self.friction!r}"
+                )
+            coefficients = Parameter(
+                "flexible_joints.friction",
+                np.broadcast_to(given, (p,)).copy(),
+                "N m" if rotary else "",
+                nonnegative=True,
+            )
+            slow = np.array([self.stiction_tolerance])
+            creep = Parameter("flexible_joints.stiction_tolerance", slow, positive=True)
             parameters += [coefficients, creep]
             drag = coefficients.symbol * rate / ca.sqrt(rate**2 + creep.symbol**2)
 
@@ -111,20 +123,4 @@ class FlexibleJoints(Stage):
             carries_rotors=True,
             ports={"motor_state": slice(0, 2 * p)},
             parameters=tuple(parameters),
-        )
-
-    def _friction(self, p: int, rotary: bool) -> tuple[Parameter, Parameter]:
-        """The parameters of the motors' friction: F_c, shape (p,), and v_s."""
-        assert self.friction is not None
-        given = np.asarray(self.friction, dtype=float)
-        if given.shape not in ((), (p,)) or not (np.isfinite(given).all() and np.all(given >= 0)):
-            raise ModelError(
-                f"flexible_joints.friction must be 0 or more, a number or shape ({p},), got "
-                f"{self.friction!r}"
-            )
-        name, slow = "flexible_joints.friction", "flexible_joints.stiction_tolerance"
-        values = np.broadcast_to(given, (p,)).copy()
-        return (
-            Parameter(name, values, "N m" if rotary else "", nonnegative=True),
-            Parameter(slow, np.array([self.stiction_tolerance]), "", positive=True),
         )

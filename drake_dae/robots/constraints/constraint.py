@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Container
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import casadi as ca
@@ -15,26 +16,22 @@ from pydrake.multibody.tree import MultibodyConstraintId
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.picture import PosedShape
-from drake_dae.robots.surfaces.surface import Vector
+from drake_dae.robots.links.links import Frames, Kinematics, Reaction
+from drake_dae.robots.surfaces.surface import Surface, Vector
 
 
 @dataclass(frozen=True, eq=False)
 class Application:
-    """The action of constraint forces: F = force_axes @ lambda and M = moment_axes @ lambda.
+    """The action of constraint forces: F = force_axes @ lambda + drag, M = moment_axes @ lambda.
 
     All vectors are in the world. Frame A exerts F and M on frame B at the point; B exerts the
     opposite on A at the same point.
-
-    With `drag`, F also contains that force.
 
     Attributes:
         point: The point of application of F, in m, shape (3, 1).
         force_axes: The force in N for a unit of each constraint force, shape (3, m).
         moment_axes: The moment in N m for a unit of each constraint force, shape (3, m).
-        frame_b: Name of frame B, on which F and M act.
-        frame_a: Name of frame A, on which the opposite acts.
+        frame_b, frame_a: Names of the frames.
         drag: The part of F in N that acts without constraint forces, shape (3, 1); None if none.
     """
 
@@ -95,68 +92,54 @@ class Joint:
 class Constraint(ABC):
     """m constraint equations of a robot, and the m constraint forces lambda that enforce them.
 
-    1. A constraint is an expression of `Kinematics` (its position part of `Frames`) and of the
-       symbols of its own `parameters`. It is smooth in the whole workspace. Only its friction may
-       have a state: rule 17.
+    1. It is an expression of `Kinematics` (its position part of `Frames`) and of its `parameters`,
+       smooth in the workspace. These are made once, have names that begin with "<name>.", and may
+       move (see `RobotModel`) if k = m; `rate` is then the part of the derivative from velocities.
     2. `residual` is phi(q), shape (k, 1), zero if the constraint holds. The first k of the m rows
        are holonomic; the others restrict velocities alone (nonholonomic, r = 1).
     3. `rate` is linear in velocities, shape (m, 1), and zero; its first k rows are the derivative
-       of `residual`. A constraint with k < m defines `rate` itself. If the constraint holds, lambda
-       . rate is the power of the constraint forces without friction: lambda is a force in N if the
-       rate is a velocity in m/s.
-    4. `reaction` is linear in lambda: the gradient of that power with respect to the velocities.
-       Further forces proportional to lambda, such as friction, are added.
-    5. `is_unilateral` marks unilateral rows: lambda >= 0 pushes the robot to the free side.
-    6. `applications` are the forces and moments of `reaction`, each on one frame, and the opposite
-       on another: the plant's port `constraint_wrenches` consists of these. There are none if the
-       frames are not known, as for two angles in textbook equations. Pictures show the first.
-    7. `coordinates` are the free coordinates along the constraint, one row for each of
-       `coordinate_signals`; there may be none.
-    8. `picture` is the visible object in contact, if any; `placement` is its pose for given
-       parameters.
-    9. If the constraint holds and does not move, the total power of its wrenches on both frames is
-       zero; with `is_ideal` false, as with friction, it may be negative.
-    10. Its parameters may move (see `RobotModel`) if k = m; `rate` is then the part of the
-        derivative from velocities. Terms that depend on the rates of parameters, such as friction,
-        use `Parameter.rate`.
-    11. `joint` has the spring, damper, limits and motor along its coordinate, if it is a joint that
-        closes a loop. `coordinate_rate` is linear in velocities, and the derivative of
-        `coordinates` if the constraint holds. The power of a force along the coordinate is force
-        times rate.
-    12. `drag` are forces independent of lambda, such as viscous friction; `applications` contain
-        them as well.
-    13. `friction_parameter` is the name of its coefficient of friction, if it has one, and
-        `sliding` is the sliding velocity.
-    14. `solids` and `layer` are the geometry for Drake's own contact: objects in the world that act
-        on frame B of its first application at the point there.
-    15. `touch` describes the contact point, if there is a free side; `residual` is then the
-        clearance of that point.
-    16. `add_to` adds it to a MultibodyPlant, if Drake has such a constraint.
-
-    Attributes:
-        name: The prefix of the names of its forces, residuals and parameters.
-        parameters: Its numbers, which can change without tracing again.
+       of `residual`. A constraint with k < m defines `rate` itself. If the constraint holds,
+       lambda . rate is the power of the constraint forces without friction: lambda is a force in N
+       if the rate is a velocity in m/s. Where `is_unilateral`, lambda >= 0 pushes to the free side.
+    4. `reaction` is linear in lambda: the gradient of that power by the velocities, and forces
+       proportional to lambda, as of friction. `drag` are forces independent of lambda.
+    5. `applications` are all these forces, each on one frame and the opposite on another; none if
+       the frames are not known. Pictures show the first. If the constraint holds and does not move,
+       their power is zero where `is_ideal`, and not positive otherwise.
+    6. `coordinates` are free coordinates along it, one row for each of `coordinate_signals`, if
+       any, and `coordinate_rate` their rate where it holds. A `joint` is that of a closed loop: its
+       power is force times rate.
+    7. With friction, `friction_parameter` names the coefficient, and `sliding` is the velocity
+       relative to the other object.
+    8. `touch` is the contact point, if there is a free side; `residual` is its clearance.
+       `surface_at` and `placement` are the surface for values of the parameters, and where it
+       stands: for pictures, and for Drake's own contact. `add_to` gives it to Drake, if it can.
     """
 
     name: str
-    parameters: tuple[Parameter, ...] = ()
 
-    @property
-    def is_ideal(self) -> bool:
-        """Whether its forces do no work."""
-        return True
+    def __post_init__(self) -> None:
+        _ = self.parameters  # They check themselves.
 
-    @property
-    def friction_parameter(self) -> str | None:
-        """The name of its coefficient of friction among its parameters; None without one."""
-        return None
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its numbers, which can change without tracing again."""
+        return ()
 
-    def sliding(self, kinematics: Kinematics) -> ca.SX | None:
-        """The sliding velocity relative to the other object, m/s, shape (3, 1).
+    def symbol(self, key: str) -> ca.SX:
+        """The symbol of the parameter "<name>.<key>"; 0 if there is none."""
+        found = [p.symbol for p in self.parameters if p.name == f"{self.name}.{key}"]
+        return found[0] if found else ca.SX(0)
 
-        None without friction.
-        """
-        return None
+    def moving(self, names: Container[str]) -> Self:
+        """The same constraint; parameters of the given names are exogenous."""
+        if not any(parameter.name in names for parameter in self.parameters):
+            return self
+        changed = copy(self)
+        changed.__dict__["parameters"] = tuple(
+            replace(p, exogenous=p.exogenous or p.name in names) for p in self.parameters
+        )
+        return changed
 
     @property
     @abstractmethod
@@ -167,6 +150,16 @@ class Constraint(ABC):
     @abstractmethod
     def residual_signals(self) -> tuple[Signal, ...]:
         """Names and units of phi, then of the nonholonomic rows of the rate."""
+
+    @property
+    def is_unilateral(self) -> tuple[bool, ...]:
+        """Whether each constraint force is unilateral (not negative)."""
+        return (False,) * len(self.force_signals)
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether its forces do no work."""
+        return True
 
     def residual(self, frames: Frames) -> ca.SX:
         """phi(q), shape (k, 1) with k <= m; k = 0 if velocities alone are restricted."""
@@ -184,20 +177,6 @@ class Constraint(ABC):
         """The forces on the robot independent of constraint forces; None if there are none."""
         return None
 
-    def moving(self, names: Container[str]) -> Self:
-        """The same constraint; parameters of the given names are exogenous."""
-        if not any(parameter.name in names for parameter in self.parameters):
-            return self
-        changed = copy(self)  # Its class may be frozen.
-        parameters = [replace(p, exogenous=p.exogenous or p.name in names) for p in self.parameters]
-        object.__setattr__(changed, "parameters", tuple(parameters))
-        return changed
-
-    @property
-    def is_unilateral(self) -> tuple[bool, ...]:
-        """Whether each constraint force is unilateral (not negative)."""
-        return (False,) * len(self.force_signals)
-
     @abstractmethod
     def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
         """The points and frames on which the constraint forces act."""
@@ -208,11 +187,7 @@ class Constraint(ABC):
         return ()
 
     def coordinates(self, frames: Frames) -> ca.SX:
-        """The free coordinates along the constraint, shape (k, 1).
-
-        Raises:
-            ModelError: The constraint has none.
-        """
+        """The free coordinates along the constraint, shape (k, 1); ModelError without any."""
         raise ModelError(
             f"'{self.name}' has no coordinates along it; use PointCoordinates or an expression"
         )
@@ -226,35 +201,26 @@ class Constraint(ABC):
         """The joint along its coordinate; None if it is not a joint."""
         return None
 
+    @property
+    def friction_parameter(self) -> str | None:
+        """The name of its coefficient of friction among its parameters; None without one."""
+        return None
+
+    def sliding(self, kinematics: Kinematics) -> ca.SX | None:
+        """The sliding velocity, m/s, shape (3, 1); None without friction."""
+        return None
+
     def touch(self, frames: Frames) -> Touch | None:
         """The contact point; None without a free side."""
         return None
 
-    @property
-    def remark(self) -> str:
-        """The approximations of its surface, as text; empty if there are none."""
-        return ""
-
-    @property
-    def extent(self) -> FloatArray | None:
-        """The range of coordinates in which it is defined, shape (2, k), or None."""
+    def surface_at(self, values: FloatArray) -> Surface | None:
+        """The surface that it touches, for the values of its parameters in one vector."""
         return None
 
     def placement(self, values: FloatArray) -> RigidTransform:
-        """The pose of the object in contact, in the world.
-
-        Args:
-            values: The values of its parameters in one vector.
-        """
+        """The pose of that surface in the world, for the values of its parameters."""
         return RigidTransform()
-
-    def solids(self, values: FloatArray) -> tuple[PosedShape, ...]:
-        """The geometry for Drake's own contact; () if there is none.
-
-        Args:
-            values: The values of its parameters in one vector.
-        """
-        return ()
 
     def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
         """Adds it to a plant that is not finalized, and returns Drake's id.
@@ -266,29 +232,3 @@ class Constraint(ABC):
             f"'{self.name}': Drake has no constraint for a {type(self).__name__}; use a "
             "WeldedFrames, a CoincidentPoints with three axes, or ideal constraints"
         )
-
-    def layer(
-        self, values: FloatArray, point: FloatArray, size: float, depth: float
-    ) -> PosedShape | None:
-        """A mesh below a piece of the surface, for hydroelastic contact; None without a surface.
-
-        Args:
-            values: The values of its parameters in one vector.
-            point: The middle of the piece, in the world, m, shape (3,).
-            size: The length of its sides if the surface is unbounded, m.
-            depth: The thickness of the layer, m.
-
-        Raises:
-            ModelError: The surface does not have such a piece.
-        """
-        return None
-
-    def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
-        """The visible object in contact, or None.
-
-        Args:
-            values: The values of its parameters in one vector.
-            point: The present point of application, in the world, m, shape (3,).
-            size: The size of the piece to draw, m.
-        """
-        return None

@@ -2,24 +2,21 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
+import numpy as np
 
-from drake_dae.arrays import unknown_name
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Parameter, Signal, UnilateralInput
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
-from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.links.links import Links
+from drake_dae.robots.links.links import Frames, Kinematics, Links, Reaction
 
 
 @dataclass(frozen=True)
 class ConstraintSet:
-    """The constraints of a robot, stacked.
-
-    Attributes:
-        constraints: The constraints, in the order of their constraint forces.
-    """
+    """The constraints of a robot, stacked in the order of their constraint forces."""
 
     constraints: Sequence[Constraint]
 
@@ -28,27 +25,21 @@ class ConstraintSet:
         """m, the number of constraint forces."""
         return len(self.force_signals)
 
-    @property
+    @cached_property
     def force_signals(self) -> tuple[Signal, ...]:
         """Names and units of lambda."""
         return tuple(s for c in self.constraints for s in c.force_signals)
 
     @property
     def residual_signals(self) -> tuple[Signal, ...]:
-        """Names and units of the residuals."""
         return tuple(s for c in self.constraints for s in c.residual_signals)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The parameters of all constraints."""
         return tuple(p for c in self.constraints for p in c.parameters)
 
     def place(self, name: str) -> int:
-        """The index of a constraint force in lambda.
-
-        Raises:
-            ModelError: There is no such force.
-        """
+        """The index of a constraint force in lambda; ModelError if there is none."""
         names = [signal.name for signal in self.force_signals]
         if name not in names:
             raise ModelError(unknown_name("constraint force", name, names))
@@ -87,6 +78,31 @@ class ConstraintSet:
             total += constraint.reaction(kinematics, constraint_force[part])
         return total
 
+    def force_matrix(self, links: Links) -> ca.SX:
+        """G of M v' + H = G lambda + B tau, shape (nv, m): J^T without friction."""
+        kinematics, force = links.kinematics(), ca.SX.sym("force", self.size)
+        # (41)
+        columns = self.reaction(kinematics, force).map(lambda part: ca.jacobian(part, force))
+        return links.generalized_force(kinematics, columns)
+
+    def implicit(self, links: Links, acceleration: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """M v' + H - G lambda, shape (nv, 1), and phi'' (38), shape (m, 1), by inverse dynamics.
+
+        Neither M nor J is formed: see `Links.inverse_dynamics`.
+        """
+        kinematics = links.kinematics(acceleration)
+        balance = links.inverse_dynamics(kinematics, self.reaction(kinematics, force))
+        return balance, kinematics.value(kinematics.derivative(self.rate(kinematics)))
+
+    def drag(self, links: Links) -> ca.SX:
+        """The generalized force of constraints independent of lambda, shape (nv, 1)."""
+        total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
+        for constraint in self.constraints:
+            reaction = constraint.drag(kinematics)
+            if reaction is not None:
+                total += links.generalized_force(kinematics, reaction)
+        return total
+
     def acting(self, kinematics: Kinematics) -> list[tuple[Constraint, slice, Application]]:
         """The constraints that act at a point, the slices of their forces, and their first points.
 
@@ -101,16 +117,7 @@ class ConstraintSet:
     def force_on(
         self, frame: str, name: str, kinematics: Kinematics, constraint_force: ca.SX
     ) -> tuple[ca.SX, ca.SX]:
-        """The point and force of a constraint on a frame, both in the world.
-
-        Args:
-            frame: The name of the frame.
-            name: The name of the constraint.
-            kinematics: The kinematics that constraints use.
-            constraint_force: lambda, shape (m, 1).
-
-        Returns:
-            The point in m and the force in N, shapes (3, 1).
+        """The point and force in N of a constraint on a frame, both in the world, shapes (3, 1).
 
         Raises:
             ModelError: There is no such constraint, or it does not act on the frame at one point.
@@ -134,19 +141,11 @@ class ConstraintSet:
     def wrenches(
         self, kinematics: Kinematics, constraint_force: ca.SX
     ) -> tuple[ca.SX, tuple[Signal, ...]]:
-        """The wrench of each constraint on each of its frames, with names and units.
+        """The wrench of each constraint on each of its frames, 6 rows each, with names and units.
 
         A wrench is a moment in N m and a force in N, as in Drake's SpatialForce, both in the world,
-        the force at the frame's origin. Those of one constraint on one frame are added.
-
-        Args:
-            kinematics: The kinematics that constraints use.
-            constraint_force: lambda, shape (m, 1).
-
-        Returns:
-            The wrenches of the first constraint on its frames, B before A, then those of the
-            others, 6 rows each, in terms of q, v and parameters; and their signals,
-            "<constraint>.<frame>.mx", ..., "<constraint>.<frame>.fz".
+        the force at the frame's origin. Those of one constraint on one frame are added. They are in
+        terms of q, v and parameters, and the signals "<constraint>.<frame>.mx", ..., ".fz".
         """
         rows, names = [ca.SX(0, 1)], []
         for constraint, part in self.parts():
@@ -164,13 +163,6 @@ class ConstraintSet:
         signals = tuple(Signal(f"{name}.{part}", unit) for name in names for part, unit in parts)
         return kinematics.value(ca.vertcat(*rows)), signals
 
-    def force_matrix(self, links: Links) -> ca.SX:
-        """G of M v' + H = G lambda + B tau, shape (nv, m): J^T without friction."""
-        kinematics, force = links.kinematics(), ca.SX.sym("force", self.size)
-        # (41)
-        columns = self.reaction(kinematics, force).map(lambda part: ca.jacobian(part, force))
-        return links.generalized_force(kinematics, columns)
-
     @property
     def joints(self) -> tuple[tuple[Constraint, Joint], ...]:
         """The joints that close loops, with their properties along the coordinate."""
@@ -182,54 +174,54 @@ class ConstraintSet:
         """Names and units of the motors' efforts in the loop-closing joints."""
         return tuple(joint.motor for _, joint in self.joints if joint.motor is not None)
 
-    def joint_state(self, links: Links) -> tuple[ca.SX, ca.SX]:
-        """The coordinates of the l loop-closing joints and their rates, shape (l, 1) each."""
-        kinematics, parts = links.kinematics(), [c for c, _ in self.joints]
-        positions = ca.vertcat(ca.SX(0, 1), *[c.coordinates(kinematics) for c in parts])
-        rates = ca.vertcat(ca.SX(0, 1), *[c.coordinate_rate(kinematics) for c in parts])
-        return kinematics.value(positions), kinematics.value(rates)
-
-    def joint_columns(self, links: Links) -> ca.SX:
-        """The generalized forces of unit efforts in the loop-closing joints, shape (nv, l)."""
-        kinematics, count = links.kinematics(), len(self.joints)
-        unit, total = ca.SX.sym("unit", count), Reaction(ca.SX(links.v.numel(), 1))
-        for i, (constraint, _) in enumerate(self.joints):
-            total += kinematics.reaction(unit[i] * constraint.coordinate_rate(kinematics))
-        columns = total.map(lambda part: ca.jacobian(part, unit))
-        return links.generalized_force(kinematics, columns)
-
-    def drag(self, links: Links) -> ca.SX:
-        """The generalized force of constraints independent of lambda, shape (nv, 1)."""
-        total, kinematics = ca.SX(links.v.numel(), 1), links.kinematics()
-        for constraint in self.constraints:
-            reaction = constraint.drag(kinematics)
-            if reaction is not None:
-                total += links.generalized_force(kinematics, reaction)
-        return total
-
     def contacts(self, links: Links) -> tuple[UnilateralInput, ...]:
         """The unilateral constraint forces, if friction acts on one of them."""
-        kinematics = links.kinematics()
-
-        def slides(constraint: Constraint) -> ca.SX | None:
+        kinematics, contacts = links.kinematics(), []
+        for constraint in self.constraints:
             sliding = constraint.sliding(kinematics)
-            return None if sliding is None else kinematics.value(sliding)
-
-        contacts = [
-            UnilateralInput(signal.name, constraint.friction_parameter, slides(constraint))
-            for constraint in self.constraints
-            for signal, pushes in zip(
-                constraint.force_signals, constraint.is_unilateral, strict=True
-            )
-            if pushes
-        ]
+            sliding = None if sliding is None else kinematics.value(sliding)
+            contacts += [
+                UnilateralInput(signal.name, constraint.friction_parameter, sliding)
+                for signal, pushes in zip(
+                    constraint.force_signals, constraint.is_unilateral, strict=True
+                )
+                if pushes
+            ]
         return tuple(contacts) if any(contact.friction for contact in contacts) else ()
 
-    def implicit(self, links: Links, acceleration: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """M v' + H - G lambda, shape (nv, 1), and phi'' (38), shape (m, 1), by inverse dynamics.
 
-        Neither M nor J is formed: see `Links.inverse_dynamics`.
-        """
-        kinematics = links.kinematics(acceleration)
-        balance = links.inverse_dynamics(kinematics, self.reaction(kinematics, force))
-        return balance, kinematics.value(kinematics.derivative(self.rate(kinematics)))
+class LoopState:
+    """The l joints of a robot that close loops, as expressions of q and v.
+
+    Attributes:
+        state: Their coordinates and rates (c, c'), shape (2 l, 1).
+        signals: Their names and units.
+        limits: The lower and the upper limits of (c, c'), shape (2 l,) each, infinite where there
+            are none.
+        columns: The generalized forces of unit efforts in the joints, shape (nv, l).
+        force: The generalized force of their springs and dampers, shape (nv, 1).
+        motors: The generalized forces of their motors, shape (nv, k).
+    """
+
+    def __init__(self, constraints: ConstraintSet, links: Links) -> None:
+        members, kinematics = constraints.joints, links.kinematics()
+        joints = [joint for _, joint in members]
+        coordinates = [c.coordinates(kinematics) for c, _ in members]
+        rates = [c.coordinate_rate(kinematics) for c, _ in members]
+        position = kinematics.value(ca.vertcat(ca.SX(0, 1), *coordinates))
+        rate = kinematics.value(ca.vertcat(ca.SX(0, 1), *rates))
+        self.state = ca.vertcat(position, rate)
+        named = [signal for c, _ in members for signal in c.coordinate_signals]
+        self.signals = (*named, *(signal.derivative(1) for signal in named))
+        fastest = [joint.velocity_limit for joint in joints]
+        low = [*(joint.lower for joint in joints), *(-v for v in fastest)]
+        high = [*(joint.upper for joint in joints), *fastest]
+        self.limits: tuple[FloatArray, FloatArray] = (np.array(low), np.array(high))
+        unit, total = ca.SX.sym("unit", len(joints)), Reaction(ca.SX(links.v.numel(), 1))
+        for i, own in enumerate(rates):
+            total += kinematics.reaction(unit[i] * own)
+        columns = total.map(lambda part: ca.jacobian(part, unit))
+        self.columns = links.generalized_force(kinematics, columns)
+        forces = [joint.force(position[i], rate[i]) for i, joint in enumerate(joints)]
+        self.force = ca.sparsify(ca.mtimes(self.columns, ca.vertcat(ca.SX(0, 1), *forces)))
+        self.motors = self.columns[:, [i for i, j in enumerate(joints) if j.motor is not None]]

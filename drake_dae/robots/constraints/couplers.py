@@ -1,17 +1,24 @@
-"""Joints that move together: gears, racks, mimic joints."""
+"""Joints that move together: gears, racks, mimic joints; and the constraints of a plant itself."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import casadi as ca
 import numpy as np
+from pydrake.multibody.inverse_kinematics import AddMultibodyPlantConstraints
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import PrismaticJoint
+from pydrake.solvers import LinearEqualityConstraint, MathematicalProgram
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import brief
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
-from drake_dae.robots.links.kinematics import Frames, Kinematics, position_index
+from drake_dae.robots.constraints.points import FixedDistance
+from drake_dae.robots.links.links import Frames, Kinematics, Links, position_index
+from drake_dae.robots.links.plant_frames import frame_name, joint_names
+from drake_dae.robots.surfaces.surface import triple
 
 
 @checked(ModelError)
@@ -48,18 +55,20 @@ class JointCoupler(Constraint):
     offset: float = 0.0
     unit: Literal["rad", "m"] = "rad"
     name: str = "coupler"
-    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.follower == self.leader:
             raise ModelError(f"'{self.follower}' cannot follow itself; name another leader")
         if self.ratio == 0.0:
             raise ModelError("ratio must not be zero; weld the joint if it shall not move")
-        if not isinstance(self.unit, str) or self.unit not in ("rad", "m"):
-            raise ModelError(f"unit must be 'rad' or 'm', got {brief(self.unit)}")
-        ratio = Parameter(f"{self.name}.ratio", np.array([self.ratio]))
-        offset = Parameter(f"{self.name}.offset", np.array([self.offset]), self.unit)
-        object.__setattr__(self, "parameters", (ratio, offset))
+        super().__post_init__()
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (
+            Parameter(f"{self.name}.ratio", np.array([self.ratio])),
+            Parameter(f"{self.name}.offset", np.array([self.offset]), self.unit),
+        )
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -91,3 +100,81 @@ class JointCoupler(Constraint):
             axes = share * axis.force, share * axis.moment
             applications.append(Application(axis.point, *axes, axis.child, axis.parent))
         return tuple(applications)
+
+
+def plant_constraints(links: Links) -> tuple[Constraint, ...]:
+    """The constraints of the plant of the links; none without a plant.
+
+    Couplers, which mimic joints are, become a `JointCoupler` "<follower>_coupler", and rods of
+    AddDistanceConstraint a `FixedDistance` "rod0", "rod1", ... Drake enforces them only in discrete
+    plants; here they hold in continuous time as well.
+
+    Raises:
+        ModelError: The plant has other constraints, or a rod with a stiffness.
+    """
+    plant = links.plant
+    if plant is None or plant.num_constraints() == 0:
+        return ()
+    constraints = (*couplings_of(plant), *_rods(plant))
+    others = plant.num_constraints() - len(constraints)
+    if others:
+        raise ModelError(
+            f"the plant has {others} constraint(s) that cannot be read back from it; take them out "
+            "of the plant or of its file, and give them as `constraints`: a ball constraint is "
+            "CoincidentPoints, a weld constraint WeldedFrames"
+        )
+    return constraints
+
+
+def couplings_of(plant: MultibodyPlant) -> list[JointCoupler]:
+    """The couplers of a finalized plant, read from a mathematical program of Drake.
+
+    Raises:
+        ModelError: The plant has a constraint that Drake does not describe.
+    """
+    program = MathematicalProgram()
+    q = program.NewContinuousVariables(plant.num_positions(), "q")
+    try:
+        AddMultibodyPlantConstraints(plant, q, program, plant.CreateDefaultContext())
+    except RuntimeError as error:
+        raise ModelError(
+            f"the plant has a constraint that is not supported ({error}); leave it out of the plant"
+        ) from None
+    couplers: list[JointCoupler] = []
+    followers: set[str] = set()
+    joints = joint_names(plant)
+    names = {joint.position_start(): name for name, joint in joints.items()}
+    index = {variable.get_id(): i for i, variable in enumerate(q)}
+    for binding in program.GetAllConstraints():
+        row = binding.evaluator()
+        if not isinstance(row, LinearEqualityConstraint) or binding.variables().size != 2:
+            continue
+        pair = [names[index[variable.get_id()]] for variable in binding.variables()]
+        factors = [float(factor) for factor in np.reshape(row.GetDenseA(), 2)]
+        # The follower has the factor 1. If both have it, either may be; no joint follows twice.
+        able = [i for i in (1, 0) if factors[i] == 1.0] or [0]
+        place = next((i for i in able if pair[i] not in followers), able[0])
+        follower, leader = pair[place], pair[1 - place]
+        followers.add(follower)
+        ratio = -factors[1 - place] / factors[place]
+        offset = float(row.lower_bound()[0]) / factors[place]
+        unit: Literal["m", "rad"] = "m" if isinstance(joints[follower], PrismaticJoint) else "rad"
+        couplers.append(JointCoupler(follower, leader, ratio, offset, unit, f"{follower}_coupler"))
+    return couplers
+
+
+def _rods(plant: MultibodyPlant) -> list[FixedDistance]:
+    found = []
+    rods = plant.GetDefaultDistanceConstraintParams()
+    for number, key in enumerate(sorted(rods, key=lambda key: key.get_value())):
+        rod = rods[key]
+        bodies = [plant.get_body(index) for index in (rod.bodyA(), rod.bodyB())]
+        start, end = (frame_name(plant, body.body_frame()) for body in bodies)
+        if np.isfinite(rod.stiffness()):
+            raise ModelError(
+                f"the distance constraint between '{start}' and '{end}' has a stiffness of "
+                f"{rod.stiffness():g} N/m: that is a spring and no rod; add a LinearSpringDamper"
+            )
+        point_a, point_b = (triple("a point", point) for point in (rod.p_AP(), rod.p_BQ()))
+        found.append(FixedDistance(start, point_a, end, point_b, rod.distance(), f"rod{number}"))
+    return found

@@ -1,8 +1,9 @@
 """Joints that close a loop, as constraints."""
 
 from abc import abstractmethod
-from dataclasses import dataclass, field
-from math import pi
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, pi
 from typing import ClassVar, Literal
 
 import casadi as ca
@@ -14,8 +15,9 @@ from drake_dae.arrays import brief
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
-from drake_dae.robots.links.joints import clean
-from drake_dae.robots.links.kinematics import Frames, Kinematics
+from drake_dae.robots.constraints.points import rotation_error
+from drake_dae.robots.links.joints import without_round_off
+from drake_dae.robots.links.links import Frames, Kinematics
 from drake_dae.robots.surfaces.surface import Vector
 
 Letter = Literal["x", "y", "z"]
@@ -36,9 +38,7 @@ class LoopJoint(Constraint):
     robot, after those of its other actuators. These forces are not on the port
     `constraint_wrenches`. c and c' are on the port `loop_state` of `RobotPlant`, and c can be an
     output, by `SurfaceCoordinates`. Limits are not enforced: reports and summaries say where c
-    exceeds them.
-
-    Its motor is rigid and has no rotor inertia; otherwise cut the loop at another joint.
+    exceeds them. Its motor is rigid, without rotor inertia; else cut the loop at another joint.
 
     Attributes:
         frame_a: Name of frame A, of the parent; it may be "world".
@@ -76,14 +76,12 @@ class LoopJoint(Constraint):
     motor: bool = False
     effort_limit: float | None = None
     name: str = "loop"
-    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
     units: ClassVar[tuple[str, str]]
     """The units of c and of its force."""
     coordinate: ClassVar[str]
     """The name of c."""
 
     def __post_init__(self) -> None:
-        check_letter("axis", self.axis)
         for key in ("damping", "stiffness"):
             if getattr(self, key) < 0.0:
                 raise ModelError(f"{key} must not be negative, got {getattr(self, key):g}")
@@ -96,13 +94,17 @@ class LoopJoint(Constraint):
         low, high = self._limits
         if not low < high:
             raise ModelError(f"lower must be below upper, got {low:g} and {high:g}")
-        (unit, force), parameters = self.units, []
-        for key, per in (("damping", f"{force} s/{unit}"), ("stiffness", f"{force}/{unit}")):
-            if getattr(self, key):
-                parameters.append(
-                    Parameter(f"{self.name}.{key}", np.array([getattr(self, key)]), per)
-                )
-        object.__setattr__(self, "parameters", tuple(parameters))
+        super().__post_init__()
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        unit, force = self.units
+        made = {"damping": f"{force} s/{unit}", "stiffness": f"{force}/{unit}"}
+        return tuple(
+            Parameter(f"{self.name}.{key}", np.array([getattr(self, key)]), per)
+            for key, per in made.items()
+            if getattr(self, key)
+        )
 
     @property
     @abstractmethod
@@ -135,26 +137,19 @@ class LoopJoint(Constraint):
 
     @property
     def joint(self) -> Joint:
-        low, high = self._limits
+        damping, stiffness = self.symbol("damping"), self.symbol("stiffness")
         return Joint(
-            lower=low,
-            upper=high,
-            velocity_limit=np.inf if self.velocity_limit is None else self.velocity_limit,
-            motor=Signal(f"{self.name}.motor", self.units[1]) if self.motor else None,
-            effort_limit=np.inf if self.effort_limit is None else self.effort_limit,
-            force=self._force,
+            lambda c, rate: -damping * rate - stiffness * (c - self.rest),
+            *self._limits,
+            inf if self.velocity_limit is None else self.velocity_limit,
+            Signal(f"{self.name}.motor", self.units[1]) if self.motor else None,
+            inf if self.effort_limit is None else self.effort_limit,
         )
 
     @property
     def _limits(self) -> tuple[float, float]:
         low, high = self.lower, self.upper
-        return -np.inf if low is None else low, np.inf if high is None else high
-
-    def _force(self, position: ca.SX, rate: ca.SX) -> ca.SX:
-        symbols = {p.name: p.symbol for p in self.parameters}
-        damping = symbols.get(f"{self.name}.damping", ca.SX(0))
-        stiffness = symbols.get(f"{self.name}.stiffness", ca.SX(0))
-        return -damping * rate - stiffness * (position - self.rest)
+        return -inf if low is None else low, inf if high is None else high
 
     @property
     def _held(self) -> tuple[list[int], list[int]]:
@@ -211,12 +206,10 @@ class RevoluteLoopJoint(LoopJoint):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = self._limits
-        middle = self._middle
-        ends = [end for end in (low, high, self.rest) if np.isfinite(end)]
-        if any(abs(end - middle) >= pi for end in ends):
+        ends = [end for end in (*self._limits, self.rest) if np.isfinite(end)]
+        if any(abs(end - self._middle) >= pi for end in ends):
             raise ModelError(
-                f"lower, upper and rest must be within half a turn of {middle:g} rad, got "
+                f"lower, upper and rest must be within half a turn of {self._middle:g} rad, got "
                 f"{brief(ends)}. Leave out both limits for a continuous joint"
             )
 
@@ -278,10 +271,8 @@ class PrismaticLoopJoint(LoopJoint):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.normal is not None:
-            check_letter("normal", self.normal)
-            if self.normal == self.axis:
-                raise ModelError(f"normal must be another axis than '{self.axis}', the joint's own")
+        if self.normal == self.axis:
+            raise ModelError(f"normal must be another axis than '{self.axis}', the joint's own")
 
     @property
     def held_axes(self) -> tuple[str, str]:
@@ -293,8 +284,7 @@ class PrismaticLoopJoint(LoopJoint):
     def residual(self, frames: Frames) -> ca.SX:
         R_FM, p_FM = self._relative(frames)
         held, turned = self._held
-        skew = ca.vertcat(R_FM[2, 1] - R_FM[1, 2], R_FM[0, 2] - R_FM[2, 0], R_FM[1, 0] - R_FM[0, 1])
-        return ca.vertcat(p_FM[held], (2 * skew / (1 + ca.trace(R_FM)))[turned])
+        return ca.vertcat(p_FM[held], rotation_error(R_FM)[turned])
 
     def coordinates(self, frames: Frames) -> ca.SX:
         return self._relative(frames)[1][self._own]
@@ -308,16 +298,7 @@ class PrismaticLoopJoint(LoopJoint):
         return ca.dot(R_WF[:, self._own], moving - carried)
 
 
-def check_letter(what: str, letter: str) -> None:
-    """Refuses a name that is not an axis of a frame.
-
-    Raises:
-        ModelError: It is none of "x", "y", "z".
-    """
-    if letter not in ("x", "y", "z"):
-        raise ModelError(f"{what} must be 'x', 'y' or 'z', got {brief(letter)}")
-
-
 def _rotation(rpy: Vector) -> ca.SX:
     """The rotation by roll, pitch and yaw; entries that are only round-off are structural zeros."""
-    return ca.SX(ca.sparsify(ca.DM(clean(RollPitchYaw(rpy).ToRotationMatrix().matrix()))))
+    rotation = RollPitchYaw(rpy).ToRotationMatrix().matrix()
+    return ca.SX(ca.sparsify(ca.DM(without_round_off(rotation))))

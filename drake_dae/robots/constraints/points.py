@@ -1,220 +1,24 @@
-"""Points on a surface, and points at a fixed distance."""
+"""Points at a fixed distance, points that coincide, and frames with a fixed relative pose."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
-from drake_dae.dae import Parameter, Signal
+from drake_dae.arrays import check_axes
+from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
-from drake_dae.robots.constraints.friction import Friction, friction_parameters
-from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
-from drake_dae.robots.surfaces.picture import PosedShape
-from drake_dae.robots.surfaces.surface import Surface, Vector, rotation_of, with_parameters
+from drake_dae.robots.constraints.constraint import Application, Constraint
+from drake_dae.robots.links.joints import constant_pose
+from drake_dae.robots.links.links import Frames, Kinematics
+from drake_dae.robots.links.plant_frames import body_with_frame
+from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.trace.expressions import length_of
-
-
-@checked(ModelError)
-@dataclass(frozen=True)
-class PointOnSurface(Constraint):
-    """A point of a frame stays on a surface: phi(q) = signed distance of p_W(q).
-
-    The constraint force is the normal force of the surface on the robot in N, positive towards the
-    free side; the contact is unilateral. The parameters "<name>.position" and "<name>.rpy" are the
-    position and orientation of the surface; if they are exogenous (see `RobotModel`), the surface
-    moves. Numbers of the surface's `shape` are parameters "<name>.<number>".
-
-    With friction the surface also exerts a tangential force, with the sliding velocity v_t in m/s
-    relative to the surface:
-
-        F_t = -(mu lambda s + d v_t),    s = v_t / sqrt(|v_t|^2 + v_s^2),
-
-    regularized Coulomb friction with the speed v_s, and viscous friction. It does not stick: below
-    v_s the point creeps. The parameters "<name>.friction", "<name>.stiction_tolerance" and
-    "<name>.viscous_friction" are mu, v_s and d; plant and law may have different values if both
-    have these parameters; use 0 for a surface that has them but no friction. If friction reverses
-    the effect of lambda on phi'', the Painleve paradox occurs: see `dae.system.contacts`.
-
-    With flexible joints, motors or hydraulics the law differentiates s, whose slopes are 1 / v_s.
-    With error control the prediction holds for all of them down to v_s = 0.001 m/s. At reversals of
-    the sliding direction the control then rises by a factor of 3 to 18 with flexible joints and
-    hydraulics; v_s = 0.01 m/s avoids this (0.03 m/s with hydraulics). With flexible joints and
-    fixed steps of 5 ms use 0.03 m/s: errors are 0.01 to 0.4 N at 0.01 m/s, and at 0.003 m/s the
-    steps fail. With rigid joints v_s does not affect the law.
-
-    Attributes:
-        frame: Name of the frame.
-        surface: A surface in the world.
-        point: The point in the frame, m, shape (3,).
-        name: The name of the constraint, the prefix of its force and its parameters.
-        rpy: Roll, pitch and yaw of the surface, rad, shape (3,): about the fixed axes x, y, z in
-            this order, as in Drake. None for no rotation and no such parameter.
-        friction: mu, not negative; None for no friction and no such parameters.
-        stiction_tolerance: v_s in m/s, Drake's stiction tolerance; only with friction.
-        viscous_friction: d in N s/m, not negative; None for none, without a parameter.
-
-    Raises:
-        ModelError: A coefficient is negative, or the speed not positive.
-    """
-
-    frame: str
-    surface: Surface
-    point: Vector = (0.0, 0.0, 0.0)
-    name: str = "surface"
-    rpy: Vector | None = None
-    friction: float | None = None
-    stiction_tolerance: float = 1e-3
-    viscous_friction: float | None = None
-    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
-    is_unilateral: ClassVar[tuple[bool, ...]] = (True,)
-
-    def __post_init__(self) -> None:
-        position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
-        turns = []
-        if self.rpy is not None:
-            turns.append(Parameter(f"{self.name}.rpy", np.array(self.rpy), "rad"))
-        frictional = friction_parameters(
-            self.name,
-            self.friction,
-            self.stiction_tolerance,
-            self.viscous_friction,
-        )
-        surface, shape = with_parameters(self.name, self.surface)
-        object.__setattr__(self, "surface", surface)
-        object.__setattr__(self, "parameters", (position, *turns, *frictional, *shape))
-
-    @property
-    def force_signals(self) -> tuple[Signal, ...]:
-        return (Signal(f"{self.name}.force", "N"),)
-
-    @property
-    def residual_signals(self) -> tuple[Signal, ...]:
-        return (Signal(f"{self.name}.distance", "m"),)
-
-    @property
-    def coordinate_signals(self) -> tuple[Signal, ...]:
-        coordinates = self.surface.coordinate_signals
-        return tuple(Signal(f"{self.name}.{signal.name}", signal.unit) for signal in coordinates)
-
-    def offset(self, frames: Frames) -> ca.SX:
-        """The point relative to the surface, in its axes, m, shape (3, 1)."""
-        return self.offset_of(frames.position(self.frame, self.point))
-
-    def offset_of(self, point: ca.SX) -> ca.SX:
-        """The same of any point in the world, shape (3, 1)."""
-        offset = point - self.parameters[0].symbol
-        return offset if self.rpy is None else ca.mtimes(self.rotation.T, offset)
-
-    @property
-    def rotation(self) -> ca.SX:
-        """The orientation of the surface in the world, shape (3, 3)."""
-        return ca.SX.eye(3) if self.rpy is None else rotation_of(self.parameters[1].symbol)
-
-    def _normal(self, frames: Frames) -> ca.SX:
-        """The gradient of phi in the world, shape (3, 1)."""
-        normal = self.surface.unit_normal(self.offset(frames))
-        return normal if self.rpy is None else ca.mtimes(self.rotation, normal)
-
-    def _friction(self, kinematics: Kinematics) -> Friction | None:
-        """The friction on the point; None without friction."""
-        if (sliding := self.sliding(kinematics)) is None:
-            return None
-        return Friction.of(self.name, self.parameters, sliding)
-
-    def sliding(self, kinematics: Kinematics) -> ca.SX | None:
-        if self.is_ideal:
-            return None
-        moved = self.surface_velocity(kinematics.position(self.frame, self.point))
-        velocity = kinematics.velocity(self.frame, self.point) - moved
-        normal = self._normal(kinematics)
-        return velocity - normal * ca.dot(normal, velocity)
-
-    def surface_velocity(self, point: ca.SX) -> ca.SX:
-        """The velocity of the surface at a point in the world, m/s, shape (3, 1)."""
-        moved = self.parameters[0].rate
-        if self.rpy is None:
-            return moved
-        turn, offset = self.parameters[1], ca.SX.sym("offset", 3)
-        turning = ca.jtimes(ca.mtimes(self.rotation, offset), turn.symbol, turn.rate)
-        return moved + ca.substitute(turning, offset, self.offset_of(point))
-
-    @property
-    def is_ideal(self) -> bool:
-        return self.friction is None and self.viscous_friction is None
-
-    @property
-    def friction_parameter(self) -> str | None:
-        return None if self.friction is None else f"{self.name}.friction"
-
-    def residual(self, frames: Frames) -> ca.SX:
-        return self.surface.distance(self.offset(frames))
-
-    def reaction(self, kinematics: Kinematics, constraint_force: ca.SX) -> Reaction:
-        pushed = super().reaction(kinematics, constraint_force)
-        frictional = self._friction(kinematics)
-        if frictional is None or self.friction is None:
-            return pushed
-        return pushed + kinematics.push(self.frame, frictional.pull * constraint_force, self.point)
-
-    def drag(self, kinematics: Kinematics) -> Reaction | None:
-        frictional = self._friction(kinematics)
-        if frictional is None or frictional.drag is None:
-            return None
-        return kinematics.push(self.frame, frictional.drag, self.point)
-
-    def coordinates(self, frames: Frames) -> ca.SX:
-        return self.surface.coordinates(self.offset(frames))
-
-    def touch(self, frames: Frames) -> Touch:
-        return Touch(
-            self.frame,
-            self.point,
-            self._normal(frames),
-            lambda point: self.surface.distance(self.offset_of(point)),
-            self.surface_velocity,
-            self.surface.has_exact_distance,
-        )
-
-    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        push, drag, frictional = self._normal(kinematics), None, self._friction(kinematics)
-        if frictional is not None:
-            push, drag = push + frictional.pull, frictional.drag
-        point = kinematics.position(self.frame, self.point)
-        return (Application(point, push, ca.SX(3, 1), self.frame, drag=drag),)
-
-    @property
-    def remark(self) -> str:
-        return f"{self.name}: {self.surface.remark}" if self.surface.remark else ""
-
-    @property
-    def extent(self) -> FloatArray | None:
-        return self.surface.extent
-
-    def placement(self, values: FloatArray) -> RigidTransform:
-        turn = np.zeros(3) if self.rpy is None else values[3:6]
-        return RigidTransform(RollPitchYaw(turn), values[:3])
-
-    def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
-        stands = self.placement(values)
-        picture = self._shaped(values).picture(stands.inverse() @ point, size)
-        return None if picture is None else picture.moved(stands)
-
-    def _shaped(self, values: FloatArray) -> Surface:
-        """The surface with the values of its shape numbers."""
-        return self.surface.shaped(ca.SX(values[len(values) - len(self.surface.shape) :]))
-
-    def solids(self, values: FloatArray) -> tuple[PosedShape, ...]:
-        pose = self.placement(values)
-        return tuple(solid.moved(pose) for solid in self.surface.solids())
-
-    def layer(self, values: FloatArray, point: FloatArray, size: float, depth: float) -> PosedShape:
-        pose = self.placement(values)
-        return self._shaped(values).layer(pose.inverse() @ point, size, depth).moved(pose)
 
 
 @checked(ModelError)
@@ -246,11 +50,10 @@ class FixedDistance(Constraint):
     point_b: Vector
     length: float
     name: str = "rod"
-    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
-        length = Parameter(f"{self.name}.length", np.array([self.length]), "m", positive=True)
-        object.__setattr__(self, "parameters", (length,))
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter(f"{self.name}.length", np.array([self.length]), "m", positive=True),)
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -272,3 +75,138 @@ class FixedDistance(Constraint):
     def _apart(self, frames: Frames) -> ca.SX:
         start = frames.position(self.frame_a, self.point_a)
         return frames.position(self.frame_b, self.point_b) - start
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class CoincidentPoints(Constraint):
+    """A point of frame B coincides with a point of frame A: phi(q) = p_WB(q) - p_WA(q).
+
+    A ball joint that closes a loop; in a planar mechanism, with the axes of the plane, a pin. The
+    constraint force is the force in N, in world axes, that A exerts on B at the point; B exerts the
+    opposite on A.
+
+    Attributes:
+        frame_a: Name of frame A, for example "world".
+        point_a: The point in frame A, m, shape (3,).
+        frame_b: Name of frame B, on another body.
+        point_b: The point in frame B, m, shape (3,).
+        axes: The axes of the world along which they coincide, for example "xz".
+        name: The name of the constraint, the prefix of its forces.
+    """
+
+    frame_a: str
+    point_a: Vector
+    frame_b: str
+    point_b: Vector
+    axes: str = "xyz"
+    name: str = "pin"
+
+    def __post_init__(self) -> None:
+        check_axes("axes", self.axes)
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        return signals([f"{self.name}.f{axis}" for axis in self.axes], "N")
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        return signals([f"{self.name}.{axis}" for axis in self.axes], "m")
+
+    def residual(self, frames: Frames) -> ca.SX:
+        point_b = frames.position(self.frame_b, self.point_b)
+        apart = point_b - frames.position(self.frame_a, self.point_a)
+        return apart[self._rows]
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        point = kinematics.position(self.frame_b, self.point_b)
+        axes = ca.SX.eye(3)[:, self._rows], ca.SX(3, len(self.axes))
+        return (Application(point, *axes, self.frame_b, self.frame_a),)
+
+    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
+        if len(self.axes) < 3:
+            return super().add_to(plant)
+        (a, pose_a), (b, pose_b) = (
+            body_with_frame(plant, name) for name in (self.frame_a, self.frame_b)
+        )
+        points = pose_a @ np.array(self.point_a), pose_b @ np.array(self.point_b)
+        return plant.AddBallConstraint(a, points[0], b, points[1])
+
+    @property
+    def _rows(self) -> list[int]:
+        return ["xyz".index(axis) for axis in self.axes]
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False)
+class WeldedFrames(Constraint):
+    """Frame B has a fixed pose (R, p) in frame A, as with Drake's AddWeldConstraint:
+
+        phi(q) = (p_AB(q) - p, 2 tan(theta / 2) n),    R_AB(q) R^T = turn by theta about n,
+
+    all in the axes of A. The constraint force is what A exerts on B, a force in N at B's origin and
+    a moment in N m, in the axes of A; B exerts the opposite on A at the same point. For at phi = 0
+    phi' = (v, w), the velocity and angular velocity of B in A, so that lambda^T phi' is the power
+    of such a force and moment: p_AB' = v, and with E = R_AB R^T, E' = w x E, the orientation error
+
+        r = 2 tan(theta / 2) n = 2 vee(E - E^T) / (1 + tr E)
+
+    has r' = w + w x r / 2 + (w . r) r / 4, which is w at r = 0. It is smooth up to half a turn,
+    where it is infinite. Unlike the sine of theta its only zero is the pose itself. The parameter
+    "<name>.position" is p.
+
+    Attributes:
+        frame_a: Name of frame A; it may be "world".
+        frame_b: Name of frame B, on another body.
+        pose: X_AB, the pose of B in A; by default the frames coincide.
+        name: The name of the constraint, before those of its forces and its parameter.
+    """
+
+    frame_a: str
+    frame_b: str
+    pose: RigidTransform = field(default_factory=RigidTransform)
+    name: str = "weld"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pose", RigidTransform(self.pose))
+        super().__post_init__()
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter(f"{self.name}.position", self.pose.translation(), "m"),)
+
+    @property
+    def force_signals(self) -> tuple[Signal, ...]:
+        forces, moments = ([f"{self.name}.{kind}{axis}" for axis in "xyz"] for kind in "fm")
+        return (*signals(forces, "N"), *signals(moments, "N m"))
+
+    @property
+    def residual_signals(self) -> tuple[Signal, ...]:
+        shifts, turns = ([f"{self.name}.{kind}{axis}" for axis in "xyz"] for kind in ("", "r"))
+        return (*signals(shifts, "m"), *signals(turns, "rad"))
+
+    def residual(self, frames: Frames) -> ca.SX:
+        R_AW = frames.rotation(self.frame_a).T
+        offset = frames.position(self.frame_b) - frames.position(self.frame_a)
+        rotation = ca.SX(ca.sparsify(ca.DM(constant_pose(self.pose)[0])))
+        E = ca.mtimes(R_AW, ca.mtimes(frames.rotation(self.frame_b), rotation.T))
+        shift = ca.mtimes(R_AW, offset) - self.parameters[0].symbol
+        return ca.vertcat(shift, rotation_error(E))
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        R_WA, none = kinematics.rotation(self.frame_a), ca.SX(3, 3)
+        point = kinematics.position(self.frame_b)
+        axes = ca.horzcat(R_WA, none), ca.horzcat(none, R_WA)
+        return (Application(point, *axes, self.frame_b, self.frame_a),)
+
+    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
+        (a, pose_a), (b, pose_b) = (
+            body_with_frame(plant, name) for name in (self.frame_a, self.frame_b)
+        )
+        return plant.AddWeldConstraint(a, pose_a @ self.pose, b, pose_b)
+
+
+def rotation_error(E: ca.SX) -> ca.SX:
+    """2 tan(theta / 2) n of the rotation by theta about n, shape (3, 1)."""
+    skew = ca.vertcat(E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1])
+    return 2 * skew / (1 + ca.trace(E))

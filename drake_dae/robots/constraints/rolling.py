@@ -1,18 +1,19 @@
 """Blades, wheels and balls: nonholonomic constraints."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import casadi as ca
 import numpy as np
+from pydrake.math import RigidTransform
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
-from drake_dae.robots.links.kinematics import Frames, Kinematics
-from drake_dae.robots.surfaces.picture import PosedShape
+from drake_dae.robots.links.links import Frames, Kinematics
 from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
 from drake_dae.trace.expressions import length_of
 
@@ -101,13 +102,15 @@ class RollingWheel(Constraint):
     normal: Vector = (0.0, 0.0, 1.0)
     holds_side: bool = True
     name: str = "wheel"
-    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("axle", "normal"):
             object.__setattr__(self, name, unit_vector(name, getattr(self, name)))
-        radius = Parameter(f"{self.name}.radius", np.array([self.radius]), "m", positive=True)
-        object.__setattr__(self, "parameters", (radius,))
+        super().__post_init__()
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter(f"{self.name}.radius", np.array([self.radius]), "m", positive=True),)
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -184,7 +187,6 @@ class RollingBall(Constraint):
     center: Vector = (0.0, 0.0, 0.0)
     along: Vector = (1.0, 0.0, 0.0)
     name: str = "ball"
-    parameters: tuple[Parameter, ...] = field(init=False, repr=False, compare=False)
     is_unilateral: ClassVar[tuple[bool, ...]] = (True, False, False)
 
     def __post_init__(self) -> None:
@@ -194,9 +196,14 @@ class RollingBall(Constraint):
                 "first order only; use Plane, Sphere, Cylinder or Torus"
             )
         object.__setattr__(self, "along", unit_vector("along", self.along))
-        position = Parameter(f"{self.name}.position", np.array(self.surface.position), "m")
-        radius = Parameter(f"{self.name}.radius", np.array([self.radius]), "m", positive=True)
-        object.__setattr__(self, "parameters", (position, radius))
+        super().__post_init__()
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (
+            Parameter(f"{self.name}.position", np.array(self.surface.position), "m"),
+            Parameter(f"{self.name}.radius", np.array([self.radius]), "m", positive=True),
+        )
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
@@ -234,9 +241,11 @@ class RollingBall(Constraint):
         axes = ca.horzcat(normal, tangents), ca.SX(3, 3)
         return (Application(point, *axes, self.frame),)
 
-    def picture(self, values: FloatArray, point: FloatArray, size: float) -> PosedShape | None:
-        picture = self.surface.picture(point - values[:3], size)
-        return None if picture is None else picture.moved(values[:3])
+    def surface_at(self, values: FloatArray) -> Surface:
+        return self.surface
+
+    def placement(self, values: FloatArray) -> RigidTransform:
+        return RigidTransform(values[:3])
 
     def _offset(self, frames: Frames) -> ca.SX:
         """The center relative to the surface's position, m, shape (3, 1)."""

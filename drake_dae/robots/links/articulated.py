@@ -30,11 +30,7 @@ def is_one_by_one(links: Sequence[TreeLink]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class ArticulatedInertia:
-    """Moment J w + H a and force H' w + M a of a link's acceleration (w, a), at its origin.
-
-    Attributes:
-        J, H, M: Shapes (3, 3); J and M are symmetric.
-    """
+    """Moment J w + H a and force H' w + M a of a link's acceleration (w, a), at its origin."""
 
     J: ca.SX
     H: ca.SX
@@ -62,11 +58,9 @@ class ArticulatedInertia:
 
 
 class ArticulatedBodies:
-    """M = L D L' of links that move one by one, as a `PositiveDefiniteFactorization`.
+    """M = L D L' of a tree of links that move one by one, as a `PositiveDefiniteFactorization`.
 
-    Args:
-        links: The tree, parents before children; the world is link 0.
-        rotors: The addition of the rotors to the diagonal of M, shape (nv,).
+    `rotors`, shape (nv,), are added to the diagonal of M.
     """
 
     def __init__(self, links: Sequence[TreeLink], rotors: FloatArray) -> None:

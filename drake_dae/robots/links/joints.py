@@ -1,7 +1,5 @@
 """The joints of a MultibodyPlant as rotations about coordinate axes and translations."""
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -34,26 +32,8 @@ SUPPORTED_JOINTS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class ElementaryJoints:
-    """A joint as elementary ones, from its inboard to its outboard frame.
-
-    Attributes:
-        sequence: The elementary joints from inboard to outboard; empty for a weld.
-        rotation: The constant R, shape (3, 3), such that X_FM(q) = R (sequence) R^T: it turns an
-            oblique joint axis into a coordinate axis, which saves operations.
-    """
-
-    sequence: tuple[ElementaryJoint, ...]
-    rotation: FloatArray
-
-
 def check_joint(joint: Joint) -> None:
-    """Refuses a joint that is not a sequence of rotations and translations.
-
-    Raises:
-        ModelError: It is a quaternion joint, or of a type that is not supported.
-    """
+    """Refuses a joint that is not a sequence of rotations and translations."""
     if isinstance(joint, SUPPORTED_JOINTS):
         return
     if joint.is_ephemeral():
@@ -73,53 +53,55 @@ def check_joint(joint: Joint) -> None:
 
 def elementary_joints(
     plant: MultibodyPlant, joint: Joint, reverse: bool = False
-) -> ElementaryJoints:
-    """Reads a supported joint as elementary ones.
+) -> tuple[list[ElementaryJoint], FloatArray]:
+    """A joint as elementary ones from inboard to outboard, and R with X_FM(q) = R (joints) R^T.
 
-    Args:
-        plant: The finalized plant of the joint.
-        joint: One that `check_joint` accepts.
-        reverse: Whether it leads from the frame on the child to the frame on the parent; Drake
-            allows it for revolute, prismatic and weld joints, where the inverse has the opposite
-            axis.
+    The constant R, shape (3, 3), turns an oblique axis into a coordinate axis, which saves
+    operations. A `reverse` joint leads from the frame on the child to the one on the parent; Drake
+    allows it for revolute, prismatic and weld joints, where the inverse has the opposite axis.
     """
     sign = -1.0 if reverse else 1.0
     i, j = joint.position_start(), joint.velocity_start()
     unit = np.eye(3)
-    if isinstance(joint, RevoluteJoint):
-        axis, rotation = _align(sign * joint.revolute_axis())
-        return ElementaryJoints((ElementaryJoint(axis, (i,), (j,), unit[:, [axis]]),), rotation)
-    if isinstance(joint, PrismaticJoint):
-        direction = sign * joint.translation_axis().reshape(3, 1)
-        return ElementaryJoints((ElementaryJoint(None, (i,), (j,), direction),), unit)
-    if isinstance(joint, ScrewJoint):
-        axis, rotation = _align(_screw_axis(plant, joint))
-        metres_per_radian = joint.screw_pitch() / (2.0 * np.pi)
-        shift = ElementaryJoint(None, (i,), (j,), metres_per_radian * unit[:, [axis]])
-        return ElementaryJoints(
-            (shift, ElementaryJoint(axis, (i,), (j,), unit[:, [axis]])), rotation
+
+    def turn(axis: int, k: int = 0) -> ElementaryJoint:
+        return ElementaryJoint(axis, (i + k,), (j + k,), unit[:, [axis]])
+
+    def shift(directions: FloatArray, first: int = 0) -> ElementaryJoint:
+        places = range(first, first + directions.shape[1])
+        return ElementaryJoint(
+            None, tuple(i + k for k in places), tuple(j + k for k in places), directions
         )
-    if isinstance(joint, UniversalJoint):
-        turns = [ElementaryJoint(k, (i + k,), (j + k,), unit[:, [k]]) for k in (0, 1)]
-        return ElementaryJoints(tuple(turns), unit)
-    if isinstance(joint, PlanarJoint):
-        shift = ElementaryJoint(None, (i, i + 1), (j, j + 1), unit[:, :2])
-        return ElementaryJoints((shift, ElementaryJoint(2, (i + 2,), (j + 2,), unit[:, [2]])), unit)
-    if isinstance(joint, BallRpyJoint):
-        return ElementaryJoints(_roll_pitch_yaw(i, j), unit)
-    if isinstance(joint, RpyFloatingJoint):
-        shift = ElementaryJoint(None, (i + 3, i + 4, i + 5), (j + 3, j + 4, j + 5), unit)
-        return ElementaryJoints((shift, *_roll_pitch_yaw(i, j)), unit)
-    return ElementaryJoints((), unit)
+
+    # R_FM = Rz(yaw) Ry(pitch) Rx(roll); the first turn carries the angular velocity in F.
+    roll_pitch_yaw = [
+        ElementaryJoint(2, (i + 2,), (j, j + 1, j + 2), unit),
+        ElementaryJoint(1, (i + 1,), (), np.zeros((3, 0))),
+        ElementaryJoint(0, (i,), (), np.zeros((3, 0))),
+    ]
+    match joint:
+        case RevoluteJoint():
+            axis, rotation = _align(sign * joint.revolute_axis())
+            return [turn(axis)], rotation
+        case PrismaticJoint():
+            return [shift(sign * joint.translation_axis().reshape(3, 1))], unit
+        case ScrewJoint():
+            axis, rotation = _align(_screw_axis(plant, joint))
+            metres_per_radian = joint.screw_pitch() / (2.0 * np.pi)
+            return [shift(metres_per_radian * unit[:, [axis]]), turn(axis)], rotation
+        case UniversalJoint():
+            return [turn(0), turn(1, 1)], unit
+        case PlanarJoint():
+            return [shift(unit[:, :2]), turn(2, 2)], unit
+        case BallRpyJoint():
+            return roll_pitch_yaw, unit
+        case RpyFloatingJoint():
+            return [shift(unit, 3), *roll_pitch_yaw], unit
+    return [], unit
 
 
 def joint_velocity_map(joint: Joint, q: ca.SX) -> ca.SX:
-    """N(q) of one joint, shape (k, k), with q' = N v for its own positions and velocities.
-
-    Args:
-        joint: A supported joint.
-        q: Its own positions, shape (k, 1).
-    """
+    """N(q) of one joint, shape (k, k), with q' = N v for its own positions and velocities."""
     count = joint.num_positions()
     block = ca.SX.eye(count)
     if isinstance(joint, (BallRpyJoint, RpyFloatingJoint)):
@@ -139,13 +121,8 @@ def read_links(
 ) -> tuple[list[TreeLink], dict[int, tuple[int, RigidTransform]]]:
     """Reads the tree of a plant whose joints are supported, outward from the world.
 
-    Args:
-        plant: The finalized plant.
-        q: Its positions, shape (nq, 1).
-
-    Returns:
-        The links, still without inertia, and for every body its index -> its link, and its
-        constant pose in that link.
+    Returns the links, still without inertia, and for every body its index -> its link, and its
+    constant pose in that link.
     """
     links = [TreeLink()]
     bodies = {int(plant.world_body().index()): (0, RigidTransform())}
@@ -165,10 +142,10 @@ def read_links(
             if isinstance(joint, WeldJoint):
                 X_LM = X_LF @ (joint.X_FM().inverse() if reverse else joint.X_FM())
             else:
-                parts = elementary_joints(plant, joint, reverse)
-                X_FA = RigidTransform(RotationMatrix(parts.rotation), np.zeros(3))
+                parts, rotation = elementary_joints(plant, joint, reverse)
+                X_FA = RigidTransform(RotationMatrix(rotation), np.zeros(3))
                 start = X_LF @ X_FA
-                for elementary in parts.sequence:
+                for elementary in parts:
                     links.append(TreeLink.moved(link, *constant_pose(start), elementary, q))
                     link, start = len(links) - 1, RigidTransform()
                 X_LM = X_FA.inverse()
@@ -179,10 +156,10 @@ def read_links(
 
 def constant_pose(pose: RigidTransform) -> tuple[FloatArray, FloatArray]:
     """R, shape (3, 3), and p, shape (3,), of a constant pose."""
-    return _snap(pose.rotation().matrix()), clean(pose.translation())
+    return _snap(pose.rotation().matrix()), without_round_off(pose.translation())
 
 
-def clean(values: FloatArray) -> FloatArray:
+def without_round_off(values: FloatArray) -> FloatArray:
     """Sets entries to zero that are below 1e-13 of the largest one."""
     return np.where(np.abs(values) < 1e-13 * np.abs(values).max(), 0.0, values)
 
@@ -194,16 +171,6 @@ def _snap(rotation: FloatArray) -> FloatArray:
     """
     nearest = np.rint(rotation)
     return np.where(np.abs(rotation - nearest) < 1e-13, nearest, rotation)
-
-
-def _roll_pitch_yaw(i: int, j: int) -> tuple[ElementaryJoint, ...]:
-    """R_FM = Rz(yaw) Ry(pitch) Rx(roll); the first turn carries the angular velocity in F."""
-    none = np.zeros((3, 0))
-    return (
-        ElementaryJoint(2, (i + 2,), (j, j + 1, j + 2), np.eye(3)),
-        ElementaryJoint(1, (i + 1,), (), none),
-        ElementaryJoint(0, (i,), (), none),
-    )
 
 
 def _screw_axis(plant: MultibodyPlant, joint: ScrewJoint) -> FloatArray:

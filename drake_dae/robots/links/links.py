@@ -1,15 +1,163 @@
-"""The contract of the links of a robot: M(q), H(q, v), and their frames."""
+"""The contracts of the links of a robot: M(q), H(q, v), and their frames, at rest and in motion."""
 
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol, Self
 
 import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Parameter, Signal
+from drake_dae.errors import ModelError
 from drake_dae.robots.links.articulated import ArticulatedBodies
-from drake_dae.robots.links.frames import Outline
-from drake_dae.robots.links.kinematics import Frames, Kinematics, Reaction
+
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+class Frames(Protocol):
+    """The poses of frames, as expressions. Frames are given by name; "world" is one.
+
+    `Links` and `Kinematics` are both of this kind, so functions of positions accept either.
+    """
+
+    @property
+    def q(self) -> ca.SX:
+        """Generalized positions, symbols, shape (nq, 1)."""
+
+    @property
+    def position_signals(self) -> tuple[Signal, ...]:
+        """Names and units of q."""
+
+    def rotation(self, frame: Any) -> ca.SX:
+        """R_WF, shape (3, 3): the orientation of a frame in the world."""
+
+    def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
+        """p_W in m, shape (3, 1): the position of a point that is fixed in a frame."""
+
+
+def position_index(frames: Frames, name: str) -> int:
+    """The index of a name among the generalized positions; ModelError if there is none."""
+    names = [signal.name for signal in frames.position_signals]
+    if name not in names:
+        raise ModelError(unknown_name("joint position", name, names))
+    return names.index(name)
+
+
+class JointAxis(NamedTuple):
+    """Force and moment of a unit generalized force of a joint, in the world, shapes (3, 1).
+
+    They act on the frame `child`, the force in N at `point`; the opposite acts on `parent`.
+    """
+
+    child: str
+    parent: str
+    point: ca.SX
+    force: ca.SX
+    moment: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
+class Reaction:
+    """Forces that act on a robot; k columns are k reactions.
+
+    Attributes:
+        generalized: A generalized force, shape (nv, k).
+        wrenches: Frame -> the force in N and the moment in N m on it, both in the world, the
+            force at the frame's origin, shapes (3, k).
+    """
+
+    generalized: ca.SX
+    wrenches: Mapping[Any, tuple[ca.SX, ca.SX]] = field(default_factory=dict)
+
+    def __add__(self, other: Self) -> "Reaction":
+        wrenches = dict(self.wrenches)
+        for frame, (force, moment) in other.wrenches.items():
+            total = wrenches.get(frame, (0, 0))
+            wrenches[frame] = (total[0] + force, total[1] + moment)
+        return Reaction(self.generalized + other.generalized, wrenches)
+
+    def map(self, function: Callable[[ca.SX], ca.SX]) -> "Reaction":
+        """The reaction with a function applied to every expression in it."""
+        wrenches = {frame: (function(f), function(m)) for frame, (f, m) in self.wrenches.items()}
+        return Reaction(function(self.generalized), wrenches)
+
+
+class Kinematics(ABC):
+    """The frames of a robot in motion, in which constraints are expressed.
+
+    1. Its expressions contain q, v, the robot's parameters, and symbols of its own for poses and
+       velocities of frames; `value` replaces these by their expressions.
+    2. `position` and `rotation` are functions of positions, `velocity` and `angular_velocity` are
+       linear in velocities, all of them in the world: R' = w x R, and `velocity(frame, point)` is
+       the time derivative of `position(frame, point)`.
+    3. `derivative(e)` is the time derivative along q' = N(q) v, v' = `acceleration`, of an
+       expression e of positions and velocities.
+    4. `reaction(power)` are the forces with a given power, linear in velocities: tau . v = power
+       with the generalized force tau that `Links` computes from them.
+    5. `joint_axis` of a position is the force and moment of its joint; None if the joint has
+       several positions, or if it is not known.
+
+    Attributes:
+        q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
+        position_signals: Names and units of q.
+        acceleration: v', shape (nv, 1).
+    """
+
+    q: ca.SX
+    position_signals: tuple[Signal, ...]
+    v: ca.SX
+    acceleration: ca.SX
+
+    @abstractmethod
+    def rotation(self, frame: Any) -> ca.SX:
+        """R_WF, shape (3, 3): the orientation of a frame in the world."""
+
+    @abstractmethod
+    def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
+        """p_W in m, shape (3, 1): the position of a point that is fixed in a frame."""
+
+    @abstractmethod
+    def angular_velocity(self, frame: Any) -> ca.SX:
+        """w in rad/s, shape (3, 1): the angular velocity of a frame, in the world."""
+
+    @abstractmethod
+    def velocity(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
+        """p_W' in m/s, shape (3, 1): the velocity of a point that is fixed in a frame."""
+
+    @abstractmethod
+    def derivative(self, expression: ca.SX) -> ca.SX:
+        """The time derivative of an expression of positions and velocities, shape (k, 1)."""
+
+    @abstractmethod
+    def reaction(self, power: ca.SX) -> Reaction:
+        """The forces on the links with a power in W that is linear in velocities."""
+
+    @abstractmethod
+    def value(self, expression: ca.SX) -> ca.SX:
+        """The expression in terms of q, v, `acceleration` and parameters alone."""
+
+    def joint_axis(self, position: str) -> JointAxis | None:
+        """The force and moment of the joint of a position, by the position's name."""
+        return None
+
+    def push(self, frame: Any, force: ca.SX, point: ArrayLike = ORIGIN) -> Reaction:
+        """The reaction of a force at a point of a frame, N, in the world; it may depend on v."""
+        pushing = ca.SX.sym("force", 3)
+        reaction = self.reaction(ca.dot(pushing, self.velocity(frame, point)))
+        return reaction.map(lambda part: ca.substitute(part, pushing, ca.densify(force)))
+
+
+class Outline(NamedTuple):
+    """Points of a link in one of its frames, m, shape (k, 3), and a radius around them in m."""
+
+    name: str
+    frame: Any
+    points: FloatArray = np.zeros((1, 3))
+    radius: float = 0.0
 
 
 class Links(Frames, Protocol):
@@ -94,11 +242,7 @@ class Links(Frames, Protocol):
         """Their MultibodyPlant, for Drake's visualization; None without one."""
 
     def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
-        """Factors of M by the articulated-body algorithm; None if they are not known.
-
-        Args:
-            rotors: The addition of the rotors to the diagonal of M, shape (nv,).
-        """
+        """Factors of M, where `rotors`, shape (nv,), are the addition of rotors to its diagonal."""
 
     def landmarks(self) -> ca.SX:
         """Points of the robot for views of it, in m, shape (3, k)."""
@@ -112,27 +256,13 @@ class Links(Frames, Protocol):
         """Points of the collision geometry of each link, of one without any its origin."""
 
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
-        """The frames in motion, in which constraints are expressed.
-
-        Args:
-            acceleration: v', shape (nv, 1); a symbol of its own if None.
-        """
+        """The frames in motion with v' = `acceleration`, a symbol of its own if None."""
 
     def generalized_force(self, kinematics: Any, reaction: Reaction) -> ca.SX:
-        """tau of each column of a reaction, shape (nv, k).
-
-        Args:
-            kinematics: The kinematics of the reaction, made by these links.
-            reaction: Forces that act on the links.
-        """
+        """tau of each column of a reaction in kinematics of these links, shape (nv, k)."""
 
     def inverse_dynamics(self, kinematics: Any, reaction: Reaction) -> ca.SX:
-        """M(q) v' + H(q, v) - tau of (37), shape (nv, 1), with v' of the kinematics.
-
-        Args:
-            kinematics: The kinematics of the reaction, made by these links.
-            reaction: Forces that act on the links, one column.
-        """
+        """M(q) v' + H(q, v) - tau of (37), shape (nv, 1), with v' of the kinematics."""
 
 
 def velocities_are_rates(links: Links) -> bool:

@@ -1,5 +1,6 @@
 """The equations of motion of a MultibodyPlant as CasADi expressions."""
 
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -7,33 +8,36 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody
+from pydrake.multibody.tree import BodyIndex, Frame, Joint, MultibodyForces
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.articulated import ArticulatedBodies, is_one_by_one
-from drake_dae.robots.links.comparison import compare_with_plant
-from drake_dae.robots.links.force_elements import Springs, check_force_elements
-from drake_dae.robots.links.frames import PlantFrames, outlines_of, position_of, unique_names
 from drake_dae.robots.links.joints import (
     check_joint,
-    clean,
     elementary_joints,
     joint_velocity_map,
     read_links,
+    without_round_off,
 )
-from drake_dae.robots.links.kinematics import ORIGIN, Reaction
-from drake_dae.robots.links.recursions import (
-    LinkKinematics,
+from drake_dae.robots.links.links import ORIGIN, Reaction
+from drake_dae.robots.links.plant_frames import PlantFrames, outlines_of, position_of, unique_names
+from drake_dae.robots.links.springs import Springs, force_elements
+from drake_dae.robots.links.tree import (
+    Inertia,
+    LinkMotion,
     frame_jacobian,
     inverse_dynamics,
-    link_kinematics,
+    link_motions,
     mass_matrix,
 )
-from drake_dae.robots.links.tree import Inertia
 from drake_dae.robots.links.tree_kinematics import TreeKinematics
+from drake_dae.trace.functions import TracedFunction
+
+TOLERANCE = 1e-10
+"""Of a comparison with the plant: round-off gives 1e-14, any modelling error far more."""
 
 
 @checked(ModelError)
@@ -58,25 +62,14 @@ class MultibodyExpressions:
         scene_graph: The scene graph with its geometry; without one links are their origins.
 
     Attributes:
-        plant: The plant.
-        q, v: Symbols, shapes (nq, 1) and (nv, 1), with nq = nv.
         parameters: The mass in kg of every body that has one, "<body>.mass". As in
             RigidBody.SetMass, center of mass and unit inertia do not change with it.
         position_signals, velocity_signals: Names and units of q ("joint1", "base_qx") and of v
             ("joint1_w", "base_wx"), unique in both together; a joint name that several model
             instances use is written "instance::joint1".
-        actuator_signals: Names and units of u.
-        velocity_map: N, shape (nq, nv).
-        mass_matrix: M, shape (nv, nv), structurally zero between branches.
-        bias: H, shape (nv, 1).
-        actuation_matrix: B, shape (nv, nu).
         effort_limits: The largest |u|, shape (nu,), inf without a limit. Drake's plant clips u to
             them; these equations do not.
-        reflected_inertia: The part of M from the rotors, in kg m^2 (kg), shape (nu,).
-        gear_ratios: Motor turns per joint turn, shape (nu,).
-        position_limits, velocity_limits: The lower and upper limits, shapes (nq,) and (nv,).
-        default_positions: The plant's default configuration, shape (nq,).
-        outlines: Points of the collision geometry of each body.
+        Others: as in `Links`.
 
     Raises:
         ModelError: The plant is not finalized, cannot move, or has a joint or force element that
@@ -84,11 +77,20 @@ class MultibodyExpressions:
     """
 
     def __init__(self, plant: MultibodyPlant, scene_graph: SceneGraph | None = None) -> None:
-        _check_support(plant)
+        if not plant.is_finalized():
+            raise ModelError("a finalized MultibodyPlant is needed; call plant.Finalize() first")
+        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        for joint in joints:
+            check_joint(joint)
+        force_elements(plant)
+        if plant.num_velocities() == 0:
+            raise ModelError("the plant has no joint that moves")
         self.plant = plant
-        self.outlines = outlines_of(plant, scene_graph, _bodies(plant))
-        self._joints = _moving_joints(plant)
-        self._read_signals()
+        self._bodies = [plant.get_body(BodyIndex(i)) for i in range(plant.num_bodies())]
+        self.outlines = outlines_of(plant, scene_graph, self._bodies)
+        moving = [joint for joint in joints if joint.num_velocities() > 0]
+        moving.sort(key=lambda joint: joint.velocity_start())
+        self._read_signals(moving)
         self._read_actuators()
         self.position_limits = (plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
         self.velocity_limits = (plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits())
@@ -99,24 +101,27 @@ class MultibodyExpressions:
         self._links, bodies = read_links(plant, self.q)
         self._frames = PlantFrames(plant, self._links, bodies)
         self.parameters = self._read_masses()
-        self.velocity_map = ca.diagcat(
-            *[
-                joint_velocity_map(joint, self.q[i : i + joint.num_positions()])
-                for joint, i in ((joint, joint.position_start()) for joint in self._joints)
-            ]
-        )
-        self._springs = Springs(
-            plant, self._joints, self._frames, self.q, self.v, self.velocity_map
-        )
+        blocks = []
+        for joint in moving:
+            i = joint.position_start()
+            blocks.append(joint_velocity_map(joint, self.q[i : i + joint.num_positions()]))
+        self.velocity_map = ca.diagcat(*blocks)
+        self._springs = Springs(plant, moving, self._frames, self.q, self.v, self.velocity_map)
         self.mass_matrix = mass_matrix(self._links, self._rotors)
         self.bias = self._newton_euler(self.v, self._gravity) - self._springs.force
-        self._compare_with_plant()
+        weight = -self._newton_euler(ca.SX.zeros(self.v.numel()), self._gravity)
+        terms = {
+            "mass matrix": self.mass_matrix,
+            "Coriolis and centrifugal forces": self._newton_euler(self.v, np.zeros(3)),
+            "gravity": weight,
+            "force elements and damping": weight + self._springs.force,
+            "bias": self.bias,
+            "velocity map": self.velocity_map @ self.v,
+        }
+        _compare_with_plant(plant, self.q, self.v, self.parameters, terms)
 
     def rotation(self, frame: str | Frame) -> ca.SX:
-        """R_WF, shape (3, 3): the orientation of a frame in the world.
-
-        Args:
-            frame: A frame of the plant, or its name; "instance::name" if several have that name.
+        """R_WF, shape (3, 3): the orientation of a frame, or of "instance::name", in the world.
 
         Raises:
             ModelError: No frame, or more than one, has that name.
@@ -126,42 +131,31 @@ class MultibodyExpressions:
     def position(self, frame: str | Frame, point: ArrayLike = ORIGIN) -> ca.SX:
         """p_W in m, shape (3, 1): the position in the world of a point fixed in a frame.
 
-        Args:
-            frame: A frame of the plant, or its name; "instance::name" if several have that name.
-            point: The point in the frame, m, shape (3,).
-
         Raises:
             ModelError: No frame, or more than one, has that name; or the point is not finite.
         """
         return position_of(self._frames.pose(self._frames.find(frame)), point)
 
     def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
-        """Factors of M by the articulated-body algorithm; None if joints have several velocities.
-
-        Args:
-            rotors: The addition of the rotors to the diagonal of M, shape (nv,).
-
-        Raises:
-            ModelError: They have another shape.
-        """
+        """Factors of M; None if a joint has several velocities."""
         rotors = vector("rotors", rotors, self.plant.num_velocities())
         return ArticulatedBodies(self._links, rotors) if is_one_by_one(self._links) else None
 
     def landmarks(self) -> ca.SX:
         """The origins of all bodies, in m, shape (3, k)."""
-        return ca.horzcat(*[self.position(body.body_frame()) for body in _bodies(self.plant)])
+        return ca.horzcat(*[self.position(body.body_frame()) for body in self._bodies])
 
     @property
     def landmark_names(self) -> tuple[str, ...]:
         """The names of all bodies, in the order of the landmarks."""
-        return tuple(body.name() for body in _bodies(self.plant))
+        return tuple(body.name() for body in self._bodies)
 
     def kinematics(self, acceleration: ca.SX | None = None) -> TreeKinematics:
         """The frames in motion with v' = `acceleration`, a symbol if None."""
         if acceleration is None:
             acceleration, moving = self._moving
         else:
-            moving = link_kinematics(self._links, self.v, acceleration, self._gravity)
+            moving = link_motions(self._links, self.v, acceleration, self._gravity)
         return TreeKinematics(
             self._frames,
             self.q,
@@ -174,10 +168,10 @@ class MultibodyExpressions:
         )
 
     @cached_property
-    def _moving(self) -> tuple[ca.SX, list[LinkKinematics]]:
+    def _moving(self) -> tuple[ca.SX, list[LinkMotion]]:
         """A symbol for v', and how each link moves with it."""
         acceleration = ca.SX.sym("acceleration", self.v.numel())
-        return acceleration, link_kinematics(self._links, self.v, acceleration, self._gravity)
+        return acceleration, link_motions(self._links, self.v, acceleration, self._gravity)
 
     def generalized_force(self, kinematics: TreeKinematics, reaction: Reaction) -> ca.SX:
         """tau of each column of a reaction, shape (nv, k)."""
@@ -225,9 +219,9 @@ class MultibodyExpressions:
             energy -= ca.dot(gravity, mass * origin + rotation @ first)
         return energy
 
-    def _read_signals(self) -> None:
+    def _read_signals(self, joints: Sequence[Joint]) -> None:
         positions, velocities = [], []
-        for joint, name in zip(self._joints, unique_names(self.plant, self._joints), strict=True):
+        for joint, name in zip(joints, unique_names(self.plant, joints), strict=True):
             for k in range(joint.num_positions()):
                 suffix = f"_{joint.position_suffix(k)}" if joint.num_positions() > 1 else ""
                 unit = "rad" if self._is_turned(joint, k) else "m"
@@ -237,10 +231,8 @@ class MultibodyExpressions:
 
     def _read_actuators(self) -> None:
         plant = self.plant
-        actuators = sorted(
-            (plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()),
-            key=lambda actuator: actuator.input_start(),
-        )
+        every = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
+        actuators = sorted(every, key=lambda actuator: actuator.input_start())
         self.actuator_signals = tuple(
             Signal(name, "N m" if self._is_turned(actuator.joint()) else "N")
             for actuator, name in zip(actuators, unique_names(plant, actuators), strict=True)
@@ -256,22 +248,21 @@ class MultibodyExpressions:
         self.reflected_inertia = np.array([a.default_reflected_inertia() for a in actuators])
         # As in Drake, the last of several actuators of a joint is used.
         self._rotors = np.zeros(plant.num_velocities())
-        for index in plant.GetJointActuatorIndices():
-            actuator = plant.get_joint_actuator(index)
-            joint = actuator.joint()
-            self._rotors[joint.velocity_start()] = actuator.default_reflected_inertia()
+        for actuator in every:
+            self._rotors[actuator.joint().velocity_start()] = actuator.default_reflected_inertia()
 
     def _is_turned(self, joint: Joint, k: int = 0) -> bool:
         """Whether the k-th position and velocity of a joint are angular."""
-        sequence = elementary_joints(self.plant, joint).sequence
-        return any(joint.position_start() + k in e.positions for e in sequence if e.is_turn)
+        parts, _ = elementary_joints(self.plant, joint)
+        turns = [place for part in parts if part.axis is not None for place in part.positions]
+        return joint.position_start() + k in turns
 
     def _read_masses(self) -> tuple[Parameter, ...]:
         """Makes every mass a parameter, and adds the bodies' inertias to their links.
 
         A point mass at its body's origin also has the parameter "<body>.center", its place.
         """
-        bodies = [body for body in _bodies(self.plant) if body.default_mass() > 0.0]
+        bodies = [body for body in self._bodies if body.default_mass() > 0.0]
         parameters = []
         for body, name in zip(bodies, unique_names(self.plant, bodies), strict=True):
             parameter = Parameter(f"{name}.mass", body.default_mass(), "kg", positive=True)
@@ -282,13 +273,15 @@ class MultibodyExpressions:
             lever = rotation @ body.default_com()
             second = rotation @ about_body @ rotation.T
             second += np.outer(lever, offset) + np.outer(offset, lever + offset)
+            mass = parameter.symbol
             if unit.any() or lever.any():
-                inertia = Inertia.of_mass(parameter.symbol, clean(lever + offset), clean(second))
+                moments = lever + offset, second
+                inertia = Inertia(mass, *(mass * ca.SX(without_round_off(m)) for m in moments))
             else:
                 center = Parameter(f"{name}.center", np.zeros(3), "m")
                 parameters.append(center)
-                place = clean(offset) + ca.mtimes(ca.SX(rotation), center.symbol)
-                inertia = Inertia.of_point(parameter.symbol, place)
+                place = without_round_off(offset) + ca.mtimes(ca.SX(rotation), center.symbol)
+                inertia = Inertia(mass, mass * place, mass * (place @ place.T))
             link = self._links[index]
             link.inertia += inertia
             if not self.plant.is_gravity_enabled(body.model_instance()):
@@ -301,39 +294,60 @@ class MultibodyExpressions:
 
     def _newton_euler(self, v: ca.SX, gravity: FloatArray) -> ca.SX:
         """Generalized forces at velocities v without acceleration, shape (nv, 1)."""
-        moving = link_kinematics(self._links, v, ca.SX(v.numel(), 1), gravity)
+        moving = link_motions(self._links, v, ca.SX(v.numel(), 1), gravity)
         return inverse_dynamics(self._links, moving, gravity, v.numel())
 
-    def _compare_with_plant(self) -> None:
-        weight = -self._newton_euler(ca.SX.zeros(self.v.numel()), self._gravity)
-        terms = {
-            "mass matrix": self.mass_matrix,
-            "Coriolis and centrifugal forces": self._newton_euler(self.v, np.zeros(3)),
-            "gravity": weight,
-            "force elements and damping": weight + self._springs.force,
-            "bias": self.bias,
-            "velocity map": self.velocity_map @ self.v,
+
+def _compare_with_plant(
+    plant: MultibodyPlant,
+    q: ca.SX,
+    v: ca.SX,
+    parameters: Sequence[Parameter],
+    terms: Mapping[str, ca.SX],
+) -> None:
+    """Compares each term with the plant's own value at three random states.
+
+    The error of a term is its largest absolute difference, over its own largest entry or over that
+    of M if that is larger: forces that cancel have no scale of their own.
+    """
+    symbols = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters])
+    values = np.concatenate([np.zeros(0), *[p.value for p in parameters]])
+    function = TracedFunction("comparison", {"q": q, "v": v, "parameters": symbols}, terms)
+    random, context = np.random.default_rng(0), plant.CreateDefaultContext()
+    for _ in range(3):
+        state = random.uniform(-1.0, 1.0, (2, v.numel()))
+        ours = dict(zip(terms, function(*state, values), strict=True))
+        plant.SetPositions(context, state[0])
+        plant.SetVelocities(context, state[1])
+        forces = MultibodyForces(plant)
+        plant.CalcForceElementsContribution(context, forces)
+        applied = plant.CalcGeneralizedForces(context, forces)
+        inertial = plant.CalcBiasTerm(context)
+        theirs = {
+            "mass matrix": plant.CalcMassMatrix(context),
+            "Coriolis and centrifugal forces": inertial,
+            "gravity": plant.CalcGravityGeneralizedForces(context),
+            "force elements and damping": applied,
+            "bias": inertial - applied,
+            "velocity map": plant.MapVelocityToQDot(context, state[1]),
         }
-        compare_with_plant(self.plant, self.q, self.v, self.parameters, terms)
-
-
-def _check_support(plant: MultibodyPlant) -> None:
-    """Refuses a plant that is not supported."""
-    if not plant.is_finalized():
-        raise ModelError("a finalized MultibodyPlant is needed; call plant.Finalize() first")
-    for index in plant.GetJointIndices():
-        check_joint(plant.get_joint(index))
-    check_force_elements(plant)
-    if plant.num_velocities() == 0:
-        raise ModelError("the plant has no joint that moves")
-
-
-def _moving_joints(plant: MultibodyPlant) -> list[Joint]:
-    """The joints that move, in the order of q and v."""
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    moving = [joint for joint in joints if joint.num_velocities() > 0]
-    return sorted(moving, key=lambda joint: joint.velocity_start())
-
-
-def _bodies(plant: MultibodyPlant) -> list[RigidBody]:
-    return [plant.get_body(BodyIndex(i)) for i in range(plant.num_bodies())]
+        size = np.abs(theirs["mass matrix"]).max()
+        if not size > 0.0:
+            raise ModelError(
+                "no link that moves has mass or inertia; give each of them an <inertial>, or weld "
+                "it to one that has"
+            )
+        for name, other in theirs.items():
+            if not np.all(np.isfinite(other)):
+                raise ModelError(
+                    f"the plant's own {name} is not finite at q = {state[0]}: a joint has no mass "
+                    "to move; give each moving link mass and inertia, or weld it"
+                )
+            scale = max(np.abs(other).max(), 1.0 if name == "velocity map" else size)
+            error = np.abs(ours[name] - other).max() / scale
+            if not error <= TOLERANCE:
+                raise ModelError(
+                    f"{name} differs from the plant's own by {error:.1e} (relative) at "
+                    f"q = {state[0]}, v = {state[1]}; this is an error in drake_dae, please "
+                    "report the model"
+                )

@@ -13,8 +13,7 @@ from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae import Parameter, Signal, as_expression, signals
 from drake_dae.dae.signals import is_symbol
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.frames import Outline
-from drake_dae.robots.links.kinematics import ORIGIN, Kinematics, Reaction
+from drake_dae.robots.links.links import ORIGIN, Kinematics, Outline, Reaction
 
 
 @checked(ModelError)

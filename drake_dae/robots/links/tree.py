@@ -1,12 +1,15 @@
 """A tree of links, each with its own frame, its inertia and one elementary joint to its parent.
 
-Frame names: P is the frame of a link's parent, L its own, W the world's. Quantities of a link are
-expressed in L unless said otherwise. A link moves by one elementary joint, so that its rotation
-is sparse; a joint with several is a chain of links, of which the last carries the inertia.
+Its algorithms (Featherstone, Rigid Body Dynamics Algorithms, 2008): the composite rigid body
+algorithm and the recursive Newton-Euler algorithm (chapters 5 and 6), in link frames. P is the
+frame of a link's parent, L its own, W the world's. Quantities of a link are expressed in L unless
+said otherwise. A link moves by one elementary joint, so that its rotation is sparse; a joint with
+several is a chain of links, of which the last carries the inertia.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -38,11 +41,6 @@ class ElementaryJoint:
     velocities: tuple[int, ...]
     directions: FloatArray
 
-    @property
-    def is_turn(self) -> bool:
-        """Whether its positions and velocities are angular."""
-        return self.axis is not None
-
 
 @dataclass(eq=False)
 class Inertia:
@@ -58,16 +56,6 @@ class Inertia:
     mass: ca.SX = field(default_factory=lambda: zeros(1))
     first: ca.SX = field(default_factory=lambda: zeros(3))
     second: ca.SX = field(default_factory=lambda: zeros(3, 3))
-
-    @classmethod
-    def of_mass(cls, mass: ca.SX, centre: FloatArray, second: FloatArray) -> "Inertia":
-        """The inertia of a mass symbol with its centre in m and second moment per mass in m^2."""
-        return cls(mass, mass * ca.SX(centre), mass * ca.SX(second))
-
-    @classmethod
-    def of_point(cls, mass: ca.SX, place: ca.SX) -> "Inertia":
-        """The inertia of a point mass at a place in m, both symbolic."""
-        return cls(mass, mass * place, mass * (place @ place.T))
 
     def __add__(self, other: "Inertia") -> "Inertia":
         return Inertia(self.mass + other.mass, self.first + other.first, self.second + other.second)
@@ -113,7 +101,10 @@ class TreeLink:
             shifting = {j: directions[:, c] for c, j in enumerate(joint.velocities)}
             moved = ca.SX(offset) + directions @ lengths
             return cls(parent, fixed, offset=moved, shifting=shifting)
-        turn = _turn_about(joint.axis, q[joint.positions[0]])
+        i, j = (joint.axis + 1) % 3, (joint.axis + 2) % 3
+        s, c = ca.sin(q[joint.positions[0]]), ca.cos(q[joint.positions[0]])
+        turn = ca.SX.eye(3)
+        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
         directions = turn.T @ ca.SX(joint.directions)
         turning = {j: ca.densify(directions[:, c]) for c, j in enumerate(joint.velocities)}
         return cls(parent, fixed, joint.axis, turn, ca.SX(offset), turning)
@@ -139,24 +130,22 @@ class TreeLink:
         )
 
     def to_parent_axes(self, matrix: ca.SX) -> ca.SX:
-        """A symmetric matrix in L, shape (3, 3), in the axes of P."""
-        fixed = ca.SX(self.fixed)
-        return fixed @ self._turn_second(matrix) @ fixed.T
+        """A symmetric matrix in L, shape (3, 3), in the axes of P.
 
-    def _turn_second(self, second: ca.SX) -> ca.SX:
-        """turn second turn^T with 16 operations instead of 75."""
-        if self.axis is None:
-            return second
-        k, i, j = self.axis, (self.axis + 1) % 3, (self.axis + 2) % 3
-        s, c = self.turn[j, i], self.turn[i, i]
-        g = s * (second[i, i] - second[j, j]) + 2 * c * second[i, j]
-        result = ca.SX(second)
-        result[i, i] = second[i, i] - s * g
-        result[j, j] = second[j, j] + s * g
-        result[i, j] = result[j, i] = c * g - second[i, j]
-        result[i, k] = result[k, i] = c * second[i, k] - s * second[j, k]
-        result[j, k] = result[k, j] = s * second[i, k] + c * second[j, k]
-        return result
+        turn matrix turn^T takes 16 operations here, and 75 as products.
+        """
+        turned = ca.SX(matrix)
+        if self.axis is not None:
+            k, i, j = self.axis, (self.axis + 1) % 3, (self.axis + 2) % 3
+            s, c = self.turn[j, i], self.turn[i, i]
+            g = s * (matrix[i, i] - matrix[j, j]) + 2 * c * matrix[i, j]
+            turned[i, i] = matrix[i, i] - s * g
+            turned[j, j] = matrix[j, j] + s * g
+            turned[i, j] = turned[j, i] = c * g - matrix[i, j]
+            turned[i, k] = turned[k, i] = c * matrix[i, k] - s * matrix[j, k]
+            turned[j, k] = turned[k, j] = s * matrix[i, k] + c * matrix[j, k]
+        fixed = ca.SX(self.fixed)
+        return fixed @ turned @ fixed.T
 
 
 def link_poses(links: Sequence[TreeLink]) -> list[tuple[ca.SX, ca.SX]]:
@@ -173,10 +162,136 @@ def symmetric(matrix: ca.SX) -> ca.SX:
     return ca.tril2symm(ca.tril(matrix))
 
 
-def _turn_about(axis: int, angle: ca.SX) -> ca.SX:
-    """The rotation about a coordinate axis, shape (3, 3)."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    s, c = ca.sin(angle), ca.cos(angle)
-    turn = ca.SX.eye(3)
-    turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
-    return turn
+def mass_matrix(links: Sequence[TreeLink], reflected_inertia: FloatArray) -> ca.SX:
+    """M, shape (nv, nv), by the composite rigid body algorithm; rotors add to its diagonal."""
+    M = ca.SX(ca.diag(reflected_inertia))
+    composite = [link.inertia for link in links]
+    for index in range(len(links) - 1, 0, -1):
+        link, inertia = links[index], composite[index]
+        composite[link.parent] += link.inertia_to_parent(inertia)
+        columns = []
+        for j, direction in link.turning.items():
+            moment = ca.trace(inertia.second) * direction - inertia.second @ direction
+            columns.append((j, moment, ca.cross(direction, inertia.first)))
+        for j, direction in link.shifting.items():
+            direction = link.rotation.T @ direction
+            columns.append((j, ca.cross(inertia.first, direction), inertia.mass * direction))
+        for j, moment, force in columns:
+            at = link
+            while at.parent >= 0:
+                for i, entry in at.generalized_force(moment, force):
+                    M[i, j] += entry
+                    if at is not link:
+                        M[j, i] += entry
+                moment, force = at.force_to_parent(moment, force)
+                at = links[at.parent]
+    return ca.sparsify(symmetric(M))
+
+
+def frame_jacobian(links: Sequence[TreeLink], index: int, origin: ca.SX, size: int) -> ca.SX:
+    """The velocity of a point of a link above its angular velocity, per unit of v, shape (6, nv).
+
+    In the world, as the position `origin` of the point, shape (3, 1); `size` is nv.
+    """
+    poses, result = link_poses(links), ca.SX(6, size)
+    while index > 0:
+        link, (rotation, position) = links[index], poses[index]
+        for j, direction in link.turning.items():
+            axis = rotation @ direction
+            result[:, j] += ca.vertcat(ca.cross(axis, origin - position), axis)
+        for j, direction in link.shifting.items():
+            result[:3, j] += poses[link.parent][0] @ direction
+        index = link.parent
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class LinkMotion:
+    """The motion of a link, in its own axes; vectors have shape (3, 1).
+
+    Attributes:
+        spin: The angular velocity in rad/s.
+        spin_rate: The derivative of the spin in rad/s^2.
+        velocity: The velocity of the origin, in m/s.
+        acceleration: The acceleration of the origin minus gravity, in m/s^2: gravity is represented
+            by an upward acceleration of the world.
+        gradient: A point r of the link has the acceleration `acceleration` + gradient r, in 1/s^2,
+            shape (3, 3).
+    """
+
+    spin: ca.SX
+    spin_rate: ca.SX
+    velocity: ca.SX
+    acceleration: ca.SX
+    gradient: ca.SX
+
+
+def link_motions(
+    links: Sequence[TreeLink], v: ca.SX, acceleration: ca.SX, gravity: FloatArray
+) -> list[LinkMotion]:
+    """The motion of every link, with v' = `acceleration`; gravity is in the world, in m/s^2."""
+    result = [LinkMotion(zeros(3), zeros(3), zeros(3), ca.SX(-gravity), zeros(3, 3))]
+    for link in links[1:]:
+        parent, to_link = result[link.parent], link.rotation.T
+        turning, turning_rate, shifting, shifting_rate = (
+            sum((rates[j] * d for j, d in directions.items()), zeros(3))
+            for directions in (link.turning, link.shifting)
+            for rates in (v, acceleration)
+        )
+        carried = to_link @ parent.spin
+        spin = carried + turning
+        spin_rate = to_link @ parent.spin_rate + ca.cross(carried, turning) + turning_rate
+        velocity = parent.velocity + ca.cross(parent.spin, link.offset) + shifting
+        moved = parent.gradient @ link.offset + 2 * ca.cross(parent.spin, shifting) + shifting_rate
+        outer = symmetric(spin @ spin.T)
+        result.append(
+            LinkMotion(
+                spin,
+                spin_rate,
+                to_link @ velocity,
+                to_link @ (parent.acceleration + moved),
+                ca.skew(spin_rate) + outer - ca.trace(outer) * ca.SX.eye(3),
+            )
+        )
+    return result
+
+
+def inverse_dynamics(
+    links: Sequence[TreeLink],
+    moving: Sequence[LinkMotion],
+    gravity: FloatArray,
+    size: int,
+    wrenches: Mapping[int, tuple[ca.SX, ca.SX]] = MappingProxyType({}),
+) -> ca.SX:
+    """Generalized forces, shape (nv, 1), by the recursive Newton-Euler algorithm.
+
+    Args:
+        links: The tree, parents before children; the world is link 0.
+        moving: The motion of each link.
+        gravity: Gravity in the world, m/s^2, shape (3,).
+        size: The number of velocities, nv.
+        wrenches: Index of a link -> moment about its origin in N m and force in N that act on it,
+            in the link's axes, each of shape (3, 1).
+    """
+    tau = zeros(size)
+    moments, forces = [zeros(3) for _ in links], [zeros(3) for _ in links]
+    poses = link_poses(links)
+    for index in range(len(links) - 1, 0, -1):
+        link, inertia, weightless = links[index], links[index].inertia, links[index].weightless
+        acceleration, gradient = moving[index].acceleration, moving[index].gradient
+        T = gradient @ inertia.second
+        force = forces[index] + inertia.mass * acceleration + gradient @ inertia.first
+        moment = moments[index] + ca.cross(inertia.first, acceleration)
+        moment += ca.vertcat(T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1])
+        if not weightless.mass.is_zero():
+            lift = poses[index][0].T @ ca.SX(gravity)
+            force += weightless.mass * lift
+            moment += ca.cross(weightless.first, lift)
+        if index in wrenches:
+            moment, force = moment - wrenches[index][0], force - wrenches[index][1]
+        for j, entry in link.generalized_force(moment, force):
+            tau[j] += entry
+        moment, force = link.force_to_parent(moment, force)
+        moments[link.parent] += moment
+        forces[link.parent] += force
+    return tau

@@ -11,17 +11,12 @@ import casadi as ca
 from numpy.typing import ArrayLike
 from pydrake.multibody.tree import Frame
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae import Signal
-from drake_dae.robots.links.frames import PlantFrames, check_point, position_of
-from drake_dae.robots.links.kinematics import (
-    ORIGIN,
-    JointAxis,
-    Kinematics,
-    Reaction,
-    position_index,
-)
-from drake_dae.robots.links.recursions import LinkKinematics
+from drake_dae.robots.links.joints import elementary_joints
+from drake_dae.robots.links.links import ORIGIN, JointAxis, Kinematics, Reaction, position_index
+from drake_dae.robots.links.plant_frames import PlantFrames, frame_name, position_of
+from drake_dae.robots.links.tree import LinkMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +35,7 @@ class _FrameSymbols:
 
 
 class TreeKinematics(Kinematics):
-    """The frames of a plant in motion.
-
-    Args:
-        frames: The plant's frames.
-        q, v, acceleration, position_signals: As in `Kinematics`.
-        velocity_map: N, shape (nq, nv).
-        moving: How each link moves, with gravity in its acceleration.
-        gravity: Gravity in the world, m/s^2, shape (3,).
-
-    Attributes:
-        moving: How each link moves, with gravity in its acceleration.
-    """
+    """The frames of a plant in motion; `moving` is how each link moves."""
 
     def __init__(
         self,
@@ -61,7 +45,7 @@ class TreeKinematics(Kinematics):
         acceleration: ca.SX,
         position_signals: tuple[Signal, ...],
         velocity_map: ca.SX,
-        moving: Sequence[LinkKinematics],
+        moving: Sequence[LinkMotion],
         gravity: FloatArray,
     ) -> None:
         self.q, self.v, self.acceleration = q, v, acceleration
@@ -83,7 +67,7 @@ class TreeKinematics(Kinematics):
         return ca.SX.zeros(3) if symbols is None else symbols.spin
 
     def velocity(self, frame: str | Frame, point: ArrayLike = ORIGIN) -> ca.SX:
-        symbols, offset = self._moving(self._frames.find(frame)), check_point(point)
+        symbols, offset = self._moving(self._frames.find(frame)), vector("a point", point, 3)
         if symbols is None:
             return ca.SX.zeros(3)
         return symbols.velocity + symbols.rotation_rate @ ca.SX(offset)
@@ -118,14 +102,22 @@ class TreeKinematics(Kinematics):
         return Reaction(ca.sparsify(ca.gradient(power, self.v)), wrenches)
 
     def joint_axis(self, position: str) -> JointAxis | None:
-        joint = self._frames.joint_at(position_index(self, position))
-        if joint is None:
+        plant, place = self._frames.plant, position_index(self, position)
+        for index in plant.GetJointIndices():
+            joint = plant.get_joint(index)
+            if joint.num_positions() == 1 and joint.position_start() == place:
+                break
+        else:
             return None
-        last = joint.elementary.sequence[-1]  # The rotation of a screw joint.
-        along = self.rotation(joint.frame) @ ca.SX(joint.elementary.rotation @ last.directions)
-        none = ca.SX(3, 1)
-        axes = (none, along) if last.is_turn else (along, none)
-        return JointAxis(joint.child, joint.parent, self.position(joint.frame), *axes)
+        (*_, last), rotation = elementary_joints(plant, joint)  # The rotation of a screw joint.
+        frame = joint.frame_on_child()
+        along, none = self.rotation(frame) @ ca.SX(rotation @ last.directions), ca.SX(3, 1)
+        child, parent = (
+            frame_name(plant, body.body_frame())
+            for body in (joint.child_body(), joint.parent_body())
+        )
+        axes = (along, none) if last.axis is None else (none, along)
+        return JointAxis(child, parent, self.position(frame), *axes)
 
     def value(self, expression: ca.SX) -> ca.SX:
         pairs = [pair for entry in self._symbols.values() for pair in self._values(*entry)]

@@ -17,7 +17,7 @@ from drake_dae.arrays import FloatArray, brief, numbers, positive, show, vector
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.files import MESHES, check_file, read_mesh
-from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
+from drake_dae.robots.surfaces.meshes import PosedShape, mesh_of_grid
 from drake_dae.robots.surfaces.surface import Pair, Surface, Vector, tangents, triple, unit_vector
 
 CELLS, BEYOND = 16, 3
@@ -85,7 +85,6 @@ class MeasuredSurface(Surface):
 
     @property
     def fit(self) -> "_Fit":
-        """The smooth heights."""
         return _fit(self, None if self.file is None else check_file(self.file, ModelError))
 
     @property
@@ -114,17 +113,17 @@ class MeasuredSurface(Surface):
 
     def picture(self, center: ArrayLike, size: float) -> PosedShape:
         even = np.linspace(-0.5, 0.5, 3 * CELLS + 1)
-        grid = self._piece(np.zeros(3), size, (even, even))
+        grid = self._patch(np.zeros(3), size, even, even)
         return PosedShape(mesh_of_grid(grid.swapaxes(0, 1)), RigidTransform())
 
     def _lengths(self, size: float) -> Pair:
         length, width = np.ptp(self.extent, axis=0)
         return float(length), float(width)
 
-    def _piece(
-        self, center: FloatArray, size: float, places: tuple[FloatArray, FloatArray]
+    def _patch(
+        self, center: FloatArray, size: float, rows: FloatArray, columns: FloatArray
     ) -> FloatArray:
-        sides = zip(self.extent.T, places, strict=True)
+        sides = zip(self.extent.T, (rows, columns), strict=True)
         x, y = (side.mean() + np.ptp(side) * part for side, part in sides)
         along, across = tangents(self.normal)
         level = x[:, None, None] * along + y[:, None] * across
@@ -133,7 +132,7 @@ class MeasuredSurface(Surface):
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The smooth heights h(x, y): a plane, and bells exp(-(x - x_j)^2 / 2 d^2) along x and y.
+    """The smooth heights: a plane, and bells exp(-(x - x_j)^2 / 2 d^2) along x and along y.
 
     Their distance d is their width: so they span polynomials to 1e-8 and are still distinct.
     """
@@ -200,8 +199,7 @@ def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
     spectra = [np.linalg.svd(bells, full_matrices=False) for bells in at]
     for least in LEAST:
         # Orthonormal values at the data, and the bells' factors for them.
-        kept = [sizes > least * sizes[0] for _, sizes, _ in spectra]
-        pairs = list(zip(spectra, kept, strict=True))
+        pairs = [(spectrum, spectrum[1] > least * spectrum[1][0]) for spectrum in spectra]
         basis_x, basis_y = (values[:, k] for (values, _, _), k in pairs)
         to_x, to_y = (factors[k].T / sizes[k] for (_, sizes, factors), k in pairs)
         shares = basis_y.T @ rest @ basis_x
@@ -242,7 +240,6 @@ def _read_table(file: Path) -> FloatArray:
 
 
 def _table(what: str, rows: Any) -> FloatArray:
-    """A table of heights."""
     heights = numbers(f"{what}: heights", rows)
     if heights.ndim != 2 or min(heights.shape) < 2 or heights.size > MOST_HEIGHTS:
         raise ModelError(f"{what}: heights are two rows of two at least, got {heights.shape}")
@@ -272,25 +269,23 @@ def _mesh_heights(
     areas = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
     facing = areas * np.linalg.det(axes) / extent**2  # A reflection turns all triangles.
     seen = facing > 1e-12 if np.any(facing > 1e-12) else facing < -1e-12
-    least = corners[..., :2].min(axis=1) - 1e-9 * extent
-    most = corners[..., :2].max(axis=1) + 2e-9 * extent
-    lowest, highest = (np.full((len(y), len(x)), end) for end in (np.inf, -np.inf))
-    for k in np.flatnonzero(seen):
-        columns = slice(*np.searchsorted(x, [least[k, 0], most[k, 0]]))
-        rows = slice(*np.searchsorted(y, [least[k, 1], most[k, 1]]))
-        across, up = np.meshgrid(x[columns] - corners[k, 0, 0], y[rows] - corners[k, 0, 1])
-        one, other = edges[k]
-        s = (across * other[1] - up * other[0]) / areas[k]
-        t = (one[0] * up - one[1] * across) / areas[k]
+    lowest, highest = (end(corners[..., 1], axis=1) for end in (np.min, np.max))
+    heights = np.empty((len(y), len(x)))
+    for row, level in enumerate(y):
+        crossed = seen & (lowest < level + 1e-9 * extent) & (highest > level - 1e-9 * extent)
+        first, (one, other) = corners[crossed, 0], edges[crossed].swapaxes(0, 1)
+        across, up = x[:, None] - first[:, 0], level - first[:, 1]
+        s = (across * other[:, 1] - up * other[:, 0]) / areas[crossed]
+        t = (one[:, 0] * up - one[:, 1] * across) / areas[crossed]
         inside = (s > -1e-9) & (t > -1e-9) & (s + t < 1 + 1e-9)
-        height = corners[k, 0, 2] + s * one[2] + t * other[2]
-        for kept, extreme in ((lowest, np.minimum), (highest, np.maximum)):
-            kept[rows, columns][inside] = extreme(kept[rows, columns], height)[inside]
-    for bad, what in (
-        (~np.isfinite(lowest), "has a hole; give a size that it covers"),
-        (highest - lowest > 1e-6 * extent, "overlaps itself; choose another normal or size"),
-    ):
-        if bad.any():
-            row, column = np.argwhere(bad)[np.count_nonzero(bad) // 2]
-            raise ModelError(f"at {show([x[column], y[row]])} m across the normal the mesh {what}")
-    return x, y, highest, distance
+        found = first[:, 2] + s * one[:, 2] + t * other[:, 2]
+        heights[row] = np.max(found, axis=1, initial=-np.inf, where=inside)
+        depth = heights[row] - np.min(found, axis=1, initial=np.inf, where=inside)
+        for bad, what in (
+            (~np.isfinite(heights[row]), "has a hole; give a size that it covers"),
+            (depth > 1e-6 * extent, "overlaps itself; choose another normal or size"),
+        ):
+            if bad.any():
+                place = show([x[np.argmax(bad)], level])
+                raise ModelError(f"at {place} m across the normal the mesh {what}")
+    return x, y, heights, distance

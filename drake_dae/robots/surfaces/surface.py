@@ -1,4 +1,4 @@
-"""The contract of a surface, and the drawing of any surface."""
+"""The contract of a surface, and directions on it."""
 
 import warnings
 from abc import ABC, abstractmethod
@@ -13,8 +13,13 @@ from pydrake.math import RigidTransform
 from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae import Parameter, Signal, as_expression
 from drake_dae.errors import ModelError
-from drake_dae.robots.surfaces.layer import facets_needed, layer_below, sides
-from drake_dae.robots.surfaces.picture import PosedShape, mesh_of_grid
+from drake_dae.robots.surfaces.meshes import (
+    PosedShape,
+    facets_needed,
+    layer_below,
+    mesh_of_grid,
+    sides,
+)
 from drake_dae.trace.expressions import length_of
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
@@ -47,7 +52,7 @@ class Surface(ABC):
        own contact; convex if there are several. A surface may have none. `layer` is a mesh below a
        piece of any smooth surface, for hydroelastic contact.
     8. `remark` describes its approximations, if any, and `extent` is the range of coordinates in
-       which it is defined, if that is bounded.
+       which it is defined, shape (2, 2), if that is bounded.
     """
 
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
@@ -60,18 +65,10 @@ class Surface(ABC):
 
     @abstractmethod
     def distance(self, offset: ca.SX) -> ca.SX:
-        """The signed distance of a point in m.
-
-        Args:
-            offset: The point relative to the reference point, m, shape (3, 1).
-        """
+        """The signed distance in m of a point relative to the reference point, shape (3, 1)."""
 
     def coordinates(self, offset: ca.SX) -> ca.SX:
-        """Coordinates along the surface of such a point, shape (2, 1).
-
-        Raises:
-            ModelError: The surface has none.
-        """
+        """Coordinates along the surface of such a point, shape (2, 1); ModelError without any."""
         raise ModelError(
             f"{type(self).__name__} has no coordinates along it; use PointCoordinates or an "
             "expression"
@@ -88,12 +85,10 @@ class Surface(ABC):
 
     @property
     def remark(self) -> str:
-        """Its approximations, as text; empty if there are none."""
         return ""
 
     @property
     def extent(self) -> FloatArray | None:
-        """The range of coordinates in which it is defined, shape (2, 2), or None."""
         return None
 
     def unit_normal(self, offset: ca.SX) -> ca.SX:
@@ -102,15 +97,13 @@ class Surface(ABC):
         return ca.substitute(ca.gradient(self.distance(p), p), p, offset)
 
     def picture(self, center: ArrayLike, size: float) -> PosedShape | None:
-        """The visible form of the surface, with its reference point at the origin.
+        """The visible form, with its reference point at the origin.
 
-        Warns if Newton's method finds no point of it near the center; then it is not drawn.
-
-        Args:
-            center: A point of interest, relative to the reference point, m, shape (3,).
-            size: The size of the piece to draw if it is unbounded, m.
+        `center` is a point of interest, relative to the reference point, and `size` the size of the
+        piece to draw if it is unbounded, m. Warns and draws nothing where Newton's method finds no
+        point of the surface near the center.
         """
-        grid = self._patch(np.asarray(center, float), size, (EVEN, EVEN))
+        grid = self._patch(np.asarray(center, float), size, EVEN, EVEN)
         if np.all(np.isfinite(grid), axis=2).sum() < 3:
             warnings.warn(
                 f"{type(self).__name__}: no point of it is found within {size:.3g} m of "
@@ -125,59 +118,39 @@ class Surface(ABC):
         return ()
 
     def layer(self, center: ArrayLike, size: float, depth: float) -> PosedShape:
-        """A layer of a mesh below a piece, with the reference point of the surface at the origin.
-
-        Args:
-            center: The middle of the piece, relative to the reference point, m, shape (3,).
-            size: The length of each side of the piece if the surface is unbounded, m.
-            depth: The thickness of the layer, m.
+        """A mesh of a thickness `depth` below a piece of the surface; arguments as of `picture`.
 
         Raises:
             ModelError: The piece is not on the surface everywhere, or too curved.
         """
-        place = np.asarray(center, float)
-        lengths = self._lengths(size)
-        facets = facets_needed(self._piece(place, size, (EVEN, EVEN)))
-        along, across = (
-            sides(count, length, depth) for count, length in zip(facets, lengths, strict=True)
-        )
-        grid = self._piece(place, size, (along, across))
-        return layer_below(grid, self._linear(), depth)
+        place, (length, width) = np.asarray(center, float), self._lengths(size)
+        rows, columns = facets_needed(self._patch(place, size, EVEN, EVEN))
+        places = sides(rows, length, depth), sides(columns, width, depth)
+        return layer_below(self._patch(place, size, *places), self._linear(), depth)
 
     def _lengths(self, size: float) -> Pair:
-        """The lengths of the sides of a piece in m: `size`, if the surface is unbounded."""
+        """The lengths of a patch along rows and columns in m."""
         return size, size
 
-    def _piece(
-        self, center: FloatArray, size: float, places: tuple[FloatArray, FloatArray]
-    ) -> FloatArray:
-        """The grid of a `layer`, as of `_patch`: of all of a bounded surface."""
-        return self._patch(center, size, places)
-
     def _linear(self) -> TracedFunction:
-        """The distance of a point and its gradient."""
+        """A point -> its distance, and the gradient of the distance."""
         p = ca.SX.sym("p", 3)
         distance = self.distance(p)
-        return TracedFunction(
-            "distance", {"offset": p}, {"distance": distance, "gradient": ca.gradient(distance, p)}
-        )
+        outputs = {"distance": distance, "gradient": ca.gradient(distance, p)}
+        return TracedFunction("distance", {"offset": p}, outputs)
 
     def _patch(
-        self, center: FloatArray, size: float, places: tuple[FloatArray, FloatArray]
+        self, center: FloatArray, size: float, rows: FloatArray, columns: FloatArray
     ) -> FloatArray:
         """A grid of points on the surface, shape (r, c, 3); NaN where there is none.
 
-        A grid of the tangent plane below `center`, projected onto the surface by Newton's method.
-
-        Args:
-            center, size: As for `picture`.
-            places: The places of rows and columns along the sides, from -1/2 to 1/2.
+        A grid of the tangent plane below the center, projected onto the surface by Newton's method.
+        The places of rows and columns along the sides are from -1/2 to 1/2.
         """
         function = self._linear()
 
         def linearize(point: FloatArray) -> NewtonModel | None:
-            gradient = function(point)[1]
-            return shortest_steps(gradient[None], lambda x: function(x)[0])
+            return shortest_steps(function(point)[1][None], lambda x: function(x)[0])
 
         def foot(point: FloatArray) -> FloatArray:
             nearest, solved = newton(point, linearize)
@@ -187,30 +160,23 @@ class Surface(ABC):
         middle = foot(center)
         if not np.all(np.isfinite(middle)):
             middle = center
-        normal = function(middle)[1]
-        if not (np.all(np.isfinite(normal)) and normal.any()):
-            # A tip or an axis, where the distance has no gradient; there is one next to it.
-            normal = function(middle + size * np.array([0.07, 0.11, 0.13]))[1]
-        if not (np.all(np.isfinite(normal)) and normal.any()):
-            return np.full((1, 1, 3), np.nan)
-        first, second = tangents(normal / np.linalg.norm(normal))
-        rows, columns = (size * part for part in places)
-        return np.array([[foot(middle + a * first + b * second) for b in columns] for a in rows])
+        # At a tip or on an axis the distance has no gradient; there is one next to it.
+        for place in (middle, middle + size * np.array([0.07, 0.11, 0.13])):
+            normal = function(place)[1].copy()
+            if np.all(np.isfinite(normal)) and normal.any():
+                first, second = tangents(normal / np.linalg.norm(normal))
+                along, across = size * first, size * second
+                grid = [[foot(middle + a * along + b * across) for b in columns] for a in rows]
+                return np.array(grid)
+        return np.full((1, 1, 3), np.nan)
 
 
 def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Parameter, ...]]:
-    """A surface with symbols for its shape numbers, and these as parameters "<name>.<number>".
-
-    Args:
-        name: The name of the constraint that has the parameters.
-        surface: The surface.
-    """
-    parameters = tuple(
-        Parameter(f"{name}.{key}", np.array([value])) for key, value in surface.shape.items()
-    )
-    if not parameters:
+    """A surface with symbols for its shape numbers, and these as parameters "<name>.<number>"."""
+    numbers = tuple(Parameter(f"{name}.{key}", np.array([n])) for key, n in surface.shape.items())
+    if not numbers:
         return surface, ()
-    return surface.shaped(ca.vertcat(*(parameter.symbol for parameter in parameters))), parameters
+    return surface.shaped(ca.vertcat(*(number.symbol for number in numbers))), numbers
 
 
 def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -249,21 +215,13 @@ def rotation_of(rpy: ca.SX) -> ca.SX:
 
 
 def triple(name: str, value: ArrayLike) -> Vector:
-    """Three finite numbers as a tuple.
-
-    Raises:
-        ModelError: They are not three finite numbers.
-    """
-    array = vector(name, value, 3)
-    return (float(array[0]), float(array[1]), float(array[2]))
+    """Three finite numbers as a tuple."""
+    x, y, z = vector(name, value, 3).tolist()
+    return x, y, z
 
 
 def unit_vector(name: str, value: ArrayLike) -> Vector:
-    """A direction of any length, normalized.
-
-    Raises:
-        ModelError: It is not three finite numbers, or zero.
-    """
+    """A direction of any length, normalized; one of zero length raises ModelError."""
     array = np.array(triple(name, value))
     length = float(np.linalg.norm(array))
     if length == 0.0:

@@ -26,7 +26,7 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots import (
     Constraint,
-    Coupling,
+    JointCoupler,
     PrismaticLoopJoint,
     RevoluteLoopJoint,
     axes_along,
@@ -128,7 +128,7 @@ def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
 
 @at("robot.locked")
 def _lock_joints(
-    locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[Coupling]
+    locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[JointCoupler]
 ) -> None:
     """Replaces joints, and those that are coupled to them, by welds with their constant X_FM(q).
 
@@ -173,7 +173,9 @@ def _lock_joints(
             plant.AddCouplerConstraint(*pair, coupling.ratio, coupling.offset)
 
 
-def _with_coupled(locked: Mapping[str, float], couplings: Sequence[Coupling]) -> dict[str, float]:
+def _with_coupled(
+    locked: Mapping[str, float], couplings: Sequence[JointCoupler]
+) -> dict[str, float]:
     """The positions of locked joints, and of those that are coupled to them."""
     positions = dict(locked)
     for _ in couplings:  # As often as the longest chain needs.
@@ -196,7 +198,7 @@ def _with_coupled(locked: Mapping[str, float], couplings: Sequence[Coupling]) ->
 def _drive_joints(
     driven: str | Sequence[str] | Mapping[str, float | None],
     plant: MultibodyPlant,
-    couplings: Sequence[Coupling],
+    couplings: Sequence[JointCoupler],
     mender: Mender,
 ) -> None:
     """Adds actuators to the joints that a scenario names, and removes those of all other joints.
@@ -251,7 +253,7 @@ def _of_joints(plant: MultibodyPlant, values: Mapping[tuple[str, str], T]) -> di
     return found
 
 
-def _couplings(plant: MultibodyPlant, mender: Mender) -> list[Coupling]:
+def _couplings(plant: MultibodyPlant, mender: Mender) -> list[JointCoupler]:
     """The couplings of joints of a plant, by names."""
     if plant.num_constraints() == 0:
         return []
@@ -260,7 +262,7 @@ def _couplings(plant: MultibodyPlant, mender: Mender) -> list[Coupling]:
     couplings = []
     for name, (leader, ratio, offset) in _of_joints(plant, mender.joints["follows"]).items():
         leading = names.get((int(joints[name].model_instance()), leader))
-        couplings += [Coupling(name, leading, ratio, offset)] if leading else []
+        couplings += [JointCoupler(name, leading, ratio, offset)] if leading else []
     return couplings
 
 

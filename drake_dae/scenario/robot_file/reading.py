@@ -140,19 +140,7 @@ def read_robot(
     drawn: bool = True,
     plant: MultibodyPlant | None = None,
 ) -> tuple[MultibodyPlant, Mender]:
-    """Reads the models of the robot's file into a plant that is not finalized.
-
-    Args:
-        robot: The key `robot` of the scenario.
-        scene_graph: The scene graph for the robot's geometry; None leaves geometry out.
-        drawn: Whether the geometry will be drawn: visual meshes are converted then, which takes
-            longer than all else.
-        plant: The plant, registered in the scene graph; None makes one.
-
-    Raises:
-        ModelError: The files cannot be read, or are not supported.
-        ScenarioError: A key of the scenario does not fit; the message names the key.
-    """
+    """Reads the models of the robot's file into a plant that is not finalized."""
     if plant is None:
         plant = MultibodyPlant(0.0)  # In continuous time, as (37).
         if scene_graph is not None:

@@ -1,85 +1,97 @@
-"""An estimator of state, disturbance and friction from measured positions."""
+"""One estimator of what a law does not know: state, disturbance, friction and parameters."""
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers
-from drake_dae.blocks.block import TIME, Held, where_finite
+from drake_dae.arrays import FloatArray, numbers, positive
+from drake_dae.blocks.block import Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae import TrackingLaw
+from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError
-from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
-from drake_dae.systems.observing.observer_rates import Observing
-from drake_dae.systems.observing.observing_system import (
-    ObservingSystem,
-    check_timing,
-    columns,
-    observer_block,
-)
+from drake_dae.systems.observing.observing import Observing
+from drake_dae.systems.observing.sample import EstimatorSample
+from drake_dae.systems.parameterized import ParameterizedSystem
 
 
 @checked(ModelError)
-class StateEstimator(ObservingSystem):
-    """Estimates the state of a robot with rigid joints from its encoders, with model errors.
+class StateEstimator(ParameterizedSystem):
+    """Estimates what a law does not know: disturbance, friction, parameters, and the state.
 
-    Between samples the model predicts the state and the disturbance r,
+    **Disturbance** r, in E x' = f + S d + g v + h u. It is corrected by the momentum p = S^T E x
+    that the model did not predict over a sample T,
 
-        q' = v,    M v' = f + C mu + r + g lambda + h u,
+        r_k = r_(k-1) + gain (p_k - predicted p_k) / T,    gain = 1 - e^(-k_o T),
 
-    with the control u that acted and the measured force lambda; so velocities need no differences.
-    Viscous friction D in joints, which makes light links stiff, is implicit: M + T D then replaces
-    M in the prediction and before K_3.
-    At a sample the error of the predicted positions, e = qm - q, corrects all of them,
+    so a constant d is reached as 1 - e^(-k_o t), and velocity noise n leaves some k_o M n in r. Its
+    part along the constrained directions has the rate k_n. With flexible joints or motors the law
+    needs derivatives of r, which is then the output of several lags in series, see `Lags`.
 
-        q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,
+    **State.** With exact velocities x is as measured, and p_k - predicted p_k is the difference of
+    two samples without what the model knows. With a `state_rate` w it is predicted by
+    q' = v, M v' = f + C mu + r + g lambda + h u, with the control that acted and the measured
+    force, and corrected by measured positions,
 
-    where (K_1, K_2, K_3) is the gain of the stationary Kalman filter of each position; see
-    `ChainFilter`. Since r is an acceleration there, M^-1 r, one gain serves all postures, and the
-    errors of the estimate are those of a linear filter for any motion. Along the constrained
-    directions, M^-1 J^T A^-1 J e, the gains are those of k_n in place of k_o. Measured velocities,
-    if their noise is given, correct likewise. Friction takes its share of r as in a
-    `DisturbanceObserver`, and so does a contact that sticks. In the prediction friction is
-    implicit, and at most stops a contact; it is fully developed from v_s / 10 on also where
-    contacts are ideal, since an estimate with the model's own friction grew without bound there. At
-    its first break-away a contact has a filter of its own, `BreakAway`.
+        q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,    e = qm - q,
+
+    by the gains (K_1, K_2, K_3) of the stationary Kalman filter of each position, `ChainFilter`:
+    M K_2 e / T is the momentum that was not predicted, and K_3 is about k_o K_2. Viscous friction
+    in joints and friction of contacts are implicit. This is for rigid joints.
+
+    **Friction.** With c = S^T dg/dmu v it takes its share of r,
+
+        mu' = k_f (c . r) / (c . c),    r' = ... - c mu',
+
+    so that r + c mu follows d for any k_f. At its first break-away see `EstimatorSample`.
+
+    **Parameters** that `with_disturbance` made exogenous are estimated together with friction by a
+    Kalman filter of r, `ParameterFilter`.
 
     Input ports:
-        measured_state: (q, v) as encoders measure it, shape (n,). v is used at the first sample;
-            later only if its noise is given.
+        measured_state: x, shape (n,). With a state_rate velocities are used at the first sample;
+            later only if their noise is given.
         control: The applied u, shape (p,).
-        measured_force: The constraint force, shape (m,); if the law measures it.
-        hold, reference: As of a `DisturbanceObserver`.
+        measured_force: v, shape (m,); with a state_rate only if the law measures it.
+        hold: Not 0 while a drive is at its limit, shape (1,); 0 without a wire. Then mu and
+            parameters are not updated; r is, since it depends on the applied u.
+        reference: R of the controller; without a wire the current outputs and rates.
 
     Output ports:
-        estimated_state: The estimate of (q, v) at the present sample, shape (n,).
-        exogenous, disturbance, friction, hold: As of a `DisturbanceObserver`, at the present
-            sample.
-        estimated_force: Only if the law measures no force: that of the model in the last sample, v
-            = alpha(x) + beta(x) u (25) with the observed disturbance and friction, shape (m,). It
-            has the model errors along the constrained directions.
+        estimated_state: The estimate at the present sample, shape (n,); with a state_rate.
+        exogenous: The disturbance to compensate, mu and parameters, each with the derivatives that
+            the law needs, for the port of a `TrackingController` with the same law.
+        disturbance, friction: r, shape (k,), and mu, shape (c,).
+        hold: 1 while the input `hold` is not 0 or a frictional contact is lost, else 0, shape (1,):
+            for the integrals of the controller.
+        identified, identified_deviation: All estimated parameters with friction, and their standard
+            deviations, shape (c,) each; only with such parameters.
+        estimated_force: That of the model, v = alpha(x) + beta(x) u (25), with r and mu, shape
+            (m,); only with a state_rate, if the law measures none.
+
+    Estimates are held between samples; r starts at 0, and mu at the model's coefficients.
 
     Args:
         law: The law, for a system that `with_disturbance` made.
         observing: The rates, and the thresholds for friction.
         sample_period: T in s.
-        control_lag, control_delay: As of a `DisturbanceObserver`.
+        control_lag: The fraction of T for which the plant uses the previous control, from 0 to 1: 1
+            for a discrete plant of that step, 0 for a `ControlHold` without delay before a
+            continuous plant.
+        control_delay: The mean time in s from a sample until its control acts: the delay, and half
+            of T, for which it is held.
         plant_step: The step of a discrete plant in s; 0 for a continuous plant.
-        position_deviation: The standard deviation of a measured position, in rad or m, a number or
-            shape (k,).
-        velocity_deviation: That of a measured velocity, likewise; 0 if none is measured.
-
-    Attributes:
-        observation: The observed functions.
-        observing, sample_period: The arguments.
-        disturbance_signals, friction_signals: Names and units of the output ports.
+        position_deviation, velocity_deviation: The standard deviations of measured positions and
+            velocities, numbers or of shape (k,); 0 for velocities that are not measured.
+        is_ideal: Whether contacts are ideal, with the friction of the model. On a contact that
+            gives way friction is fully developed at a tenth of the speed.
 
     Raises:
-        ModelError: The law's system has no disturbance, is no robot with rigid joints, or a number
-            is not valid.
+        ModelError: The law's system has no disturbance, or is none with rigid joints where the
+            state is to be estimated, or a number is not valid.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -94,58 +106,114 @@ class StateEstimator(ObservingSystem):
         plant_step: float = 0.0,
         position_deviation: ArrayLike = 0.0,
         velocity_deviation: ArrayLike = 0.0,
+        is_ideal: bool = False,
     ) -> None:
-        period = check_timing(sample_period, control_lag, control_delay)
-        system, count = law.system, law.system.num_states // 2
-        noise = [
-            _each(name, given, count)
-            for name, given in (
-                ("position_deviation", position_deviation),
-                ("velocity_deviation", velocity_deviation),
-            )
-        ]
-        filters = state_filters(observing, period, *noise)
-        timing = period, control_lag, control_delay, plant_step
-        functions = EstimatorFunctions(law, observing, *timing, filters, noise[0])
-        sizes = dict(zip(functions.now.input_names, functions.now.sizes, strict=True))
-        memory, p = ca.SX.sym("held", sizes["held"]), system.parameter_symbol
-        inputs = columns(law, "measured_state", with_force=functions.measures)
-        read = [inputs[name] for name in functions.reads]
-        now, _, *checks = functions.now.function(inputs["measured_state"], memory, *read, TIME, p)
-        estimate = functions.estimate
-        names = ("sample", "state", "disturbance", "friction", "force", "slides")
-        ends = np.cumsum([0, *(getattr(estimate, name).numel() for name in names)]).tolist()
-        now = where_finite(now, checks[-1])
-        _, x, disturbance, friction, by_model, _ = ca.vertsplit(now, ends)
-        force = inputs["measured_force"] if functions.measures else by_model
-        reference = inputs["reference"]
-        signals, *valid = functions.exogenous.function(x, now, force, reference, p)
-        outputs = {
-            "estimated_state": x,
-            "exogenous": where_finite(signals, valid[-1]),
-            "disturbance": disturbance,
-            "friction": friction,
-        }
-        if not functions.measures:
-            outputs["estimated_force"] = by_model
-        start = np.zeros(sizes["held"])
-        start[0] = -1.0
-        after = ca.vertcat(now, inputs["control"], force, reference)
-        held, place = Held(memory, after, start, period), ends[3]
-        block = observer_block(
-            "state_estimator", law, functions, inputs, outputs, force, held, place
+        if not 0.0 <= control_lag <= 1.0:
+            raise ModelError(f"control_lag must be from 0 to 1, got {control_lag:g}")
+        if not control_delay >= 0.0:
+            raise ModelError(f"control_delay must be 0 s or more, got {control_delay:g} s")
+        period = positive("sample_period", sample_period)
+        sample = EstimatorSample(
+            law,
+            observing,
+            period,
+            control_lag,
+            control_delay,
+            plant_step,
+            (
+                _each("position_deviation", position_deviation, law),
+                _each("velocity_deviation", velocity_deviation, law),
+            ),
+            is_ideal,
         )
-        moving = functions.observation.moving.function(x, p)[0]
-        block = replace(block, defaults={**block.defaults, "reference": moving})
-        if not functions.measures:
-            named = {**block.signals, "estimated_force": system.constraint_input_signals}
-            block = replace(block, signals=named)
-        super().__init__(law, observing, period, functions, block, place)
+        self.observing, self.sample_period = observing, period
+        self.observation, self._place = sample.observation, sample.place("friction")
+        super().__init__(law.system, _block(law, sample, period), degrees=(), sees_steps=False)
+
+    @property
+    def disturbance_signals(self) -> Sequence[Signal]:
+        """Names and units of `disturbance`."""
+        return self.block.signals["disturbance"]
+
+    @property
+    def friction_signals(self) -> Sequence[Signal]:
+        """Names and units of `friction`."""
+        return self.block.signals["friction"]
+
+    @property
+    def further_signals(self) -> dict[str, Sequence[Signal]]:
+        """Name of an output port in a record -> names and units of its entries."""
+        named = {name: self.block.signals.get(name, ()) for name in self.block.outputs}
+        others = ("estimated_state", "exogenous", "hold")
+        return {name: signals for name, signals in named.items() if signals and name not in others}
+
+    def set_friction(self, context: Context, friction: ArrayLike) -> None:
+        """Sets the initial coefficients of friction, shape (c,), or a number for all.
+
+        Raises:
+            ModelError: The shape is wrong, or a value is negative or above the largest.
+        """
+        self.check_context(context)
+        given, most = numbers("friction", friction), self.observing.largest_friction
+        count = len(self.friction_signals)
+        if given.shape not in ((), (count,)) or not np.all((given >= 0) & (given <= most)):
+            raise ModelError(
+                f"friction must be from 0 to {most:g}, a number or shape ({count},), got "
+                f"{friction!r}"
+            )
+        values = context.get_discrete_state(0).CopyToVector()
+        values[self._place] = given
+        context.SetDiscreteState(0, values)
 
 
-def _each(name: str, given: ArrayLike, count: int) -> FloatArray:
-    """One number for each position."""
-    deviations = numbers(name, given)
+def _each(name: str, given: ArrayLike, law: TrackingLaw) -> FloatArray:
+    """One number for each velocity."""
+    deviations, count = numbers(name, given), law.system.num_states // 2
     if deviations.shape not in ((), (count,)) or not np.all(deviations >= 0.0):
         raise ModelError(f"{name} must be 0 or more, a number or shape ({count},), got {given!r}")
     return np.broadcast_to(deviations, (count,))
+
+
+def _block(law: TrackingLaw, sample: EstimatorSample, period: float) -> Block:
+    """The block of an estimator."""
+    system, observation, names = law.system, sample.observation, list(sample.observation.frictions)
+    estimates = sample.sizes["state"] > 0
+    shown = sample.now if estimates else sample.memory
+    outputs = {
+        "exogenous": sample.exogenous,
+        "disturbance": shown.disturbance,
+        "friction": shown.friction,
+    }
+    frictions = tuple(Signal(name) for name in names)
+    signals: dict[str, Sequence[Signal]] = {
+        "estimated_state": system.state_signals,
+        "measured_state": system.state_signals,
+        "control": system.control_signals,
+        "measured_force": system.constraint_input_signals,
+        "disturbance": tuple(
+            Signal(f"disturbance of {system.state_signals[i].name}") for i in observation.rows
+        ),
+        "friction": frictions,
+    }
+    if estimates:
+        outputs = {"estimated_state": sample.state, **outputs}
+    if not sample.measures:
+        outputs["estimated_force"] = sample.force
+        signals["estimated_force"] = system.constraint_input_signals
+    identified = observation.identified.signals
+    if identified:
+        outputs["identified"], outputs["identified_deviation"] = sample.filter.told(
+            shown.filter, shown.friction
+        )
+        signals |= dict.fromkeys(("identified", "identified_deviation"), (*identified, *frictions))
+    rates = observation.moving.function(sample.state, system.parameter_symbol)[0]
+    return Block(
+        "state_estimator",
+        sample.inputs,
+        {**outputs, "hold": sample.hold},
+        parameters=system.parameter_symbol,
+        start={"parameters": system.parameter_values},
+        held={"memory": Held(sample.memory.column, sample.now.column, sample.start, period)},
+        defaults={"hold": ca.SX.zeros(1), "reference": rates},
+        signals=signals,
+    )

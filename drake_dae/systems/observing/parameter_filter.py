@@ -185,19 +185,19 @@ class ParameterFilter:
         self.start[memory.parts["covariance"]] = triangle
         self.start[memory.parts["spread"]] = 1.0
 
-    def values(self, friction: ca.SX) -> ca.SX:
-        """theta with the given coefficients of friction, shape (c,)."""
-        return self._values(friction)[: self.num_parameters]
-
     def _values(self, friction: ca.SX) -> ca.SX:
         values, end = ca.SX(self.memory.values), self.num_parameters
         values[end - friction.numel() : end] = friction
         return values
 
-    @property
-    def deviations(self) -> ca.SX:
-        """The standard deviation of each of these, shape (c,)."""
-        return ca.sqrt(ca.fmax(ca.diag(self._covariance), 0))[: self.num_parameters]
+    def told(self, column: ca.SX, friction: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """theta with the given coefficients of friction, and its standard deviations."""
+        symbols = [self.memory.column]
+        values, covariance = ca.substitute(
+            [self._values(friction), self._covariance], symbols, [column]
+        )
+        deviations = ca.sqrt(ca.fmax(ca.diag(covariance), 0))
+        return values[: self.num_parameters], deviations[: self.num_parameters]
 
     @property
     def prior(self) -> FloatArray:

@@ -19,7 +19,7 @@ from drake_dae.blocks.failures import (
 )
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
 from drake_dae.dae import ConstraintStructure, DaeSystem, Manifold, constraint_structure_of
-from drake_dae.dae.structure.redundancy import manifold_of_left_out
+from drake_dae.dae.redundancy import manifold_of_left_out
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plants.contract import Plant

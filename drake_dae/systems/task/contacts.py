@@ -8,7 +8,7 @@ import casadi as ca
 from drake_dae.arguments import checked
 from drake_dae.arrays import listed, unknown_name
 from drake_dae.dae import DaeSystem, TrackingLaw
-from drake_dae.dae.structure.redundancy import with_constraints
+from drake_dae.dae.redundancy import with_constraints
 from drake_dae.errors import ModelError
 
 FREE, CONTACT = 0, 1

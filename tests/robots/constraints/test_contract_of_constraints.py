@@ -41,6 +41,7 @@ from drake_dae.robots import (
     Blade,
     Constraint,
     ConstraintSet,
+    LoopState,
     MultibodyExpressions,
     RollingBall,
     WeldedFrames,
@@ -421,27 +422,26 @@ def test_a_joint_has_a_coordinate_with_a_rate_that_is_power_of_a_unit_force(give
     if constraint.joint is None:
         return
     links, plant = robot(), robot().plant
-    bound = ConstraintSet([constraint])
-    position, rate = bound.joint_state(links)
+    loop = LoopState(ConstraintSet([constraint]), links)
     plain = ca.jtimes(constraint.coordinates(links), links.q, links.velocity_map @ links.v)
     symbols = ca.vertcat(*[p.symbol for p in (*links.parameters, *constraint.parameters)])
     function = TracedFunction(
         name,
         {"q": links.q, "v": links.v, "parameters": symbols},
-        {"c": position, "rate": rate, "plain": plain, "column": bound.joint_columns(links)},
+        {"state": loop.state, "plain": plain, "column": loop.columns},
     )
     values = np.concatenate([p.value for p in (*links.parameters, *constraint.parameters)])
-    c, speed, derivative, column = function(plant.GetPositions(context), v, values)
-    assert c.item() == pytest.approx(JOINTS[name], abs=1e-12)
-    assert speed.item() == pytest.approx(column @ v, abs=1e-12)
-    assert derivative.item() == pytest.approx(speed.item(), abs=1e-10)
-    assert abs(speed.item()) > 1e-3
+    (c, speed), derivative, column = function(plant.GetPositions(context), v, values)
+    assert c == pytest.approx(JOINTS[name], abs=1e-12)
+    assert speed == pytest.approx(column @ v, abs=1e-12)
+    assert derivative.item() == pytest.approx(speed, abs=1e-10)
+    assert abs(speed) > 1e-3
     expected = -0.3 * speed - 2.0 * (c - 1.5) if name == "revolute" else None
     if expected is not None:
         symbol = ca.SX.sym("c", 2)
         force = TracedFunction(
             name, {"c": symbol, "p": symbols}, {"f": constraint.joint.force(symbol[0], symbol[1])}
-        )(np.concatenate([c, speed]), values)[0]
+        )(np.array([c, speed]), values)[0]
         np.testing.assert_allclose(force, expected, rtol=1e-12)
 
 

@@ -11,7 +11,7 @@ from meshes import obj_of_grid, stl_of
 
 from drake_dae import Cylinder, ImplicitSurface, MeasuredSurface, PointOnSurface, Sphere
 from drake_dae.errors import ModelError
-from drake_dae.robots import tangents
+from drake_dae.robots import LinkExpressions, tangents
 from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.functions import TracedFunction
 
@@ -114,13 +114,14 @@ def test_numbers_of_a_formula_are_parameters_of_the_constraint():
     assert [p.name for p in first.parameters] == ["a.position", "a.r"]
     assert first.parameters[1].value == 0.5
     # One surface of two constraints has a number for each.
-    p = ca.SX.sym("p", 3)
+    links = LinkExpressions(
+        ca.SX.sym("q", 3), ca.SX.sym("v", 3), ca.SX.eye(3), ca.SX(3, 1), {"tool": ca.SX.sym("p", 3)}
+    )
     radius = first.parameters[1].symbol
-    assert ca.depends_on(first.surface.distance(p), radius)
-    assert not ca.depends_on(second.surface.distance(p), radius)
-    assert surface == first.surface
+    assert ca.depends_on(first.residual(links), radius)
+    assert not ca.depends_on(second.residual(links), radius)
     # Drawn with the number that it has now.
-    mesh = first.picture(np.array([0, 0, 0, 0.9]), np.array([0.0, 0.0, 0.9]), 0.4).form
+    mesh = first.surface_at(np.array([0, 0, 0, 0.9])).picture([0.0, 0.0, 0.9], 0.4).form
     vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.9, atol=1e-12)
 
@@ -202,8 +203,6 @@ def test_the_error_of_smoothing_is_reported():
     assert 0.5e-4 < np.sqrt(np.mean(off**2)) < 1.2e-4
     # It is nearer to the wave than the noise is.
     assert np.sqrt(np.mean((surface.fit.heights(X, Y) - WAVES) ** 2)) < 0.7e-4
-    assert PointOnSurface("tool", surface, name="bench").remark == f"bench: {surface.remark}"
-    assert PointOnSurface("tool", Sphere((0, 0, 0), 1.0)).remark == ""
 
 
 @pytest.mark.parametrize("rough", [np.abs(X - 0.13), 1.0 * (X > 0.17), np.sin(300 * X)])
@@ -346,12 +345,12 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
     """A shelf over the half x > 0.5 of a table, and a rectangle that is wider than the table."""
     low, high = box([0, 0, 0], [1, 1, 0.1]), box([0.5, 0, 0.4], [0.5, 1, 0.1])
     both = np.vstack([low[0], high[0]]), np.vstack([low[1], high[1] + 8])
-    with pytest.raises(ModelError, match=r"at \[0\.[5-9]\d* *, +0\.\d+ *\] m"):
+    with pytest.raises(ModelError, match=r"at \[0\.5\d* *, +0\.\d* *\] m"):
         MeasuredSurface(file=stl_of(tmp_path / "shelf.stl", *both))
     file = stl_of(tmp_path / "table.stl", *low)
     part = MeasuredSurface((0.4, 0.8), file=file)
     assert part.fit.heights(np.array([0.5]), np.array([0.5]))[0, 0] == pytest.approx(0.1)
-    with pytest.raises(ModelError, match=r"at \[[-1]\.*\d* *, +0\.\d+ *\] m"):
+    with pytest.raises(ModelError, match=r"at \[-1\.\d* *, +0\.\d* *\] m"):
         MeasuredSurface((3.0, 0.8), file=file)
 
 

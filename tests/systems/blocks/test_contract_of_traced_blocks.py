@@ -36,7 +36,7 @@ from drake_dae.blocks.computations import DERIVATIVE, HELD, Traced
 from drake_dae.compiler.compile import compile_diagram
 from drake_dae.compiler.wires import Wires
 from drake_dae.dae import with_disturbance
-from drake_dae.systems import CommandedReferences, DisturbanceObserver, Observing, PointMaterial
+from drake_dae.systems import CommandedReferences, Observing, PointMaterial
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
@@ -94,7 +94,7 @@ def found_friction(is_measured=True):
 def observer(**more):
     """Of a contact that sticks, is lost, or neither."""
     rates = Observing(20.0, force_rate=30.0, **more)
-    return DisturbanceObserver(found_friction(), rates, 0.01, 0.5, 0.02)
+    return StateEstimator(found_friction(), rates, 0.01, 0.5, 0.02)
 
 
 def estimator(lag, law=None, **more):
@@ -107,7 +107,7 @@ def estimator(lag, law=None, **more):
 def observer_behind_springs():
     system = actuated("two_link", "flexible").model.dae
     dae = with_disturbance(system, [signal.name for signal in system.state_signals[2:4]])
-    return DisturbanceObserver(TrackingLaw(dae, poles(-4.0)), Observing(20.0), 0.01)
+    return StateEstimator(TrackingLaw(dae, poles(-4.0)), Observing(20.0), 0.01)
 
 
 BLOCKS = {
@@ -145,12 +145,12 @@ BLOCKS = {
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
     "ControlHold of one control": lambda: ControlHold(1, Sampling(0.01)),
-    "DisturbanceObserver": lambda: observer(least_force=1e-3),
-    "DisturbanceObserver of a contact that sticks": lambda: observer(
+    "StateEstimator of exact states": lambda: observer(least_force=1e-3),
+    "StateEstimator of exact states of a contact that sticks": lambda: observer(
         least_speed=1e3, least_force=1e-3
     ),
-    "DisturbanceObserver of a contact that is lost": lambda: observer(least_force=1e3),
-    "DisturbanceObserver behind springs": observer_behind_springs,
+    "StateEstimator of exact states of a contact that is lost": lambda: observer(least_force=1e3),
+    "StateEstimator of exact states behind springs": observer_behind_springs,
     "StateEstimator": lambda: estimator(0.5, least_force=1e-3),
     "StateEstimator without a force sensor": lambda: estimator(0.5, law=found_friction(False)),
     "StateEstimator of a discrete plant": lambda: estimator(1.0, least_force=1e-3),

@@ -3,15 +3,16 @@
 from dataclasses import replace
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 from arms import arm, numbers
 from numpy.testing import assert_allclose
 
-from drake_dae import RobotModel, TrackingLaw, poles
+from drake_dae import RobotModel, StateEstimator, TrackingLaw, poles
 from drake_dae.dae import with_disturbance
+from drake_dae.dae.beyond.chain_filter import ChainFilter
 from drake_dae.systems import Observing
-from drake_dae.systems.observing.estimator_functions import EstimatorFunctions, state_filters
 
 T = 1e-3
 RATES = Observing(20.0, force_rate=5.0, state_rate=100.0)
@@ -28,37 +29,34 @@ def law(friction: float = 0.0):
     return TrackingLaw(system, poles(-4.0), measured_force=True)
 
 
-def filters():
-    return state_filters(RATES, T, np.full(2, 1e-4), np.zeros(2))
+def gain(rate):
+    """K_1, K_2, K_3 of a position."""
+    return ChainFilter.of(RATES.state_rate, rate, T).gain[:, 0]
 
 
-def sample(
-    measured,
-    v,
-    forces,
-    controls,
-    step=0.0,
-    lag=0.0,
-    r=(0.0, 0.0),
-    mu=0.0,
-    friction=0.0,
-    slid=1e3,
-):
+def sample(measured, v, forces, controls, step=0.0, lag=0.0, mu=0.0, friction=0.0, slid=1e3):
     """The estimate after a sample: (q, v), r, mu; forces and controls are the last and the new.
 
     The contact has slid for many samples, or has not slid yet.
     """
-    function = EstimatorFunctions(law(friction), RATES, T, lag, 0.0, step, filters(), 1e-4).now
-    reference = np.zeros(law(friction).layout.reference_size)
-    slides = [slid, *np.zeros(6)]
-    held = np.concatenate([[0.0], Q, v, r, [mu], slides, controls[0], [forces[0]], reference])
     system = law(friction).system
-    given = [] if lag == 1.0 else [controls[1]]
-    found = function(
-        np.concatenate([measured, v]), held, *given, [forces[1]], [0.0], [T],
-        system.parameter_values,
-    )[0]  # fmt: skip
-    return found[1:5], found[5:7], found[7]
+    estimator = StateEstimator(law(friction), RATES, T, lag, 0.0, step, 1e-4)
+    block = estimator.block
+    held = np.concatenate([[0.0], Q, v, [0.0, 0.0], [mu], [slid], controls[0], [forces[0]]])
+    given = {
+        "time": [T],
+        "held memory": held,
+        "input measured_state": [*measured, *v],
+        "input measured_force": [forces[1]],
+        "input control": controls[1],
+        "input hold": [0.0],
+        "input reference": np.zeros(law(friction).layout.reference_size),
+        "parameters": system.parameter_values,
+    }
+    names = ("estimated_state", "disturbance", "friction")
+    function = ca.Function("now", [*block.columns().values()], [block.outputs[n] for n in names])
+    values = [value.full().ravel() for value in function(*(given[n] for n in block.columns()))]
+    return values[0], values[1], values[2][0]
 
 
 def predicted(v, force, control, step):
@@ -95,13 +93,11 @@ def test_an_error_is_corrected_by_the_gains_of_its_direction():
     J = known.constraint_jacobian[0]
     along = np.array([-J[1], J[0]])  # J e = 0.
     across = np.linalg.solve(known.mass, J)
-    for error, (own,) in (
-        (1e-3 * along, filters()[0][:1]), (1e-3 * across, filters()[1][:1])
-    ):  # fmt: skip
+    for error, rate in ((1e-3 * along, RATES.rate), (1e-3 * across, RATES.force_rate)):
         state, r, _ = sample(q + error, V, (push, push), (control, control))
-        gain = own.gain[:, 0]
-        assert_allclose(state, [*(q + gain[0] * error), *(v + gain[1] * error)], atol=1e-9)
-        assert_allclose(r, gain[2] * known.mass @ error, rtol=1e-6)
+        by_q, by_v, by_a = gain(rate)
+        assert_allclose(state, [*(q + by_q * error), *(v + by_v * error)], atol=1e-9)
+        assert_allclose(r, by_a * known.mass @ error, rtol=1e-6)
 
 
 def test_what_a_contact_that_sticks_may_hold_is_not_believed():
@@ -115,7 +111,7 @@ def test_what_a_contact_that_sticks_may_hold_is_not_believed():
     J = known.constraint_jacobian[0]
     along = np.array([-J[1], J[0]])
     _, r, mu = sample(q + 1e-4 * along, still, (push, push), (control, control))
-    believed = filters()[0][0].gain[2, 0] * known.mass @ (1e-4 * along)
+    believed = gain(RATES.rate)[2] * known.mass @ (1e-4 * along)
     assert abs(along @ believed) > 1e-3
     assert abs(along @ r) < 1e-9
     assert mu == 0.0
@@ -172,7 +168,7 @@ def test_a_displacement_beyond_noise_is_a_break_away_and_what_is_less_is_none():
     along = np.array([-J[1], J[0]])
     along /= slides @ along
     deviation = 1e-4 * np.linalg.norm(slides)
-    usual = filters()[0][0].gain[1, 0]
+    usual = gain(RATES.rate)[1]
     for size, breaks in ((3.0, False), (5.0, True)):
         measured = at_rest + size * deviation * along
         state, _, _ = sample(measured, still, (push, push), (control, control), slid=0.0)

@@ -27,6 +27,7 @@ from drake_dae import (
     RobotPlant,
     Sampling,
     SinusoidReference,
+    StateEstimator,
     TrackingLaw,
     find_structure,
     make_closed_loop,
@@ -37,7 +38,7 @@ from drake_dae.dae import ConstraintStructure, Observation, with_disturbance
 from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.systems import DisturbanceObserver, Observing
+from drake_dae.systems import Observing
 
 T, RATE, MASS = 0.01, 8.0, 2.5
 STEPS = error_controlled(1e-10)
@@ -120,13 +121,13 @@ def test_noise_of_velocities_comes_through_as_the_filter_says():
     4,000 samples, of which 1 / (k_o T) are correlated, tell it to some 5 per cent.
     """
     system, noise = body(), 0.02
-    observer = DisturbanceObserver(TrackingLaw(system, poles(-5.0)), Observing(RATE), T)
+    observer = StateEstimator(TrackingLaw(system, poles(-5.0)), Observing(RATE), T)
     builder = DiagramBuilder()
     builder.AddSystem(observer)
     source = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 1, T))
     spread = builder.AddSystem(MatrixGain(np.array([[0.0], [noise]])))
     builder.Connect(source.get_output_port(), spread.get_input_port())
-    builder.Connect(spread.get_output_port(), observer.GetInputPort("estimated_state"))
+    builder.Connect(spread.get_output_port(), observer.GetInputPort("measured_state"))
     for name, size in (("control", 1), ("measured_force", 0)):
         still = builder.AddSystem(ConstantVectorSource(np.zeros(size)))
         builder.Connect(still.get_output_port(), observer.GetInputPort(name))
@@ -250,7 +251,7 @@ def test_wanted_velocities_are_those_of_the_reference_on_the_constraints():
     """v of P v = r' + t r'', J v = 0, with P and J of the tool by MultibodyPlant; t = 20 ms."""
     _, dae = frictional(0.3)
     law = TrackingLaw(dae, poles(-4.0))
-    observation = DisturbanceObserver(law, Observing(5.0), T).observation
+    observation = StateEstimator(law, Observing(5.0), T).observation
     state = law.structure.states[0]
     reference = np.array([0.3, 0.25, 0.1, 20.0])
     found = observation.wanted(state, reference, [0.02], dae.parameter_values)[0]
@@ -268,13 +269,13 @@ def test_friction_is_cancelled_against_the_motion_that_is_wanted_when_the_contro
     """
     _, dae = frictional(0.3)
     law = TrackingLaw(dae, poles(-4.0))
-    observer = DisturbanceObserver(law, Observing(5.0), T, control_delay=0.02)
+    observer = StateEstimator(law, Observing(5.0), T, control_delay=0.02)
     state = law.structure.states[0]
     state = np.array([*state[:2], 0.0, 0.0])
     context = observer.CreateDefaultContext()
     observer.set_friction(context, 0.4)
     for name, value in (
-        ("estimated_state", state),
+        ("measured_state", state),
         ("control", np.zeros(2)),
         ("measured_force", [20.0]),
         ("reference", [0.3, velocity, 1.0, 20.0]),
@@ -297,7 +298,7 @@ def test_law_cancels_wanted_friction_whatever_velocity_it_has():
     """
     _, dae = frictional(0.3)
     law = TrackingLaw(dae, poles(-1e-6))
-    observer = DisturbanceObserver(law, Observing(5.0), T)
+    observer = StateEstimator(law, Observing(5.0), T)
     reference, controls = np.array([0.3, 0.2, 0.0, 20.0]), []
     for speed in (-1e-3, 0.0, 1e-3):
         rest = law.structure.states[0][:2]
@@ -307,7 +308,7 @@ def test_law_cancels_wanted_friction_whatever_velocity_it_has():
         context = observer.CreateDefaultContext()
         observer.set_friction(context, 0.4)
         for name, value in (
-            ("estimated_state", state),
+            ("measured_state", state),
             ("measured_force", [20.0]),
             ("reference", reference),
         ):
@@ -429,12 +430,12 @@ def test_what_cannot_be_observed_is_refused():
         with_disturbance(system, ["v"])
     model, dae = frictional(0.3)
     with pytest.raises(ModelError, match="disturbance"):
-        DisturbanceObserver(TrackingLaw(model.dae, poles(-4.0)), Observing(5.0), T)
+        StateEstimator(TrackingLaw(model.dae, poles(-4.0)), Observing(5.0), T)
     law = TrackingLaw(dae, poles(-4.0))
     with pytest.raises(ModelError, match="control_lag"):
-        DisturbanceObserver(law, Observing(5.0), T, 2.0)
+        StateEstimator(law, Observing(5.0), T, 2.0)
     with pytest.raises(ModelError, match="control_delay"):
-        DisturbanceObserver(law, Observing(5.0), T, 0.5, -1.0)
+        StateEstimator(law, Observing(5.0), T, 0.5, -1.0)
     with pytest.raises(ModelError, match="rate"):
         Observing(-5.0)
     with pytest.raises(ModelError, match="force_rate"):
@@ -449,7 +450,7 @@ def test_what_cannot_be_observed_is_refused():
             wanted,
             LoopSettings(observer=Observing(5.0), sampling=Sampling(T)),
         )
-    observer = DisturbanceObserver(law, Observing(5.0), T)
+    observer = StateEstimator(law, Observing(5.0), T)
     context = observer.CreateDefaultContext()
     observer.set_friction(context, 0.4)
     assert observer.GetOutputPort("friction").Eval(context) == 0.4

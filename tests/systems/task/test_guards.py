@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from polishing import FAR, OVER, PERIOD, SPEED, run_on, started, task_loop
 
 from drake_dae import Approach, Dwell, Move, PointToPointReference, Press, Record
-from drake_dae.running.phases import phase_spans
+from drake_dae.diagrams.record import phase_spans
 from drake_dae.systems import Condition
 
 PRESS = Press(10.0, over=0.05)

@@ -43,8 +43,8 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.diagrams import LoopSettings, wire_loop
+from drake_dae.diagrams.record import phase_spans, phases_at
 from drake_dae.errors import ModelError, WiringError
-from drake_dae.running.phases import phase_spans, phases_at
 from drake_dae.systems import open_contact
 from drake_dae.systems.task.automaton import faded
 

@@ -37,8 +37,12 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
         raise ModelError("the robot has no constraints, so there is nothing to touch")
     for constraint in model.constraints:
         values = own_values(constraint, model.dae, model.dae.parameter_values)
-        solids = constraint.solids(values)
-        if material.contact_model != "hydroelastic" and not solids:
+        surface = constraint.surface_at(values)
+        if surface is None or constraint.touch(model.links) is None:
+            raise ModelError(
+                f"'{constraint.name}' is no contact with a surface: use an ideal plant"
+            )
+        if material.contact_model != "hydroelastic" and not surface.solids():
             raise ModelError(
                 f"'{constraint.name}' has no solid for Drake's point contact, as a "
                 "PointOnSurface has on a Plane, or on the outside of a Sphere or a "
@@ -61,18 +65,18 @@ def solids_of(
     Raises:
         ModelError: There are none.
     """
-    solids = constraint.solids(values)
+    surface, pose = constraint.surface_at(values), constraint.placement(values)
+    assert surface is not None  # `check_model` refuses others.
+    solids = surface.solids()
     exact = solids and all(isinstance(solid.form, HalfSpace | Sphere) for solid in solids)
-    if material.contact_model == "point" or exact:
-        return solids
     # Drake's own mesh of a long cylinder is too coarse: 2 N of ripple in a force of 20 N.
-    try:
-        layer = constraint.layer(values, point, material.piece, material.thickness)
-    except ModelError as error:
-        raise ModelError(f"{constraint.name}: {error}") from None
-    if layer is None:
-        raise ModelError(f"'{constraint.name}' is no contact with a surface: use an ideal plant")
-    return (layer,)
+    if material.contact_model != "point" and not exact:
+        try:
+            near = pose.inverse() @ point
+            solids = (surface.layer(near, material.piece, material.thickness),)
+        except ModelError as error:
+            raise ModelError(f"{constraint.name}: {error}") from None
+    return tuple(solid.moved(pose) for solid in solids)
 
 
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:

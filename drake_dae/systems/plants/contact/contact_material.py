@@ -87,7 +87,8 @@ class PointMaterial:
         forms = [
             solid.form
             for constraint in model.constraints
-            for solid in constraint.solids(own_values(constraint, model.dae, values))
+            if (surface := constraint.surface_at(own_values(constraint, model.dae, values)))
+            for solid in surface.solids()
         ]
         spheres = {form.radius() if isinstance(form, Sphere) else None for form in forms}
         return max(self.stiffness_at(force, sphere) for sphere in spheres or {None})

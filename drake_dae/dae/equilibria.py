@@ -1,0 +1,334 @@
+"""States at rest with constant outputs, and their stability by linearization.        (35)-(36)"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+import scipy.linalg
+
+from drake_dae.arrays import FloatArray, show
+from drake_dae.dae.manifold import coordinates
+from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
+from drake_dae.dae.structure import Structure
+from drake_dae.errors import InconsistentStateError
+from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
+from drake_dae.trace.round_off import DEPENDENT
+
+LINEARIZED = 1e-11
+"""The error of a linearization, relative to the terms in each of its entries."""
+
+ROUNDED = 1e-15
+"""The error of computed eigenvalues, relative to the norm of the matrix."""
+
+SHIFT = 1e-7
+"""The error of an equilibrium, relative to the size of the states."""
+
+AT_REST = 1e-8
+"""A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
+
+ISOLATED = 1e-6
+"""An equilibrium is known to this distance, relative to the scale of the states."""
+
+BESIDE = 1e-5
+"""The distance, relative to the scale, within which the slopes must be nearly constant."""
+
+SAME = 0.5
+"""The allowed relative change of the slopes there: then Newton's method contracts."""
+
+ComplexArray = np.typing.NDArray[np.complex128]
+
+
+class Verdict(StrEnum):
+    """The verdicts on the zero dynamics."""
+
+    STABLE = "exponentially stable"
+    UNSTABLE = "unstable"
+    UNDECIDED = "not decided"
+
+
+@dataclass(frozen=True, eq=False)
+class Stability:
+    """The stability of the internal states about an equilibrium, with constant outputs.
+
+    The verdict is local: for states near this equilibrium and outputs near its outputs. The global
+    sufficient conditions (i) and (ii) below (36) are not examined.
+    """
+
+    verdict: Verdict
+    reason: str
+    eigenvalues: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    state: FloatArray | None = None
+
+
+def linearized_eigenvalues(
+    pinned: PinnedSet, scale: FloatArray, state: FloatArray
+) -> tuple[ComplexArray, FloatArray]:
+    """Returns the eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), with errors.
+
+    They come from round-off in the derivative, and from the error of the equilibrium, which is
+    large if Newton's method converges slowly. Both in 1/s, largest real part first.
+    """
+    slopes = pinned.slopes(state)
+    free, moved = coordinates(pinned.gradients(state), scale)
+    # The tangent directions are known to round-off, relative to the scale of the states.
+    least = np.where(moved == 0.0, 0.0, ROUNDED / LINEARIZED * scale[:, None] / scale[free])
+    sizes = pinned.sizes_of_slopes(state)
+    off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free]
+    # The numbers of a model are rounded as well, such as the cosine of a right angle.
+    units = scale[free][:, None] / scale[free]
+    matrix = (slopes @ moved)[free] / units
+    off = off / units + ROUNDED * np.linalg.norm(matrix, 2)
+    rounded = ROUNDED * float(np.linalg.norm(balanced_matrix(sizes * scale / scale[:, None])[0], 2))
+    values, errors = eigenvalues_of(matrix, off, rounded)
+    along = moved @ (scale[free] * np.random.default_rng(0).standard_normal(free.size))
+    along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
+    beside = pinned.slopes(state + SHIFT * along)
+    if np.all(np.isfinite(beside)):
+        shifted = (beside @ moved)[free] / units
+        others, _ = eigenvalues_of(shifted, 0.0 * off)
+        errors += np.min(np.abs(values[:, None] - others), axis=1, initial=np.inf)
+        if _stays_off_the_axis(matrix, off + np.abs(shifted - matrix), rounded):
+            errors = np.minimum(errors, 0.5 * np.abs(values.real))
+    return values, errors
+
+
+def _stays_off_the_axis(matrix: FloatArray, error: FloatArray, rounded: float) -> bool:
+    """Whether no eigenvalue can be on the imaginary axis, within the matrix's error.
+
+    Eigenvalues of a defective matrix have errors of the root of its error, even if all are far from
+    the axis. A perturbation that moves one to i w is at least the smallest singular value of A - i
+    w; this equals e for some w only if i w is an eigenvalue of [[A, -e], [e, -A^T]] (Byers 1988).
+    """
+    balanced, units = balanced_matrix(matrix)
+    norm = float(np.linalg.norm(balanced, 2))
+    off = float(np.linalg.norm(error / units[:, None] * units, 2)) + rounded + ROUNDED * norm
+    if not (np.isfinite(off) and norm > 0.0):
+        return False
+    away = off * np.eye(len(matrix))
+    values = np.linalg.eigvals(np.block([[balanced, -away], [away, -balanced.T]]))
+    # Its eigenvalues have an error of the root of round-off where they meet on the axis.
+    return bool(np.min(np.abs(values.real)) > np.sqrt(ROUNDED) * norm)
+
+
+def balanced_matrix(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Returns a matrix whose norm does not depend on units, and these units of its rows."""
+    with np.errstate(invalid="ignore"):  # SciPy casts factors of 1e50 to numbers of rows.
+        balanced, similarity = scipy.linalg.matrix_balance(matrix, permute=False)
+    return balanced, np.diag(similarity)
+
+
+def eigenvalues_of(
+    matrix: FloatArray, error: FloatArray, rounded: float = 0.0
+) -> tuple[ComplexArray, FloatArray]:
+    """Returns eigenvalues, largest real part first, and their error bounds.
+
+    To first order an error E of the matrix moves an eigenvalue by at most |y|^H |E| |x| / |y^H x|,
+    with its left and right eigenvectors y and x. So in a triangular matrix a small eigenvalue is as
+    accurate as its own entry. Balancing removes the units first.
+    `error` bounds the entries of the matrix, `rounded` those of the balanced one.
+    """
+    if not matrix.size:
+        return np.zeros(0, dtype=complex), np.zeros(0)
+    balanced, units = balanced_matrix(matrix)
+    values, left, right = scipy.linalg.eig(balanced, left=True, right=True)
+    off = error / units[:, None] * units + rounded + ROUNDED * np.linalg.norm(balanced, 2)
+    moved = np.einsum("ik,ij,jk->k", np.abs(left), off, np.abs(right))
+    errors = moved / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), 1e-300)
+    order = np.lexsort((values.imag, -values.real))
+    return values[order], errors[order]
+
+
+def judge(
+    values: ComplexArray, errors: FloatArray, state: FloatArray, place: str, degenerate: int = 0
+) -> Stability:
+    """Judges a state at rest by its eigenvalues.
+
+    In `degenerate` directions its Jacobian is singular: as many eigenvalues are known to nothing.
+    """
+    smallest = np.argsort(np.abs(values))[:degenerate]
+    errors = errors.copy()
+    errors[smallest] = np.maximum(errors[smallest], 2.0 * np.abs(values[smallest]))
+    largest = f"the largest real part of an eigenvalue is {values[0].real:.4g} 1/s {place}"
+    if np.any(values.real > errors):
+        return Stability(Verdict.UNSTABLE, f"non-minimum phase: {largest}", values, state)
+    if np.all(values.real < -errors):
+        return Stability(Verdict.STABLE, f"minimum phase: {largest}", values, state)
+    count = np.count_nonzero(np.abs(values.real) <= errors)
+    reason = (
+        f"the linearization does not decide: {count} of {values.size} eigenvalues are on the "
+        f"imaginary axis, up to round-off, {place}"
+    )
+    if degenerate:
+        reason += ", where the Jacobian is singular"
+    return Stability(Verdict.UNDECIDED, reason, values, state)
+
+
+def without_dynamics(structure: Structure) -> Stability:
+    """Judges a system without zero dynamics: whether R determines the motion."""
+    margins = {
+        "A(x) of Assumption (2)": structure.constraint_margin,
+        "B(x) of (16)": structure.control_margin,
+    }
+    for matrix, margin in margins.items():
+        if margin is not None and margin.is_singular:
+            reason = (
+                "no zero dynamics, but the reference does not determine the motion: "
+                f"{matrix} is singular at x = {show(margin.state)}"
+            )
+            return Stability(Verdict.UNDECIDED, reason)
+    return Stability(Verdict.STABLE, "no zero dynamics: the reference alone determines the motion")
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """Where a search for an equilibrium ends: a state, x' there, and why it is not at rest, if so.
+
+    `degenerate` is the number of directions in which the Jacobian of a state at rest is singular.
+    """
+
+    state: FloatArray
+    rate: FloatArray
+    unrest: str
+    degenerate: int = 0
+
+
+class Equilibria:
+    """The equilibria on Z(R).
+
+    An equilibrium is a state at rest whose Jacobian is not singular: Newton's step from there is
+    short, and its slopes hardly change beside it. A small rate alone shows nothing: that of
+    x' = exp(-x) is small for all large x, and Newton's step is 1 everywhere.
+    """
+
+    def __init__(self, pinned: PinnedOutputs) -> None:
+        self.pinned, system = pinned, pinned.system
+        examined = np.abs(pinned.structure.states).max(axis=0)
+        self.sizes = np.maximum(examined, system.spread_around(system.nominal_state))
+        # The rates of states with a constant rate, such as clocks.
+        explicit, self._clocks = system.explicit, np.zeros(system.num_states)
+        for i in range(system.num_states):
+            still = not (explicit.g[i, :].nnz() or explicit.h[i, :].nnz())
+            if still and explicit.f[i].is_constant():
+                self._clocks[i] = float(explicit.f[i])
+
+    def constant_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
+        """Returns R with the outputs of a state and zero derivatives.
+
+        The state does not determine outputs of degree 0; they are chosen to minimize its rate.
+        """
+        layout, scale = self.pinned.layout, self.pinned.system.scale
+        reference = np.zeros(layout.reference_size)
+        chain = self.pinned.at(reference, parameters).residual(state)[-layout.chain_size :]
+        if layout.chain_size:
+            reference[layout.lowest[layout.dynamic]] = chain[layout.heads]
+        direct = layout.lowest[layout.direct]
+        if direct.size and not self._clocks.any():
+            pinned = self.pinned.at(reference, parameters)
+            still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
+            slopes, rate = pinned.slopes_along(state, still, by), pinned.rate(state)
+            if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
+                nearest = -np.linalg.pinv(slopes / scale[:, None], DEPENDENT) @ (rate / scale)
+                reference[direct] = nearest
+        return reference
+
+    def find(self, pinned: PinnedSet, guess: FloatArray) -> FloatArray:
+        """Returns the equilibrium at which a search from a guess ends, shape (n,)."""
+        rest = self.search(pinned, guess)
+        unrest = rest.unrest or ("the Jacobian is singular" if rest.degenerate else "")
+        if unrest:
+            raise InconsistentStateError(self.none(pinned, rest.state, unrest), rest.rate)
+        return rest.state
+
+    def none(self, pinned: PinnedSet, state: FloatArray, unrest: str) -> str:
+        """Returns in words that a search ended at a state that is no equilibrium."""
+        return (
+            f"{self.pinned.system.name}: {pinned.describe()} have no regular state at rest near "
+            f"the given one: the search ends at x = {show(state)}, where {unrest}"
+        )
+
+    def search(self, pinned: PinnedSet, guess: FloatArray) -> Rest:
+        """Searches by Newton's method for C(x) = 0 and T^T x' = 0.
+
+        T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
+        shortest step is taken.
+        """
+        system, scale = self.pinned.system, self.pinned.system.scale
+        if self._clocks.any():
+            running = ", ".join(
+                f"{system.state_signals[i].name}' = {self._clocks[i]:g}"
+                for i in self._clocks.nonzero()[0]
+            )
+            raise InconsistentStateError(
+                f"{system.name}: no state is an equilibrium, since {running} at all of "
+                "them, as for a clock: time must not be a state. Take it out of the state, as an "
+                "exogenous signal, or judge the zero dynamics along a motion",
+                self._clocks,
+            )
+
+        def linearize(z: FloatArray) -> NewtonModel | None:
+            gradients = pinned.gradients(scale * z) * scale
+            onto = shortest_steps(gradients, lambda z: pinned.residual(scale * z))
+            slopes = pinned.slopes(scale * z) * scale / scale[:, None]
+            if onto is None or not np.all(np.isfinite(slopes)):
+                return None
+            tangent = scipy.linalg.null_space(gradients)
+            along = tangent.T @ slopes @ tangent
+            size = np.linalg.norm(balanced_matrix(slopes)[0], 2)
+            noise = ROUND_OFF * float(size) / (np.linalg.norm(along) or 1.0)
+            inner = tangent @ np.linalg.pinv(along, noise) @ tangent.T
+
+            def step(z: FloatArray) -> FloatArray:
+                across = onto.step(z)
+                return across - inner @ (pinned.rate(scale * z) / scale + slopes @ across)
+
+            return NewtonModel(step, onto.is_regular)
+
+        z, converged = newton(pinned.state(guess) / scale, linearize)
+        point = pinned.point(scale * z)
+        unrest = self.unrest(pinned, point)
+        if not converged:
+            unrest = unrest or "the rates are small and do not vanish"
+        degenerate = 0 if unrest else self._degenerate(pinned, point.state)
+        return Rest(point.state, point.rate, unrest, degenerate)
+
+    def unrest(self, pinned: PinnedSet, point: PinnedPoint) -> str:
+        """Returns why a point is no regular state at rest, as text; empty if it is one.
+
+        A state that a tiny change brings to rest, as in a fast system, does not count as changing.
+        """
+        if flaw := pinned.flaw(point):
+            return flaw
+        slow = np.abs(point.rate) <= AT_REST * np.abs(pinned.slopes(point.state)) @ self.sizes
+        unrest = np.where(slow, 0.0, point.unrest)
+        worst = int(np.argmax(unrest))
+        if unrest[worst] <= AT_REST:
+            return ""
+        return f"{self.pinned.system.state_signals[worst].name}' = {point.rate[worst]:.3g}"
+
+    @np.errstate(all="ignore")  # The domain may end near the state.
+    def _degenerate(self, pinned: PinnedSet, state: FloatArray) -> int:
+        """The number of directions on Z(R) in which the Jacobian isolates no equilibrium."""
+        scale = self.pinned.system.scale
+        free, moved = coordinates(pinned.gradients(state), scale)
+
+        def slopes_at(x: FloatArray) -> FloatArray:
+            slopes = pinned.slopes(x) @ moved
+            return np.asarray(slopes[free] * scale[free] / scale[free][:, None])
+
+        slopes = slopes_at(state)
+        rate = (pinned.rate(state) / scale)[free]
+        if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate))):
+            return free.size
+        left, sizes, right = np.linalg.svd(slopes)
+        terms = pinned.sizes_of_slopes(state) @ np.abs(state)
+        rates = np.abs(left.T @ rate) + ROUNDED * np.abs(left.T) @ (terms / scale)[free]
+        count = 0
+        for u, size, v, rest in zip(left.T, sizes, right, rates, strict=True):
+            isolated = size > 0.0 and rest <= ISOLATED * size
+            if isolated:
+                along = moved @ (scale[free] * v)
+                along *= BESIDE / np.max(np.abs(along) / scale)
+                changes = [u @ (slopes_at(x) - slopes) @ v for x in (state + along, state - along)]
+                isolated = all(abs(change) <= SAME * size for change in changes)
+            count += not isolated
+        return count

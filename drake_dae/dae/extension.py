@@ -1,0 +1,361 @@
+"""Dynamic extension: integrators before controls, where B(x) has no inverse without them.
+
+If B(x) of (16) is singular, one combination of the controls acts on some outputs before the others
+do: the drive of a wheeled robot acts on both coordinates of its position before its steering does.
+If that combination becomes a state and its derivative the control, all controls act at the same
+order. The law (28) of the extended system is then a dynamic state feedback of the original one.
+
+Descusse and Moog, "Decoupling with dynamic compensation for strong invertible affine non-linear
+systems", International Journal of Control 42(6), 1985; Isidori, Nonlinear Control Systems, 1995,
+section 5.4; Nijmeijer and van der Schaft, Nonlinear Dynamical Control Systems, 1990, chapter 8.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.dae.relative_degrees import InputActions
+from drake_dae.dae.samples import Samples, spread_of
+from drake_dae.dae.signals import Signal
+from drake_dae.dae.structure import Structure, examine_structure, find_structure
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.trace.factorization import Factorization
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.round_off import positive
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False, repr=False)
+class Extension:
+    """A system with integrators before its controls, whose B(x) is regular.
+
+    The original system's control is u = offset(x_e) + matrix(x_e) w, with x_e and w the state and
+    the control of the extended one; with the integrators it is a dynamic state feedback.
+
+    Attributes:
+        original: The system without integrators.
+        system: The extended one. The first n states are those of the original.
+        structure: The structure of the extended system.
+        integrators: The number of integrators before each of the original controls. If others are
+            mixed in first, the new state has a star: "u1*" is u1 + sum_j b_j(x) u_j.
+        control_offset: offset(x_e) as an expression of `system.state`, shape (p, 1).
+        control_matrix: matrix(x_e) likewise, shape (p, p).
+    """
+
+    original: DaeSystem
+    system: DaeSystem
+    structure: Structure
+    integrators: Mapping[str, int]
+    control_offset: ca.SX
+    control_matrix: ca.SX
+
+    def __repr__(self) -> str:
+        return f"Extension({self.system!r}, integrators={dict(self.integrators)})"
+
+    def original_control(
+        self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """Returns the control u of the original system for x_e and w of the extended one."""
+        return self._control(state, control, self.original.parameter_vector(parameters))[0]
+
+    @cached_property
+    def _control(self) -> TracedFunction:
+        w = ca.SX.sym("w", self.system.num_controls)
+        outputs = {"control": self.control_offset + ca.mtimes(self.control_matrix, w)}
+        return self.system.trace("original control", outputs, {"control": w}, often=False)
+
+
+@checked(ModelError)
+def extend(
+    system: DaeSystem,
+    integrators: Mapping[str, int] | Sequence[str],
+    nominal_control: Mapping[str, float] | None = None,
+) -> DaeSystem:
+    """Puts integrators before controls: u_i, u_i', ... become states, the next one the control.
+
+    Constraints, outputs, parameters and mass matrix do not change, and the degrees r_i neither if
+    Assumption (3) holds. If it is violated, since u_i acts on a derivative of a constraint before
+    any constraint input does, integrators repair it: the constraint then restricts the state u_i.
+
+    Args:
+        system: The system (1)-(3).
+        integrators: Name of a control -> number of integrators; or names, for one each.
+        nominal_control: Values of controls at the nominal state, for the integrators that hold
+            them; zero where not given. B(x) is often singular at zero.
+
+    Raises:
+        ModelError: A control is unknown, a number of integrators is below 1, or the system has a
+            `control_metric`.
+    """
+    _refuse_metric(system)
+    if not isinstance(integrators, Mapping):
+        integrators = dict.fromkeys(integrators, 1)
+    if any(type(count) is not int or count < 1 for count in integrators.values()):
+        raise ModelError(
+            f"{system.name}: integrators must be whole numbers from 1, got {dict(integrators)}"
+        )
+    nominal = _by_control(system, "nominal_control", nominal_control or {})
+    _by_control(system, "integrators", integrators)
+    base = system.control_signals
+    for order in range(max(integrators.values(), default=0)):
+        columns = [i for i, signal in enumerate(base) if integrators.get(signal.name, 0) > order]
+        system = _integrated(
+            system,
+            columns,
+            added=[base[i].derivative(order) for i in columns],
+            following=[base[i].derivative(order + 1) for i in columns],
+            nominal=nominal[columns] if order == 0 else np.zeros(len(columns)),
+        )
+    return system
+
+
+@checked(ModelError)
+def dynamic_extension(
+    system: DaeSystem,
+    *,
+    nominal_control: Mapping[str, float] | None = None,
+    spread: ArrayLike | None = None,
+) -> Extension:
+    """Finds integrators that make B(x) regular, by the dynamic extension algorithm.
+
+    In each round the controls that act in the dependent rows of B(x) get an integrator. If more
+    than q controls act in rows of rank q, a regular static feedback u = beta(x) w is applied first,
+    after which only q controls act in them; see `Extension.integrators`. Each round reduces the
+    dimension of the zero dynamics by the rank deficiency of B(x), so that it ends after few rounds:
+    if no zero dynamics remain and B(x) is still singular, the outputs are dependent and there is no
+    extension.
+
+    Args:
+        system: The system (1)-(3).
+        nominal_control: Values of the controls at the nominal state, for the integrators that hold
+            them; zero where not given.
+        spread: The standard deviation of the random states, as in `find_structure`. That of a
+            control is 0.1 of its nominal value; 0.1 if that is zero.
+
+    Returns:
+        The extended system; the original one if its B(x) is regular.
+
+    Raises:
+        AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
+            isolated states only, or more than n are needed; or Assumption (3) is violated, where
+            `extend` helps.
+        ModelError, InconsistentStateError: The system has no structure, see `find_structure`, or it
+            has a `control_metric`.
+    """
+    _refuse_metric(system)
+    nominal = _by_control(system, "nominal_control", nominal_control or {})
+    chain = _Chain(system, nominal, spread)
+    while True:
+        structure, _ = examine_structure(chain.near_nominal(), spread=chain.spread)
+        choice = _controls_to_integrate(structure)
+        if choice is None:
+            break
+        chain.integrate(*choice)
+        if sum(chain.integrators.values()) > system.num_states:
+            raise AssumptionError(
+                f"more than {system.num_states} integrators are needed for a regular B(x) of "
+                f"(16), so far {chain.count}. Choose other outputs",
+                5,
+            )
+    try:
+        structure = find_structure(chain.system, spread=chain.spread)
+    except AssumptionError as error:
+        if error.state is None:
+            raise
+        remedy = "Keep away from this state"
+        if chain.integrators:
+            entries = ", ".join(f'"{name}": 1.0' for name in chain.integrators)
+            remedy += (
+                f", or give another nominal_control, for example nominal_control={{{entries}}}; "
+                f"integrators: {chain.count}"
+            )
+        raise AssumptionError(
+            f"B(x) of (16) is regular around x = {show(error.state)}, but not there: it is "
+            f"singular at isolated states, which more integrators do not change. {remedy}",
+            error.assumption,
+            error.state,
+        ) from error
+    return Extension(system, chain.system, structure, chain.integrators, chain.offset, chain.matrix)
+
+
+class _Chain:
+    """A system between the original and the extended one, with the integrators added so far."""
+
+    def __init__(self, system: DaeSystem, nominal: FloatArray, spread: ArrayLike | None) -> None:
+        self.system = system
+        self.spread = spread_of(system, spread)
+        self.integrators: dict[str, int] = {}
+        self.offset = ca.SX(system.num_controls, 1)
+        self.matrix = ca.SX.eye(system.num_controls)
+        self._nominal = nominal
+        self._names = [signal.name for signal in system.control_signals]
+        self._bases = [(signal, 0) for signal in system.control_signals]
+
+    @property
+    def count(self) -> str:
+        return ", ".join(f"{count} before {name}" for name, count in self.integrators.items())
+
+    def near_nominal(self) -> DaeSystem:
+        """The system with a nominal state at which no sine is accidentally zero.
+
+        Rows of B(x) may vanish accidentally there, as sin(heading) does at heading 0.
+        """
+        random = np.random.default_rng(0)
+        step = 0.1 * self.spread * random.standard_normal(self.system.num_states)
+        nominal = self.system.nominal_state + step
+        return replace(self.system, nominal_state=nominal, state_scale=self.system.scale)
+
+    def integrate(self, columns: list[int], mixing: ca.SX | None = None) -> None:
+        """Puts one integrator before each of some controls."""
+        system = self.system
+        others = [j for j in range(system.num_controls) if j not in columns]
+        nominal = self._nominal[columns]
+        if mixing is not None:
+            function = system.trace("mixing", {"mixing": mixing}, often=False)
+            here = function(system.nominal_state, system.parameter_values)[0]
+            nominal = nominal + here.reshape(mixing.shape) @ self._nominal[others]
+            for i in columns:
+                control = system.control_signals[i]
+                self._bases[i] = (Signal(f"{control.name}*", control.unit), 0)
+        added = [self._bases[i][0].derivative(self._bases[i][1]) for i in columns]
+        for i in columns:
+            self._bases[i] = (self._bases[i][0], self._bases[i][1] + 1)
+            self.integrators[self._names[i]] = self.integrators.get(self._names[i], 0) + 1
+        following = [self._bases[i][0].derivative(self._bases[i][1]) for i in columns]
+        self.system = _integrated(system, columns, added, following, nominal, mixing)
+        # u_i = x_i - sum_j b_ij u_j, with the new state x_i.
+        new = self.system.state[system.num_states :]
+        self.offset += ca.mtimes(self.matrix[:, columns], new)
+        if mixing is not None:
+            self.matrix[:, others] -= ca.mtimes(self.matrix[:, columns], mixing)
+        self.matrix[:, columns] = 0.0
+        self._nominal[columns] = 0.0
+        # B(x) is often singular at zero, so a nonzero value is kept away from zero.
+        size = np.where(nominal == 0.0, 1.0, np.abs(nominal))
+        self.spread = np.concatenate([self.spread, 0.1 * size])
+
+
+def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | None] | None:
+    """The controls that act in the dependent rows of B(x), and how to mix them."""
+    system = structure.system
+    samples = Samples(structure.manifold, structure.states)
+    actions = InputActions(samples, structure.elimination)
+    matrices = actions.numbers(actions.feedthrough)  # B(x) without its round-off.
+    dynamic = [i for i, degree in enumerate(structure.output_degrees) if degree]
+    if dynamic:
+        last = ca.vertcat(*[structure.output_chains[i][-1] for i in dynamic])
+        matrices[:, dynamic] = actions.numbers(actions.along(last, "h*"))
+    size = np.abs(matrices).max(axis=0)
+    row_size = positive(size.max(axis=1))
+    column_size = positive((size / row_size[:, None]).max(axis=0))
+    scaled = matrices / row_size[:, None] / column_size
+    left, values, _ = np.linalg.svd(scaled)
+    ranks = (values > system.least_margin).sum(axis=1)
+    rank, p = int(ranks.max()), system.num_controls
+    if rank == p:
+        return None
+    least = system.least_margin
+    rows = [i for i in range(p) if any(np.abs(u[i, rank:]).max() > least for u in left)]
+    if ranks.min() < rank:
+        state = samples.states[int(ranks.argmin())]
+        raise AssumptionError(
+            f"the rank of B(x) of (16) falls from {rank} to {ranks.min()} at x = {show(state)}, so "
+            "that the integrators to add differ from state to state. Keep away from this state",
+            5,
+            state,
+        )
+    if samples.dependent(ca.vertcat(structure.manifold.residual_expression, structure.chain)):
+        names = ", ".join(system.output_signals[i].name for i in rows)
+        raise AssumptionError(
+            f"no integrators make B(x) of (16) regular: the outputs {names} and their derivatives "
+            "depend on each other or on the constraints, so that the system is not right-"
+            "invertible. Choose other outputs",
+            5,
+        )
+    q = len(rows) - (p - rank)
+    acting = [j for j in range(p) if matrices[:, rows, j].any()]
+    if len(acting) == q:
+        return acting, None
+
+    def distance(columns: Iterable[int]) -> float:
+        values = np.linalg.svd(scaled[:, rows][:, :, list(columns)], compute_uv=False)
+        return round(float(values[:, -1].min()), 9)
+
+    columns = list(max(combinations(acting, q), key=distance))
+    others = [j for j in range(p) if j not in columns]
+    # Least squares over all dependent rows, since q of them may be dependent at other states. It is
+    # exact: every column lies in the span of the chosen ones.
+    part = structure.control_matrix[rows, :] / row_size[rows]
+    chosen = part[:, columns]
+    mixing = ca.SX(q, p - q)
+    mixed = [i for i, j in enumerate(others) if j in acting]
+    mixing[:, mixed] = Factorization(ca.mtimes(chosen.T, chosen)).solve(
+        ca.mtimes(chosen.T, part[:, [others[i] for i in mixed]])
+    )
+    return columns, mixing
+
+
+def _refuse_metric(system: DaeSystem) -> None:
+    if system.control_metric is not None:
+        raise ModelError(
+            f"{system.name}: control_metric compares controls, not their derivatives; leave it "
+            "out, and give the extended system one"
+        )
+
+
+def _integrated(
+    system: DaeSystem,
+    columns: list[int],
+    added: Sequence[Signal],
+    following: Sequence[Signal],
+    nominal: FloatArray,
+    mixing: ca.SX | None = None,
+) -> DaeSystem:
+    """One integrator before each of some controls, where u_i = x_i - sum_j b_ij(x) u_j."""
+    q, n, p = len(columns), system.num_states, system.num_controls
+    others = [j for j in range(p) if j not in columns]
+    new = ca.vertcat(*[ca.SX.sym(signal.name) for signal in added])
+    h = ca.SX(n + q, p)
+    h[:n, others] = system.h[:, others]
+    if mixing is not None:
+        h[:n, others] -= ca.mtimes(system.h[:, columns], mixing)
+    controls, scale = list(system.control_signals), system.state_scale
+    for row, i in enumerate(columns):
+        h[n + row, i] = 1.0
+        controls[i] = following[row]
+    if scale is not None:
+        scale = np.concatenate([scale, positive(np.abs(nominal))])
+    return replace(
+        system,
+        state=ca.vertcat(system.state, new),
+        f=ca.vertcat(system.f + ca.mtimes(system.h[:, columns], new), ca.SX(q, 1)),
+        g=ca.vertcat(system.g, ca.SX(q, system.num_constraints)),
+        h=h,
+        state_signals=(*system.state_signals, *added),
+        control_signals=tuple(controls),
+        nominal_state=np.concatenate([system.nominal_state, nominal]),
+        state_scale=scale,
+        mass_matrix=ca.diagcat(system.mass_matrix, ca.SX.eye(q)),
+        factorize=None,
+        implicit=None,  # The derivatives of the constraints may differ.
+    )
+
+
+def _by_control(system: DaeSystem, what: str, values: Mapping[str, float]) -> FloatArray:
+    """Numbers by the names of controls as an array, shape (p,); 0 for others."""
+    names = [signal.name for signal in system.control_signals]
+    unknown = [name for name in values if name not in names]
+    if unknown:
+        raise ModelError(
+            f"{system.name}: {what} names {', '.join(unknown)}, but the controls are "
+            f"{', '.join(names) or 'none'}"
+        )
+    return vector(f"{system.name}: {what}", [values.get(n, 0.0) for n in names], len(names))

@@ -1,0 +1,162 @@
+"""Random members of a system: states, parameters and exogenous signals together."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.samples import fields_at
+from drake_dae.errors import InconsistentStateError
+
+MEMBERS = 4
+"""The number of random members. Functions are analytic almost everywhere: one that is zero at a few
+random members is zero at all."""
+
+VISIBLE = 1e-6
+"""An action above this, relative to the sizes of its terms, is not round-off."""
+
+NEARER, TRIES = 0.25, 6
+"""If there is no consistent state for drawn numbers, they are moved towards the defaults by this
+factor, so often."""
+
+CORNERS, PLACES = 16, 64
+"""The number of random corners and of random places at which a box of bounds is searched."""
+
+SAME = 1e-3
+"""Parameters that differ less from their defaults, relative to the others, do not decide."""
+
+OfMember = Callable[[FloatArray, FloatArray], float]
+"""A function of a consistent state and the values of all parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Deciding:
+    """Parameters that decide a degree or a rank: name, value and default of each."""
+
+    pairs: tuple[tuple[str, float, float], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for name, _, _ in self.pairs)
+
+    def __str__(self) -> str:
+        there = " and ".join(f"{name} = {value:.3g}" for name, value, _ in self.pairs)
+        here = " and ".join(f"{name} = {default:.3g}" for name, _, default in self.pairs)
+        return f"at {there}, and not at the default {here}"
+
+
+class Family:
+    """Random members of a system: consistent states, each with parameters of its own.
+
+    A parameter is drawn within its bounds, or within a factor of two of its default (if that is 0,
+    from -1 to 1). So are the derivatives of an exogenous signal, unless its bounds are equal.
+    """
+
+    def __init__(self, manifold: Manifold, states: FloatArray) -> None:
+        self._manifold, self._states = manifold, states
+        self._system = manifold.system
+
+    def deciding(self, acts: OfMember) -> Deciding | None:
+        """Returns the parameters for which an input acts that does not act at the defaults."""
+        hits = [member for member in self._members if acts(*member)]
+        # One of many may be round-off of a nearly singular matrix.
+        if 2 * len(hits) <= len(self._members):
+            return None
+        state, values = hits[0]
+        defaults = self._system.parameter_values
+
+        def acts_with(places: list[int], others: FloatArray, those: FloatArray) -> bool:
+            mixed = others.copy()
+            mixed[places] = those[places]
+            member = self._consistent(state, mixed)
+            return member is not None and bool(acts(*member))
+
+        every = self._places
+        chosen = [n for n in every if acts_with(every[n], others=defaults, those=values)]
+        # No parameter alone decides: those without which it does not act.
+        chosen = chosen or [
+            n for n in every if not acts_with(every[n], others=values, those=defaults)
+        ]
+        pairs = []
+        for name in chosen or every:
+            i = max(every[name], key=lambda i: abs(values[i] - defaults[i]))
+            pairs.append((name, float(values[i]), float(defaults[i])))
+        return Deciding(tuple(pairs))
+
+    def lost(self, margin: OfMember, least: float) -> Deciding | None:
+        """Returns parameters within their bounds where a margin is not above the least, or None.
+
+        It is evaluated at the ends of each range, and at corners and random places of the box.
+        """
+        system, defaults = self._system, self._system.parameter_values
+        names, places = list[str](), list[int]()
+        for p in system.parameters:
+            if p.bounds is not None:
+                first = system.parameter_slice(p.name).start
+                names += [signal.name for signal in p.signals]
+                places += range(first, first + p.value.size)
+        low, high = (bound[places] for bound in system.parameter_box)
+        count, random = len(places), np.random.default_rng(0)
+        default = (defaults[places] - low) / np.where(high > low, high - low, 1.0)
+        alone = [np.where(row > 0, end, default) for row in np.eye(count) for end in (0, 1)]
+        corners = random.integers(0, 2, (CORNERS, count))
+        boxes = [*alone, *np.unique(corners, axis=0), *random.uniform(size=(PLACES, count))]
+
+        def at(box: FloatArray) -> float:
+            values = defaults.copy()
+            values[places] = low + (high - low) * box
+            member = self._consistent(self._states[0], values)
+            return np.inf if member is None else margin(*member)
+
+        lowest = min(boxes, key=at)
+        if at(lowest) > least:
+            return None
+        moved = np.abs(lowest - default)
+        rows = zip(names, low + (high - low) * lowest, defaults[places], moved, strict=True)
+        far = SAME * np.max(moved)
+        return Deciding(tuple((n, float(v), float(d)) for n, v, d, off in rows if off > far))
+
+    @cached_property
+    def _places(self) -> dict[str, list[int]]:
+        """The parameters and derivatives of signals to draw, with their indices."""
+        system, places, rates = self._system, dict[str, list[int]](), dict[str, list[int]]()
+        for p in system.parameters:
+            free = np.flatnonzero(p.low < p.high)
+            places[p.name] = (system.parameter_slice(p.name).start + free).tolist()
+            for order in range(len(p.derivatives)):
+                first = system.exogenous.rates()[p.name].start + order * p.value.size
+                rates[p.name + "'" * (order + 1)] = (first + free).tolist()
+        return {name: drawn for name, drawn in (places | rates).items() if drawn}
+
+    @cached_property
+    def _members(self) -> list[tuple[FloatArray, FloatArray]]:
+        if not self._places:
+            return []
+        system, random = self._system, np.random.default_rng(0)
+        low, high = system.parameter_box
+        defaults, members = system.parameter_values, []
+        for number in range(MEMBERS):
+            away = random.uniform(low, high) - defaults
+            state = self._states[number % len(self._states)]
+            for _ in range(TRIES):
+                member = self._consistent(state, defaults + away)
+                if member is not None:
+                    members.append(member)
+                    break
+                away *= NEARER
+        return members
+
+    def _consistent(
+        self, state: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """A consistent state near a state for other parameters; None if there is none."""
+        try:
+            consistent = self._manifold.project(state, parameters)
+        except InconsistentStateError:
+            return None
+        fields = fields_at(self._system, consistent, parameters)
+        is_finite = all(np.all(np.isfinite(field)) for field in fields.values())
+        return (consistent, parameters) if is_finite else None

@@ -1,0 +1,413 @@
+"""The manifold N* of consistent states, and the projection onto it.                 (4)"""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from math import isfinite
+
+import casadi as ca
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike
+
+from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.dae.settling import CONSISTENT, Settling
+from drake_dae.dae.signals import DerivativeLayout, Indices
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.functions import TracedFunction, count_operations
+from drake_dae.trace.newton import (
+    PRECISION,
+    ROUNDING,
+    NewtonModel,
+    newton,
+    norm,
+    shortest_steps,
+)
+from drake_dae.trace.round_off import are_dependent, positive, unit_rows
+
+NEWTON_STEPS = 6
+"""The number of Newton steps in one function. One or two lead from the end of a simulation step to
+N*, the others reduce the error to round-off. One projection in a thousand takes more."""
+
+STAYS, FOUND, NOT_FOUND = 0.0, 1.0, 2.0
+"""The outcome of these steps: the state is already consistent, they converged to a consistent
+state, or they did not converge."""
+
+DOUBT = 0.03
+"""Gradients are checked for near dependence if the part of one that is orthogonal to those before
+it is shorter than usual by this factor."""
+
+PROBE = 1e-4
+"""The distance at which poles show, in states over their scale."""
+
+RESTARTS = 12
+"""The number of random starts of `Manifold.settle`."""
+
+FAR = 100.0
+"""A velocity is kept if no state moves further for it than so many times the size of the state."""
+
+FLOOR = 1e-12
+"""A distance from N* that is round-off even if all states are zero."""
+
+
+class Manifold:
+    """The manifold N* = {x : L_f^k k_i(x) = 0, k = 0, ..., r_i - 1, i = 1, ..., m} (4)."""
+
+    def __init__(self, system: DaeSystem, chains: Sequence[Sequence[ca.SX]]) -> None:
+        self.system, self.scale = system, system.scale
+        self.residual_expression = ca.vertcat(
+            ca.SX(0, 1), *[ca.vertcat(*chain) for chain in chains]
+        )  # (4)
+        self.layout = DerivativeLayout(tuple(len(chain) for chain in chains))
+        self.residual_signals = self.layout.chain_signals(system.constraint_output_signals)
+        self.gradient = ca.jacobian(self.residual_expression, system.state)
+        self.residual_function = system.trace("manifold", {"residual": self.residual_expression})
+        outputs = {"gradient": self.gradient}
+        self._gradient = system.trace("manifold gradient", outputs, often=False)
+        self._first_steps = self._trace_first_steps()
+        self._settling = Settling(system, self.layout, self.gradient, self.gradients, self.residual)
+
+    @property
+    def dimension(self) -> int:
+        """The dimension of N*, n - (r_1 + ... + r_m), Theorem 1.1."""
+        return self.system.num_states - len(self.residual_signals)
+
+    def residual(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """Returns k_1, k_1', ..., constraint-major, shape (sum r_i,)."""
+        return self.residual_function(state, self.system.parameter_vector(parameters))[0]
+
+    def gradients(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """Returns the gradients C of the residual at a state, shape (sum r_i, n)."""
+        values = self._gradient(state, self.system.parameter_vector(parameters))[0]
+        return values.reshape(-1, self.system.num_states)
+
+    @cached_property
+    def short_gradient(self) -> ca.SX:
+        """`gradient`, in fewer operations where constraint forces are along the gradients.
+
+        Where q' = v, the forces g' are dk/dq, and the gradient of k' = (dk/dq) v is the derivative
+        of dk/dq along v beside dk/dq.
+        """
+        system = self.system
+        if set(self.layout.degrees) != {2}:
+            return self.gradient
+        slope, rate = ca.SX(system.num_constraints, system.num_states), 0 * system.state
+        forces = system.frictional_contacts.without_friction(system.g)
+        index = {entry.name(): i for i, entry in enumerate(ca.vertsplit(system.state))}
+        moved = ca.SX(*slope.shape)
+        for i, entry in enumerate(ca.vertsplit(system.f)):
+            if entry.is_symbolic() and (j := index.get(entry.name())) is not None:
+                rate[i], slope[:, i], moved[:, j] = entry, forces[j, :].T, forces[j, :].T
+        further = ca.jtimes(ca.vec(ca.densify(slope)), system.state, rate)
+        moved += ca.reshape(further, slope.shape)
+        rows = zip(ca.vertsplit(slope), ca.vertsplit(moved), strict=True)
+        short = ca.sparsify(ca.vertcat(*[row for pair in rows for row in pair]))
+        is_shorter = count_operations(short) < count_operations(self.gradient)
+        return short if is_shorter and system.agree(short, self.gradient) else self.gradient
+
+    @cached_property
+    def newton_step(self) -> TracedFunction:
+        """The Newton step of least norm from a state, divided by the scale of the states.
+
+        A function of the state, a second state at which the gradients are taken, and parameters.
+        """
+        other, state = ca.SX.sym("other", self.system.num_states), self.system.state
+        gradient = ca.substitute(self.short_gradient, state, other)
+        step = _shortest_step(gradient, ca.SX(self.scale))[0](self.residual_expression)
+        inputs = {"other": other}
+        return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
+
+    def _trace_first_steps(self) -> TracedFunction:
+        """Traces the first Newton steps from a state, all with the gradients at that state.
+
+        The outputs are the outcome of `_followed` and the lengths of the steps (in states over
+        their scale), the state that they reach, and the first step. The result is not valid where
+        gradients are nearly dependent, by their usual lengths.
+        """
+        system = self.system
+        usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
+        usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
+        start, p, scale = system.state, system.parameter_symbol, ca.SX(self.scale)
+        # The steps hold them often: common subexpressions are removed once here, not from the
+        # whole.
+        expression, gradient = ca.cse([self.residual_expression, self.short_gradient])
+        function = ca.Function("residual", [start, p], [expression], {"cse": False})
+        (step_for, pivots), steps, state = _shortest_step(gradient, scale), list[ca.SX](), start
+        for _ in range(NEWTON_STEPS):
+            steps.append(scale * step_for(function(state, p)))
+            state = state + steps[-1]
+        unit = ca.fmax(scale, ca.fabs(start))
+        lengths = [ca.norm_2(step / scale) for step in steps]
+        sizes = [ca.norm_2(step / unit) for step in steps[:2]]
+        moved, outcome = _followed(start, steps, lengths, *sizes)
+        outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": moved, "step": steps[0]}
+        # A cheap test in place of the sines, which are computed only where this one fails.
+        heads = [ca.fabs(pivots[i]) / usual[i] for i in self.layout.heads.tolist()]
+        doubt = ca.mmin(ca.vertcat(1, *heads)) - DOUBT
+        return system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
+
+    @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
+    def _relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
+        """The norm of the residual, each entry divided by its scaled gradient."""
+        residual = self.residual_function.evaluate(state, parameters)[0]
+        if not residual.any():
+            return 0.0
+        length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)
+        return norm(residual / positive(length))
+
+    def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
+        """Returns whether a state is on N* up to round-off: whether Newton's step is short."""
+        x, p = self._state(state), self.system.parameter_vector(parameters)
+        reach = float(self._first_steps.evaluate(x, p)[0][1])
+        if isfinite(reach) and reach > 0.0:
+            is_near = reach <= CONSISTENT * norm(x / self.scale) + FLOOR
+            return is_near and not self._is_at_pole(x, p)
+        # Dependent gradients, a residual of zero, or one that no state changes.
+        return self._relative_size(x, p) <= CONSISTENT
+
+    def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        """Returns the consistent state next to a state, to round-off, by Newton's method.
+
+        Raises:
+            InconsistentStateError: Newton's method does not reach N*.
+        """
+        start, p = self._state(state), self.system.parameter_vector(parameters)
+        found = self.projected(start, p)
+        if self._is_at_pole(found, p):
+            left = self.residual_function(found, p)[0]
+            worst = int(np.argmax(np.abs(left)))
+            raise InconsistentStateError(
+                f"{self.system.name}: {self.residual_signals[worst].name} = {left[worst]:.3g} is "
+                "left at a pole of the constraint, as where a rotation is half a turn off: start "
+                "nearer to the constraint",
+                left,
+            )
+        return found
+
+    @np.errstate(all="ignore")  # Of a state that grew without bound.
+    def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
+        """Whether the residual is large though Newton's step is short.
+
+        Near a pole the step is the distance to it. The residual then falls along the step, while it
+        grows from a consistent state, whose own is round-off.
+        """
+        step = self._first_steps.evaluate(x, p)[2]
+        length = norm(step / self.scale)
+        if not (isfinite(length) and length > 0.0):
+            return False
+        here, there = (
+            self.residual_function(state, p)[0] for state in (x, x + PROBE / length * step)
+        )
+        lengths = positive(np.linalg.norm(self.gradients(x, p) * self.scale, axis=1))
+        return bool(norm(there / lengths) < norm(here / lengths))
+
+    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
+        function, scale = self._first_steps, self.scale
+        sizes, moved, _ = function.evaluate(start, p)
+        outcome, first = sizes.item(0), sizes.item(1)
+        if outcome == STAYS and function.is_finite:
+            return start
+        if outcome == FOUND and function.is_finite:
+            return moved.copy()
+        if function.is_finite and first == 0.0 and not self.residual(start, p).any():
+            return start
+
+        def linearize(z: FloatArray) -> NewtonModel:
+            x = scale * z
+            step = self.newton_step
+            return NewtonModel(lambda z: step.evaluate(scale * z, x, p)[0].copy(), True)
+
+        z, converged = newton(start / scale, linearize)
+        if not converged:
+            # Gradients are dependent or steps diverge: least squares with decreasing residual.
+            z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
+        state = scale * z
+        if converged and not np.array_equal(state, start):
+            return state
+        # Otherwise the residual is round-off in coarse units, or no state changes it.
+        if self._relative_size(state, p) <= CONSISTENT:
+            return state
+        residual = self.residual(state, p)
+        if converged and function.evaluate(state, p)[1].any():
+            return state
+        raise InconsistentStateError(self._why(state, p, residual), residual)
+
+    def _downhill(self, state: FloatArray, parameters: FloatArray) -> NewtonModel | None:
+        """Least-squares steps that decrease the residual; its rows are scaled to length one."""
+        scale = self.scale
+        gradients = self.gradients(state, parameters) * scale
+        length = positive(np.linalg.norm(gradients, axis=1))
+
+        def residual(z: FloatArray) -> FloatArray:
+            return self.residual_function(scale * z, parameters)[0]
+
+        steps = shortest_steps(gradients, residual)
+        if steps is None:
+            return None
+        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
+
+    def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
+        """Returns in words why a Newton iteration that ended at a state failed."""
+        name = self.system.name
+        values = zip(self.residual_signals, residual, strict=True)
+        bad = [signal.name for signal, value in values if not np.isfinite(value)]
+        if bad:
+            return (
+                f"{name}: {', '.join(bad)} is not finite at the given state; start inside the "
+                "domain of the constraints"
+            )
+        worst = int(np.argmax(np.abs(residual)))
+        text = (
+            f"{name}: no consistent state found near the given one; "
+            f"{self.residual_signals[worst].name} = {residual[worst]:.3g} is left where "
+            "Newton's method ends. "
+        )
+        if are_dependent(self.gradients(state, parameters) * self.scale):
+            return text + (
+                "The gradients of the constraints depend on each other there: the constraints "
+                "contradict each other, or start away from this state"
+            )
+        return text + "Start nearer to the constraint, away from its singular states"
+
+    def settle(
+        self,
+        state: ArrayLike,
+        parameters: ArrayLike | None = None,
+        fixed: Sequence[str] = (),
+    ) -> FloatArray:
+        """Returns the consistent state next to a user's start, computed level by level.
+
+        The constraints are met first, by the states that they depend on; then their derivatives, by
+        the states that are new in them, and so on: positions first, then velocities, so that no
+        velocity moves a position. Velocities that are not zero are kept where the constraints allow
+        it, and the others follow. If Newton's method does not reach N*, it starts again from random
+        states, at first near the given one.
+
+        Args:
+            state: A state near N*, shape (n,).
+            parameters: Values of all parameters; the defaults if None.
+            fixed: Names of states that keep their values.
+
+        Raises:
+            InconsistentStateError: N* is not reached, or not with these states fixed.
+            ModelError: There is no such state, or a shape is wrong.
+        """
+        start, p = self._state(state), self.system.parameter_vector(parameters)
+        names = [signal.name for signal in self.system.state_signals]
+        for name in fixed:
+            if name not in names:
+                raise ModelError(unknown_name("state", name, names))
+        residual = self.residual(start, p)
+        if not residual.any():
+            return start
+        outcome, first = self._first_steps.evaluate(start, p)[0][:2]
+        if self._first_steps.is_finite and outcome != NOT_FOUND and 0.0 < first <= FLOOR:
+            return self.project(start, p)  # It was there up to round-off, which no level moves.
+        chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
+        error = InconsistentStateError(
+            f"{self.system.name}: no consistent state is found near the given one in which "
+            f"{', '.join(fixed)} keep their values; fix fewer states, or give others",
+            residual,
+        )
+        random = np.random.default_rng(0)
+        for spread in (0.0, *np.geomspace(0.1, 3.0, RESTARTS)):
+            moved = start.copy()
+            free = np.setdiff1d(self._settling.places, chosen)
+            moved[free] += spread * self.scale[free] * random.normal(size=free.size)
+            try:
+                found = self._settled(moved, p, chosen)
+                if found is not None or not fixed:
+                    return self.project(moved if found is None else found, p)
+            except InconsistentStateError as failure:
+                error = error if fixed or spread else failure
+        raise error
+
+    def _settled(self, start: FloatArray, p: FloatArray, chosen: Indices) -> FloatArray | None:
+        """The state next to a start where chosen states, and if possible velocities, stay."""
+        given = np.union1d(chosen, self._settling.given_rates(start))
+        for kept in (given, chosen) if given.size > chosen.size else (chosen,):
+            found = self._settling.settled(start, p, kept)
+            if found is None:
+                continue
+            far = norm((found - start) / self.scale)
+            if kept is chosen or far <= FAR * norm(start / self.scale):
+                return found
+        return None
+
+    def _state(self, state: ArrayLike) -> FloatArray:
+        """A state as a new array; its numbers need not be finite."""
+        x = numbers(f"{self.system.name}: a state", state).reshape(-1)
+        if x.size != self.system.num_states:
+            raise ModelError(
+                f"{self.system.name}: a state has shape ({self.system.num_states},), got {x.shape}"
+            )
+        return x
+
+
+def _followed(
+    start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """The state that `newton` reaches by these first steps, and the outcome."""
+    # Newton's method ends at the start, or after its first step; then it is polished.
+    at_start = size <= ROUNDING
+    after_one = ca.logic_and(ca.logic_not(at_start), left * left <= PRECISION * size)
+    goes_on = ca.logic_and(at_start, lengths[0] > 0)
+    moved = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
+    for number in range(1, len(steps)):
+        shorter = ca.logic_and(goes_on, lengths[number] < 0.5 * lengths[number - 1])
+        goes_on = shorter if number > 1 else ca.logic_or(after_one, shorter)
+        goes_on = ca.logic_and(goes_on, lengths[number] > 0)
+        moved += ca.if_else(goes_on, steps[number], 0)
+    ends = ca.logic_and(ca.logic_or(at_start, after_one), ca.logic_not(goes_on))
+    # A first step of length zero does not tell whether the start is consistent.
+    moves = ca.logic_or(after_one, lengths[0] > 0)
+    outcome = ca.if_else(ca.logic_and(ends, moves), FOUND, NOT_FOUND)
+    stays = ca.logic_and(lengths[0] > 0, lengths[0] <= ROUNDING)
+    return moved, ca.if_else(stays, STAYS, outcome)
+
+
+def _shortest_step(
+    gradient: ca.SX, scale: ca.SX
+) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
+    """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
+
+    It is -(C S)' N^-1 residual with N = C S (C S)', each row by its largest entry. An error of N^-1
+    grows with the square of the condition of C, and only makes Newton's method slower. The lengths
+    of the parts of the gradients that are orthogonal to those before are returned as well.
+    """
+    if not gradient.shape[0]:
+        return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
+    scaled = ca.mtimes(gradient, ca.diag(scale))
+    # By their largest entries: the squares of entries may be too large for a number.
+    largest = [ca.norm_inf(row) for row in ca.vertsplit(scaled)]
+    sizes = ca.vertcat(*[ca.if_else(size > 0, size, 1) for size in largest])
+    scaled = ca.sparsify(scaled / ca.repmat(sizes, 1, scaled.shape[1]))
+    normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
+    lengths = [size * length for size, length in zip(largest, normal.lengths, strict=True)]
+    # CasADi lets the infinities of constant gradients cancel each other.
+    regular = ca.if_else(normal.pivot > 0, 0, ca.SX.nan())
+    return lambda residual: regular - ca.mtimes(scaled.T, normal.solve(residual / sizes)), lengths
+
+
+def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
+    """Returns a basis T of the tangent space, orthonormal in scaled states, shape (n, n - k)."""
+    rows = unit_rows(gradients * scale)
+    return scale[:, None] * np.linalg.svd(rows)[2][len(rows) :].T
+
+
+def coordinates(gradients: FloatArray, scale: FloatArray) -> tuple[Indices, FloatArray]:
+    """Returns n - k states that are coordinates, and the derivatives of all states by them.
+
+    Unlike an orthonormal basis this one leaves a triangular system triangular.
+    """
+    basis = tangent(gradients, scale) / scale[:, None]
+    count = basis.shape[1]
+    free = np.sort(scipy.linalg.qr(basis.T, mode="r", pivoting=True)[1][:count])
+    rest = np.setdiff1d(np.arange(scale.size), free)
+    rows = unit_rows(gradients * scale)
+    moved = np.zeros(basis.shape)
+    moved[free] = np.eye(count)
+    moved[rest] = -np.linalg.solve(rows[:, rest], rows[:, free])
+    return free, scale[:, None] * moved / scale[free]

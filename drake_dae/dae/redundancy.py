@@ -1,0 +1,313 @@
+"""Systems without their redundant constraints: whose forces go, or are shared by least squares."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import Booleans, FloatArray, unknown_name
+from drake_dae.dae.assumptions import redundant_constraints
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.samples import Samples, draw
+from drake_dae.dae.system import DaeSystem, ForceSharing
+from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.newton import ROUND_OFF
+from drake_dae.trace.round_off import (
+    FLOOR,
+    equilibrated,
+    positive,
+    rank_of,
+    significant,
+    without_round_off,
+)
+
+SEARCH = 200
+"""The largest number of steps to a state where all constraints hold; a dozen are enough."""
+
+PREFERRED = 0.5
+"""The next constraint to keep is the first whose independence of those already kept is at least
+this fraction of the best."""
+
+
+@checked(ModelError)
+def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> DaeSystem:
+    """Returns a system with the same motion in which redundant constraints are removed.
+
+    A constraint goes with the constraint input of the same number. The motion is the same, since
+    the inputs that remain act in all directions in which those that go did. The forces of the
+    remaining constraints depend on this choice: the split among redundant constraints is not
+    determined by (1)-(3), only the sum g(x) v is.
+
+    Args:
+        system: The system (1)-(3).
+        names: The constraints to leave out; if None those whose gradients follow from those before
+            them, at all consistent states drawn around the nominal one.
+
+    Raises:
+        InconsistentStateError: There is no consistent state near the nominal one.
+        ModelError: No constraint has that name; or one that is left out is not redundant, its input
+            acts in an independent direction, or an output is its force.
+    """
+    samples = all_constraints_hold(system)
+    if names is None:
+        names = [combination.name for combination in redundant_constraints(samples)]
+    kept = _all_but(system, names)
+    if len(kept) == system.num_constraints:
+        return system
+    gone = ", ".join(f"'{name}'" for name in names)
+    if system.m[:, [i for i in range(system.num_constraints) if i not in kept]].nnz():
+        raise ModelError(
+            f"{system.name}: an output is the force of {gone}, which is not determined where "
+            "constraints are redundant; choose other outputs, or leave out other constraints"
+        )
+    _check_same_motion(samples, kept, gone)
+    return with_constraints(system, kept)
+
+
+@checked(ModelError)
+def share_forces(
+    system: DaeSystem,
+    names: Sequence[str] | None = None,
+    *,
+    compliances: Mapping[str, float] | None = None,
+) -> DaeSystem:
+    """Removes redundant constraints and distributes the forces among all by least squares.
+
+    On N* the input of a constraint that is left out acts as a combination of those that stay, E^-1
+    g_out = E^-1 g D, so that the motion follows from v = v_stay + D v_out alone, and all v_all =
+    (v_stay, v_out) with one v move the system in the same way: the split among redundant
+    constraints is not determined by (1)-(3). The reported split has the least sum of c_i v_i^2,
+
+        v_all = T v,   T = C^-1 G^T (G C^-1 G^T)^-1,   G = [1, D],   C = diag(c_1, ..., c_M),
+
+    and does not depend on which constraints are kept. It is physical if the c_i are the compliances
+    of the constrained parts, in m/N or rad/(N m): stiff springs in place of the constraints share a
+    slowly changing force in this way (Menabrea 1858). Only ratios matter. With all c_i = 1, the
+    default, stiffnesses are equal in SI units, which means little if forces and moments are
+    redundant together.
+
+    The system has the constraints that stay, and its `sharing` shows the forces of all on the port
+    `constraint_force` of a plant. Those that are kept must stay independent along the whole motion,
+    otherwise A(x) becomes singular; then keep others.
+
+    Args:
+        system: The system (1)-(3).
+        names: The constraints to leave out; if None as many as are redundant at all consistent
+            states drawn around the nominal one, so that those that stay are well independent.
+        compliances: Name of a constraint input -> c_i, for those where it is not 1.
+
+    Raises:
+        InconsistentStateError: There is no consistent state near the nominal one.
+        ModelError: There is no such constraint or constraint input; a compliance is not positive; a
+            constraint that is left out is not redundant, or its input acts in an independent
+            direction; or an output is not a function of the sum G v_all, and so not determined.
+    """
+    inputs = [signal.name for signal in system.constraint_input_signals]
+    weights = np.ones(len(inputs))
+    for name, value in (compliances or {}).items():
+        if name not in inputs:
+            raise ModelError(f"{system.name}: {unknown_name('constraint force', name, inputs)}")
+        if not value > 0.0:
+            raise ModelError(
+                f"{system.name}: the compliance of '{name}' must be positive, got {value}"
+            )
+        weights[inputs.index(name)] = value
+    samples = all_constraints_hold(system)
+    kept = _independent(samples) if names is None else _all_but(system, names)
+    if len(kept) == system.num_constraints:
+        return system
+    left_out = [i for i in range(system.num_constraints) if i not in kept]
+    signals = system.constraint_output_signals
+    _check_same_motion(samples, kept, ", ".join(f"'{signals[i].name}'" for i in left_out))
+    inertia = PositiveDefiniteFactorization(system.mass_matrix)
+    half = inertia.forward(system.g)
+    product = ca.sparsify(ca.mtimes(inertia.scaled(half).T, half))
+    gather = ca.SX(len(kept), system.num_constraints)
+    gather[:, kept] = ca.SX.eye(len(kept))
+    gather[:, left_out] = PositiveDefiniteFactorization(product[kept, kept]).solve(
+        product[kept, left_out]
+    )
+    weighted = ca.mtimes(ca.diag(ca.SX(1.0 / weights)), gather.T)
+    sum_of = PositiveDefiniteFactorization(ca.sparsify(ca.mtimes(gather, weighted)))
+    split = sum_of.solve(ca.densify(weighted.T)).T
+    sharing = ForceSharing(
+        split=split,
+        gather=gather,
+        signals=system.constraint_input_signals,
+        undetermined=_undetermined(samples, gather, split),
+        left_out=system.k[left_out],
+        left_out_signals=tuple(signals[i] for i in left_out),
+    )
+    return replace(with_constraints(system, kept), sharing=sharing)
+
+
+def manifold_of_left_out(system: DaeSystem) -> Manifold | None:
+    """Returns the states at which the removed redundant constraints hold; None without any.
+
+    It contains N*, and possibly states of another assembly mode.
+    """
+    sharing = system.sharing
+    if sharing is None:
+        return None
+    count = len(sharing.left_out_signals)
+    alone = replace(
+        system,
+        k=sharing.left_out,
+        g=ca.SX(system.num_states, count),
+        m=ca.SX(system.num_outputs, count),
+        constraint_input_signals=(),
+        constraint_output_signals=sharing.left_out_signals,
+        implicit=None,
+        sharing=None,
+    )
+    return Manifold(alone, [[row] for row in ca.vertsplit(sharing.left_out)])
+
+
+def all_constraints_hold(system: DaeSystem) -> Samples:
+    """Returns random states around the nominal state at which all constraints k_i hold."""
+    return Samples(_Redundant(system), draw(system, None, 12, 0))
+
+
+class _Redundant(Manifold):
+    """The states at which all constraints k_i hold, including redundant ones.
+
+    Near these states the gradients of redundant constraints are nearly dependent, so that Newton
+    steps become very long or lead to a singular configuration. Levenberg-Marquardt steps with a
+    damping as large as the residual stay short and still converge quadratically (Yamashita and
+    Fukushima 2001).
+    """
+
+    def __init__(self, system: DaeSystem) -> None:
+        super().__init__(system, [[row] for row in ca.vertsplit(system.k)])
+
+    def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
+        scale = self.system.scale
+        z = self.system.state_vector(state) / scale
+        gradients = self.gradients(scale * z, parameters) * scale
+        length = np.linalg.norm(gradients, axis=1)
+        largest = float(np.max(length, initial=0.0))
+        length = positive(np.where(length > FLOOR * largest, length, largest))
+        residual = self.residual(scale * z, parameters) / length
+        damping = 1.0
+        for _ in range(SEARCH):
+            size = float(np.linalg.norm(residual))
+            u, s, v = np.linalg.svd(gradients / length[:, None], full_matrices=False)
+            step = (u.T @ residual) * s / positive(s * s + damping * size) @ v
+            following = self.residual(scale * (z - step), parameters) / length
+            if not np.linalg.norm(following) < size:
+                if size <= ROUND_OFF * (1.0 + np.linalg.norm(z)):
+                    return np.asarray(scale * z)
+                damping *= 4.0
+                continue
+            z, residual, damping = z - step, following, 1.0
+            gradients = self.gradients(scale * z, parameters) * scale
+        raise InconsistentStateError(
+            f"{self.system.name}: no state found near the given one at which all constraints hold",
+            residual * length,
+        )
+
+
+def _all_but(system: DaeSystem, names: Sequence[str]) -> list[int]:
+    """The indices of the constraints whose names are not listed."""
+    signals = [signal.name for signal in system.constraint_output_signals]
+    for name in names:
+        if name not in signals:
+            raise ModelError(f"{system.name}: {unknown_name('constraint', name, signals)}")
+    return [i for i, name in enumerate(signals) if name not in names]
+
+
+def _independent(samples: Samples) -> list[int]:
+    """The indices of constraints that are well independent of each other at all samples."""
+    values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
+    scaled = [gradient * samples.system.scale for (gradient,) in values]
+    remainders = [equilibrated(significant(gradient)) for gradient in scaled]
+    kept: list[int] = []
+    while len(kept) < min(map(rank_of, scaled)):
+        independence = np.min([np.linalg.norm(matrix, axis=1) for matrix in remainders], axis=0)
+        independence[kept] = 0.0
+        chosen = int(np.argmax(independence >= PREFERRED * independence.max()))
+        kept.append(chosen)
+        for matrix in remainders:
+            direction = matrix[chosen] / np.linalg.norm(matrix[chosen])
+            matrix -= np.outer(matrix @ direction, direction)
+    return sorted(kept)
+
+
+def _check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
+    """Raises ModelError if the motion changes without the constraints that are not kept."""
+    system = samples.system
+    moving = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in system.exogenous.moving])
+    gradients = samples.values(
+        gradient=ca.jacobian(system.k, system.state), moved=ca.jacobian(system.k, moving)
+    )
+    names = ", ".join(f"'{signal.name}'" for signal in system.exogenous.signals)
+    for (by_state, moved), fields in zip(gradients, samples.fields, strict=True):
+        gradient = by_state * system.scale
+        for rows, why in (
+            (gradient, "its gradients are not combinations of those of the remaining constraints"),
+            (
+                np.hstack([gradient, moved]),
+                f"where the exogenous signals {names} move, the constraints left out are no longer "
+                "implied by the remaining ones",
+            ),
+            (
+                fields["g"].T / system.scale,
+                "its columns of g are not combinations of the remaining columns",
+            ),
+        ):
+            if rank_of(significant(rows)[kept]) < rank_of(rows):
+                raise ModelError(f"{system.name}: {gone} cannot be left out: {why}")
+
+
+def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:
+    """The system with only some of its constraints and their inputs."""
+    whole, implicit = system.implicit, None
+    if whole is not None:
+
+        def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
+            every = ca.SX(system.num_constraints, 1)
+            every[kept] = constraint_input
+            rest, constraint_rate = whole(rate, every)
+            return rest, constraint_rate[kept]
+
+    signals = tuple(system.constraint_input_signals[i] for i in kept)
+    names = {signal.name for signal in signals}
+    return replace(
+        system,
+        g=system.g[:, kept],
+        k=system.k[kept],
+        m=system.m[:, kept],
+        contacts=tuple(contact for contact in system.contacts if contact.force in names),
+        constraint_input_signals=signals,
+        constraint_output_signals=tuple(system.constraint_output_signals[i] for i in kept),
+        implicit=implicit,
+    )
+
+
+def _undetermined(samples: Samples, gather: ca.SX, split: ca.SX) -> tuple[str, ...]:
+    """The constraint inputs that are not determined; raises ModelError if an output is not."""
+    system = samples.system
+
+    def changes(rows: FloatArray, gather: FloatArray, split: FloatArray) -> Booleans:
+        """The rows S of S v_all that are not determined by G v_all: S is not S T G."""
+        sized = np.abs(rows) + np.abs(rows) @ np.abs(split) @ np.abs(gather)
+        changed, _ = without_round_off(rows - rows @ split @ gather, sized)
+        return np.asarray(changed.any(axis=1))
+
+    free = np.zeros(system.num_constraints, dtype=bool)
+    for m, g, t in samples.values(m=system.m, gather=gather, split=split):
+        free |= changes(np.eye(system.num_constraints), g, t)
+        outputs = zip(system.output_signals, changes(m, g, t), strict=True)
+        if bad := [signal.name for signal, is_free in outputs if is_free]:
+            raise ModelError(
+                f"{system.name}: the output {', '.join(bad)} is not determined: the distribution "
+                "of forces among redundant constraints does not affect the motion, and no "
+                "control affects it. Choose other outputs; sums of the redundant forces are "
+                "determined"
+            )
+    signals = system.constraint_input_signals
+    return tuple(signal.name for signal, is_free in zip(signals, free, strict=True) if is_free)

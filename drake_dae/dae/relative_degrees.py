@@ -1,0 +1,314 @@
+"""Relative degrees by Assumptions (1), (3) and (4), and the chains of derivatives.
+
+Whether an input acts on a derivative is decided by the structure of the expression first, then by
+its numbers at consistent states, with the default parameters and signals at rest; what is zero
+there must be zero with all other numbers.
+"""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import Booleans, FloatArray, show
+from drake_dae.dae.assumptions import (
+    Violation,
+    ViolationKind,
+    following_outputs,
+    redundant_constraints,
+)
+from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
+from drake_dae.dae.elimination import Elimination, eliminate_numbers
+from drake_dae.dae.family import VISIBLE, Deciding, Family
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.samples import Region, Samples, as_matrix, fields_at
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import ModelError, NegligibleWarning
+from drake_dae.trace.factorization import nonzeros
+from drake_dae.trace.round_off import Sized, multiply
+
+MANY = 10
+"""A function that is zero at this many random states is zero."""
+
+DOUBTFUL = 1e-13
+"""An entry above this, relative to the others in its row or column, may be intended."""
+
+Row = Callable[[FloatArray, FloatArray, float], Sized]
+"""A row of numbers at a state for values of all parameters, and the threshold for zero."""
+
+
+def constraint_chains(
+    system: DaeSystem, guesses: FloatArray, region: Region | None
+) -> tuple[list[list[ca.SX]], Samples]:
+    """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3)."""
+    explicit = system.explicit
+    x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
+    chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
+    undecided, by_numbers = list(range(system.num_constraints)), ByNumbers()
+    while undecided:
+        last = ca.vertcat(*[chains[i][-1] for i in undecided])
+        by_force = lie_derivative_along(last, explicit.g, x)
+        by_control = lie_derivative_along(last, explicit.h, x)
+        samples = Samples(Manifold(system, chains), guesses, region)
+        actions, next_undecided, stuck = InputActions(samples), [], []
+        force_acts = actions.acts(by_force, actions.along(last, "g"))
+        control_acts = actions.acts(by_control, actions.along(last, "h"))
+        reached = _reached(explicit.g, f, last, x)
+        for row, i in enumerate(undecided):
+            order = len(chains[i])
+            if force_acts[row].all():
+                by_numbers.refuse(i)
+                continue
+            if force_acts[row].any():
+                state = samples.states[int(np.argmin(force_acts[row]))]
+                raise Violation(
+                    1, ViolationKind.CONSTRAINT_DEGREE, (names[i],), order, state
+                ).error()
+            if control_acts[row].any():
+                state = samples.states[int(np.argmax(control_acts[row]))]
+                raise Violation(3, ViolationKind.EARLY_CONTROL, (names[i],), order, state).error()
+            for key, rows, assumption in (("g", by_force, 1), ("h", by_control, 3)):
+                if rows[row, :].nnz():
+                    violation = Violation(assumption, ViolationKind.NUMBERS, (names[i],), order)
+                    along = actions.along(chains[i][-1], key)
+                    by_numbers.examine(i, violation, samples, along)
+            next_undecided.append(i)
+            if not reached[row] or (
+                by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
+            ):
+                stuck.append(i)
+        if not next_undecided:
+            return chains, samples
+        if sum(len(chain) for chain in chains) + len(next_undecided) > system.num_states:
+            stuck = next_undecided
+        if stuck:
+            dependent = redundant_constraints(samples)
+            those = tuple(names[i] for i in stuck)
+            deciding = by_numbers.deciding(stuck)
+            violation = Violation(2, ViolationKind.NO_FORCE, those, combinations=dependent)
+            raise replace(violation, deciding=deciding).error()
+        for i in next_undecided:
+            derivative = lie_derivative(chains[i][-1], f, x)
+            if system.exogenous:
+                derivative += system.exogenous.rate(chains[i][-1])
+            chains[i].append(derivative)
+        undecided = next_undecided
+    return chains, Samples(Manifold(system, chains), guesses, region)
+
+
+class OutputChains(NamedTuple):
+    """The result of Assumption (4) for the outputs; see `Structure` for the fields."""
+
+    output_chains: tuple[tuple[ca.SX, ...], ...]
+    drift: ca.SX
+    control_matrix: ca.SX
+    highest_derivatives: ca.SX
+    chains_need_force: bool
+    round_off: Booleans
+
+
+def output_chains(
+    derivatives: Derivatives, elimination: Elimination, samples: Samples
+) -> OutputChains:
+    """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and the rows of B(x)."""
+    system = derivatives.system
+    x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
+    names, count = [s.name for s in system.output_signals], system.num_outputs
+    controls = system.num_controls
+    moving = system.outputs(derivatives.constraint_input)
+    drift, control_matrix = ca.SX(count, 1), ca.SX(count, controls)
+    highest_derivatives = ca.SX(count, 1)
+    round_off, need_force = np.zeros((count, controls), dtype=bool), False
+    chains: list[list[ca.SX]] = [[] for _ in range(count)]
+    by_numbers, actions = ByNumbers(), InputActions(samples, elimination)
+    slopes = actions.numbers(actions.feedthrough)
+    following, rows = elimination.l_star, elimination.n_star
+    undecided = list(range(count))
+    while True:
+        acts, still = np.asarray(slopes.any(axis=2)).T, []
+        for row, i in enumerate(undecided):
+            if acts[row].all():
+                by_numbers.refuse(i)
+                drift[i] = following[row]
+                control_matrix[i, :] = rows[row, :]  # (16)
+                round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
+                highest_derivatives[i] = moving[row]
+            elif acts[row].any():
+                state = samples.states[int(np.argmin(acts[row]))]
+                order = len(chains[i])
+                raise Violation(4, ViolationKind.OUTPUT_DEGREE, (names[i],), order, state).error()
+            else:
+                if not chains[i] and rows[row, :].nnz():
+                    violation = Violation(4, ViolationKind.NUMBERS, (names[i],), 0)
+                    by_numbers.examine(i, violation, samples, actions.feedthrough, i)
+                still.append(i)
+                chains[i].append(following[row])
+                need_force = need_force or derivatives.has_unknowns(moving[row])
+        if not still:
+            break
+        last = ca.vertcat(*[chains[i][-1] for i in still])
+        # Along x' = f* + h* u: the derivative is L_f* + L_h* u of the last one.
+        moving = derivatives.derivative(moving[[undecided.index(i) for i in still]])
+        following, rows = derivatives.by_control(moving)
+        slopes = actions.numbers(actions.along(last, "h*"), rows)
+        acts, stuck = np.asarray(slopes.any(axis=2)).T, []
+        reached = _reached(h_star, f_star, last, x)
+        for row, i in enumerate(still):
+            if acts[row].any():
+                continue
+            if rows[row, :].nnz():
+                violation = Violation(4, ViolationKind.NUMBERS, (names[i],), len(chains[i]))
+                by_numbers.examine(i, violation, samples, actions.along(chains[i][-1], "h*"))
+            # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
+            # where nothing acts although the structure allows it.
+            used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
+            if (
+                used.numel() >= system.num_states
+                or not reached[row]
+                or (rows[row, :].nnz() and samples.dependent(used))
+            ):
+                stuck.append(i)
+        if stuck:
+            those, deciding = tuple(names[i] for i in stuck), by_numbers.deciding(stuck)
+            following = tuple(following_outputs(samples, those))
+            violation = Violation(
+                5, ViolationKind.NO_CONTROL, those, combinations=following, deciding=deciding
+            )
+            raise violation.error()
+        undecided = still
+    every = tuple(tuple(chain) for chain in chains)
+    return OutputChains(every, drift, control_matrix, highest_derivatives, need_force, round_off)
+
+
+class InputActions:
+    """The numbers by which inputs act on functions, at states and for values of all parameters.
+
+    A `Row` is a function of state, parameters and the threshold for zero. It returns numbers in
+    which round-off is zero, with their sizes before cancellation.
+    """
+
+    def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
+        self._samples, self._system, self._scale = samples, samples.system, samples.scale
+        if elimination is not None:
+            gradient, matrix = elimination.constraint_gradient, elimination.constraint_matrix
+            factors = {"gradient": gradient, "matrix": matrix}
+            self._factors = self._system.trace("sample", factors, often=False)
+
+    def along(self, functions: ca.SX, key: str) -> Row:
+        """Returns the derivatives of functions along the columns of g, h or h* (10)."""
+        system = self._system
+        gradient = ca.jacobian(functions, system.state)
+        trace = system.trace("sample", {"gradient": gradient}, often=False)
+
+        def row(state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
+            if key == "h*":
+                field, _ = self._eliminated(state, parameters, negligible)
+            else:
+                value = fields_at(system, state, parameters)[key]
+                field = value, np.abs(value)
+            gradients = trace(state, parameters)[0].reshape(gradient.shape)
+            if not np.all(np.isfinite(gradients)):
+                nowhere = np.full((len(gradients), field[0].shape[1]), np.nan)
+                return nowhere, nowhere
+            return multiply(gradients, field, self._scale, negligible)
+
+        return row
+
+    def feedthrough(self, state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
+        """Returns n* (12)."""
+        return self._eliminated(state, parameters, negligible)[1]
+
+    def numbers(self, row: Row, pattern: ca.SX | None = None) -> FloatArray:
+        """Returns a row at the samples; zeros if an expression of it, if given, is zero."""
+        samples, system = self._samples, self._system
+        if pattern is not None and not pattern.nnz():
+            return np.zeros((len(samples.states), *pattern.shape))
+        values = [row(x, system.parameter_values, system.negligible)[0] for x in samples.states]
+        for state, value in zip(samples.states, values, strict=True):
+            if not np.all(np.isfinite(value)):
+                raise ModelError(
+                    f"{system.name}: a derivative is not finite at the consistent state x = "
+                    f"{show(state)}; give a nominal_state inside the domain of the functions and "
+                    "of their derivatives"
+                )
+        return np.array(values)
+
+    def acts(self, pattern: ca.SX, row: Row) -> Booleans:
+        """Returns where a row is not zero, shape (functions, samples)."""
+        return np.asarray(self.numbers(row, pattern).any(axis=2)).T
+
+    def _eliminated(
+        self, state: FloatArray, parameters: FloatArray, negligible: float
+    ) -> tuple[Sized, Sized]:
+        """h* and n*."""
+        fields = fields_at(self._system, state, parameters)
+        gradient, matrix = map(as_matrix, self._factors(state, parameters))
+        try:
+            return eliminate_numbers(fields, gradient, matrix, self._scale, negligible)
+        except np.linalg.LinAlgError:
+            h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
+            return (h_star, h_star), (n_star * np.nan, n_star)
+
+
+class ByNumbers:
+    """Constraints and outputs whose row is zero at the default parameters, but not at others."""
+
+    def __init__(self) -> None:
+        self._violations: dict[int, Violation] = {}
+
+    def examine(
+        self, index: int, violation: Violation, samples: Samples, row: Row, of: int = 0
+    ) -> None:
+        """Evaluates a row, or one of several, that is zero at the default parameters at others."""
+        if index in self._violations:
+            return
+        system = samples.system
+
+        @np.errstate(all="ignore")  # Values that are not finite decide nothing.
+        def acts(state: FloatArray, parameters: FloatArray, negligible: float) -> bool:
+            value, size = (each[of] for each in row(state, parameters, negligible))
+            return bool(np.any(np.abs(value) > VISIBLE * size))
+
+        family = Family(samples.manifold, samples.states)
+        deciding = family.deciding(lambda x, p: acts(x, p, system.negligible))
+        if deciding:
+            self._violations[index] = replace(violation, deciding=deciding)
+        defaults = system.parameter_values
+        if system.negligible > DOUBTFUL and all(
+            acts(state, defaults, DOUBTFUL) for state in samples.states
+        ):
+            warnings.warn(
+                f"{system.name}: what acts on derivative {violation.order} of "
+                f"'{violation.names[0]}' is less than {system.negligible:g} of the others, the "
+                "system's `negligible`, and counts as zero. If it is meant, choose other units, or "
+                "set a smaller number",
+                NegligibleWarning,
+                stacklevel=5,
+            )
+
+    def refuse(self, index: int) -> None:
+        """Raises AssumptionError if a degree is another one for other parameters."""
+        if index in self._violations:
+            raise self._violations[index].error()
+
+    def deciding(self, indices: Sequence[int]) -> Deciding | None:
+        """Returns the parameters for which an input acts on one of some constraints or outputs."""
+        violations = (self._violations[i] for i in indices if i in self._violations)
+        return next((violation.deciding for violation in violations), None)
+
+
+def _reached(fields: ca.SX, drift: ca.SX, expressions: ca.SX, state: ca.SX) -> Booleans:
+    """The expressions that an input along the fields can influence, by structure."""
+    influence = _pattern(drift, state)
+    moved = nonzeros(fields.sparsity()).any(axis=1)
+    for _ in range(state.numel()):
+        moved = moved | influence[:, moved].any(axis=1)
+    return np.asarray((_pattern(expressions, state) & moved).any(axis=1))
+
+
+def _pattern(expression: ca.SX, state: ca.SX) -> Booleans:
+    """Which entries (rows) depend on which states (columns)."""
+    return nonzeros(ca.jacobian_sparsity(expression, state))

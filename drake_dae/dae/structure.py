@@ -1,0 +1,512 @@
+"""The structure of a system: relative degrees, index, N*, Assumptions (1)-(5) with margins."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TypeVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import Booleans, FloatArray, check_whole_number, show
+from drake_dae.dae.assumptions import (
+    Violation,
+    ViolationKind,
+    combinations_of,
+    find_dependence,
+    rank_violation,
+    redundant_constraints,
+)
+from drake_dae.dae.derivatives import Derivatives
+from drake_dae.dae.elimination import Elimination, eliminate
+from drake_dae.dae.family import Family
+from drake_dae.dae.manifold import Manifold
+from drake_dae.dae.margins import RankMargin, find_margin
+from drake_dae.dae.redundancy import all_constraints_hold
+from drake_dae.dae.relative_degrees import InputActions, constraint_chains, output_chains
+from drake_dae.dae.samples import Region, Samples, draw
+from drake_dae.dae.signals import DerivativeLayout
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
+from drake_dae.trace.factorization import Factorization, nearest_solution
+from drake_dae.trace.functions import TracedFunction
+from drake_dae.trace.round_off import equilibrated, equilibration, positive, smallest_singular_value
+
+Kind = TypeVar("Kind", bound="ConstraintStructure")
+
+PART = 0.1
+"""The least part of a constraint in a vanishing combination, relative to the largest."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False, repr=False)
+class ConstraintStructure:
+    """The structure of the constraints of a system, by Assumptions (1)-(3).
+
+    It is enough for simulation. Controls and controlled outputs are not needed.
+
+    Attributes:
+        system: The system.
+        constraint_degrees: r_1, ..., r_m.
+        manifold: N* (4).
+        derivatives: The time derivatives along the motion on N*.
+        elimination: Equations (9)-(14) as expressions; not finite where A(x) is singular.
+        states: The consistent states at which numbers were decided, shape (samples, n).
+        scale: The size of each state over them and the guesses from which they were found, shape
+            (n,).
+        constraint_margin: The margin of A(x), Assumption (2), without friction; None without
+            constraints.
+    """
+
+    system: DaeSystem
+    constraint_degrees: tuple[int, ...]
+    manifold: Manifold
+    derivatives: Derivatives
+    elimination: Elimination
+    states: FloatArray
+    scale: FloatArray
+    constraint_margin: RankMargin | None
+
+    def __repr__(self) -> str:
+        degrees = f"r={self.constraint_degrees}, index={self.index}"
+        return f"ConstraintStructure({self.system.name!r}, {degrees})"
+
+    @property
+    def index(self) -> int:
+        """max r_i + 1, the index of the DAE; 0 without constraints."""
+        return max(self.constraint_degrees) + 1 if self.constraint_degrees else 0
+
+    def constraint_matrix(
+        self, state: ArrayLike, parameters: ArrayLike | None = None
+    ) -> FloatArray:
+        """Returns A(x) at a state, shape (m, m): for one contact its mobility in 1/kg."""
+        return self._matrix(
+            self.system.state_vector(state), self.system.parameter_vector(parameters)
+        )
+
+    @cached_property
+    def _matrix(self) -> Callable[[FloatArray, FloatArray], FloatArray]:
+        matrix = self.elimination.constraint_matrix
+        function = self.system.trace("A(x)", {"value": matrix}, often=False)
+        return lambda x, p: function(x, p)[0].reshape(matrix.shape)
+
+    def dependent_constraints(self, state: FloatArray, parameters: FloatArray) -> tuple[str, ...]:
+        """Returns the names of the constraints that become dependent where A(x) is singular.
+
+        They are the parts of n with n^T A(x) = 0, in units of the usual lengths of the gradients.
+        """
+        usual = [np.diag(self._matrix(x, parameters)) for x in self.states]
+        unit = 1.0 / np.sqrt(positive(np.median(np.abs(usual), axis=0)))
+        matrix = self._matrix(state, parameters) * unit * unit[:, None]
+        if not np.isfinite(matrix).all():
+            return ()
+        part = np.abs(np.linalg.svd(matrix)[0][:, -1])
+        signals = self.system.constraint_output_signals
+        return tuple(signals[i].name for i in np.flatnonzero(part > PART * part.max()))
+
+    def trace(self, name: str, value: ca.SX, needs_control: bool) -> TracedFunction:
+        """Compiles an expression of state and `derivatives.control` on N*, or with control 0."""
+        control = self.derivatives.control
+        inputs = {"control": control}
+        if not needs_control:
+            value = ca.substitute(value, inputs.pop("control"), ca.SX.zeros(control.numel()))
+        pivot = self.elimination.pivot
+        outputs, regular = {"value": value}, "A(x) of Assumption (2)"
+        return self.system.trace(name, outputs, inputs, pivot, regular)
+
+
+@checked(ModelError)
+@dataclass(frozen=True, eq=False, repr=False)
+class Structure(ConstraintStructure):
+    """The structure of one system by Assumptions (1)-(5): relative degrees, A(x), B(x), margins.
+
+    Attributes:
+        output_degrees: mu_1, ..., mu_p in the order of the system's outputs; 0 where the control
+            enters the output at once (the paper's outputs s + 1, ..., p).
+        output_chains: The chain l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output.
+        highest_derivatives: z_i^(mu_i) in terms of the unknowns of `derivatives`, shape (p, 1).
+        drift: a(x) of (28), L_f*^mu_i l*_i in the order of the outputs, shape (p, 1).
+        control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p); of a
+            system with a `control_metric` it has more columns than rows.
+        chains_need_force: Whether the output chains hold alpha (13), and so need a regular A(x).
+        round_off: The entries of B(x) that are only round-off at all sampled states, in its shape.
+            A column of such entries would otherwise be scaled up to the size of the others.
+        control_margin: The margin of B(x), Assumption (5).
+    """
+
+    output_degrees: tuple[int, ...]
+    output_chains: tuple[tuple[ca.SX, ...], ...]
+    highest_derivatives: ca.SX
+    drift: ca.SX
+    control_matrix: ca.SX
+    chains_need_force: bool
+    round_off: Booleans
+    control_margin: RankMargin
+
+    def __repr__(self) -> str:
+        degrees = f"r={self.constraint_degrees}, mu={self.output_degrees}"
+        return f"Structure({self.system.name!r}, {degrees}, index={self.index})"
+
+    @property
+    def layout(self) -> DerivativeLayout:
+        """The layout of reference vectors and output chains."""
+        return DerivativeLayout(self.output_degrees)
+
+    @property
+    def output_order(self) -> tuple[int, ...]:
+        """The outputs in the paper's order (15): those with mu_i >= 1 first."""
+        return (*map(int, self.layout.dynamic), *map(int, self.layout.direct))  # (15)
+
+    @property
+    def zero_dynamics_dimension(self) -> int:
+        """The dimension of xi in (22), n - sum r_i - sum mu_i."""
+        return self.manifold.dimension - self.layout.chain_size
+
+    @property
+    def chain(self) -> ca.SX:
+        """The output chains in one column, in the order of `layout`, shape (sum mu_i, 1)."""
+        return ca.vertcat(ca.SX(0, 1), *[e for chain in self.output_chains for e in chain])
+
+    def motion_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
+        """Returns x' and v under the control of `control_for`, solved together with the control.
+
+        No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
+
+        Returns x', v, and a scalar that is 0 exactly where one of them is not determined; None if
+        the control is not found in this way, or if friction may leave the motion undetermined.
+        """
+        if self.system.control_metric is not None or self.system.frictional_contacts:
+            return None
+        motion = self.derivatives
+        shown = ca.vertcat(motion.rate, motion.constraint_input)
+        solution = motion.inverse(self.highest_derivatives, commanded, shown)
+        if solution is None:
+            return None
+        size = self.system.num_states
+        return solution[2][:size, :], solution[2][size:, :], solution[1]
+
+    def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Returns u = B(x)^-1 (-a(x) + ubar), for which z_i^(mu_i) = ubar_i on N*.
+
+        If B(x) does not determine u, `DaeSystem.control_metric` chooses it. Also returns a scalar
+        that is 0 exactly where u is not determined.
+        """
+        solution: tuple[ca.SX, ...] | None = None
+        if self.system.control_metric is None:
+            solution = self.derivatives.inverse(self.highest_derivatives, commanded)  # (28)
+        if solution is None:  # L_h* of an output vanishes, but not by structure.
+            solution = self.control_by_matrix(commanded)
+        control, pivot, *_ = solution
+        if self.chains_need_force:
+            pivot = ca.fmin(pivot, self.elimination.pivot)
+        return control, pivot
+
+    def control_by_matrix(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Returns the control of `control_for`, computed with B(x); A(x) must be regular."""
+        needed, metric = commanded - self.drift, self.system.control_metric  # (28)
+        if metric is not None:
+            return nearest_solution(self.control_matrix, needed, metric, self.system.free_control)
+        factors = Factorization(self.control_matrix)
+        return factors.solve(needed), factors.pivot
+
+
+@checked(ModelError)
+def find_constraint_structure(
+    system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
+) -> ConstraintStructure:
+    """Finds r_1, ..., r_m and A(x), and checks Assumptions (1)-(3).
+
+    The system may have no controls or outputs, and a singular B(x). Arguments and exceptions are
+    those of `find_structure`.
+    """
+    structure, samples = examine_constraints(system, guesses(system, spread, count, seed))
+    violation = constraint_violation(structure)
+    if violation:
+        raise violation.error()
+    # Rows of n* that are only round-off are no feedthrough.
+    actions = InputActions(samples, structure.elimination)
+    acts = actions.numbers(actions.feedthrough).any(axis=(0, 2))
+    rows = ca.diag(ca.SX(ca.sparsify(ca.DM(acts.astype(float)))))
+    feedthrough = ca.sparsify(ca.mtimes(rows, structure.elimination.n_star))
+    return replace(structure, elimination=replace(structure.elimination, n_star=feedthrough))
+
+
+@checked(ModelError)
+def find_structure(
+    system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
+) -> Structure:
+    """Finds relative degrees, A(x), B(x) and checks Assumptions (1)-(5).
+
+    Whether an expression is zero is decided by its structure first, then by its numbers at
+    consistent states drawn around `system.nominal_state`, with the default parameters and exogenous
+    signals at rest. An expression that is zero there must be zero for all other values of
+    parameters, signals and their derivatives, see `Parameter.bounds`; otherwise the degree would
+    change with them, and the system is refused.
+
+    Args:
+        system: The system (1)-(3).
+        spread: The standard deviation of the drawn states around the nominal one, a number for all
+            or shape (n,); `DaeSystem.spread_around` it if None.
+        count: The number of random states, at least 1.
+        seed: The seed of the random numbers.
+
+    Raises:
+        AssumptionError: An assumption is violated; the exception has the state where.
+        InconsistentStateError: There is no consistent state near the nominal one.
+        ModelError: The outputs are not as many as the controls (or fewer, with a metric), or there
+            are none, a function is not finite at the nominal state, the mass matrix or the metric
+            is not symmetric and positive definite, or count or spread make no sense.
+    """
+    structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
+    if violation:
+        raise violation.error()
+    return structure
+
+
+def examine_structure(
+    system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
+) -> tuple[Structure, Violation | None]:
+    """Finds the structure as `find_structure`, but also returns it where B(x) is singular."""
+    if why := why_no_law(system):
+        raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
+    constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
+    violation = constraint_violation(constrained)
+    if violation:
+        raise violation.error()
+    structure = examine_outputs(constrained, samples)
+    return structure, control_violation(structure)
+
+
+def constraint_structure_of(
+    owner: str, system: DaeSystem, structure: ConstraintStructure | None
+) -> ConstraintStructure:
+    """Returns the given structure of a system, or the result of `find_constraint_structure`."""
+    if structure is None:
+        return find_constraint_structure(system)
+    return _belonging(owner, system, structure)
+
+
+def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
+    """Returns the given structure of a system, or the result of `find_structure`."""
+    return find_structure(system) if structure is None else _belonging(owner, system, structure)
+
+
+def _belonging(owner: str, system: DaeSystem, structure: Kind) -> Kind:
+    if structure.system is not system:
+        raise ModelError(
+            f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
+            f"'{system.name}'. Omit it, or pass the structure of this system"
+        )
+    return structure
+
+
+def why_no_law(system: DaeSystem) -> str:
+    """Returns why a system has no law (28) by its numbers of inputs and outputs, else ""."""
+    p, q = system.num_controls, system.num_outputs
+    if p == 0:
+        return "there is no control input, so no output can be controlled"
+    if 0 < q == p or (0 < q < p and system.control_metric is not None):
+        return ""
+    least = ", or a `control_metric` in which it takes the least control" if 0 < q < p else ""
+    return (
+        f"there are {q} controlled outputs and {p} controls; the law (28) inverts B(x), so it "
+        f"needs as many outputs as controls{least}"
+    )
+
+
+def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
+    """Returns initial guesses of consistent states, shape (count + 1, n)."""
+    check_system(system)
+    check_whole_number(f"{system.name}: count", count, 1)
+    check_whole_number(f"{system.name}: seed", seed, 0)
+    return draw(system, spread, count, seed)
+
+
+def check_system(system: DaeSystem) -> None:
+    """Checks the number of constraints and the mass matrix of a system."""
+    _check_mass_matrix(system, system.nominal_state[None])
+    if system.num_constraints > system.num_states:
+        names = tuple(signal.name for signal in system.constraint_output_signals)
+        raise Violation(2, ViolationKind.COUNT, names).error()
+
+
+def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
+    """Checks E of E x' = f + g v + h u, since LDL^T reads only one triangle of it."""
+    function = system.trace("mass matrix", {"mass": ca.densify(system.mass_matrix)}, often=False)
+    for state in states:
+        mass = function(state, system.parameter_values)[0].reshape(state.size, state.size)
+        if not _is_positive_definite(mass):
+            raise ModelError(
+                f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
+                f"{show(state)}. An equation in which no derivative stands is a constraint 0 = "
+                "k(x) with a constraint input; where it holds an unknown z that has no derivative, "
+                "lift it: make z a state with z' = v, v a new constraint input, and keep the "
+                "equation as constraint"
+            )
+
+
+def _is_positive_definite(matrix: FloatArray) -> bool:
+    """Whether a matrix is symmetric and positive definite, independent of units."""
+    length = np.sqrt(np.abs(np.diag(matrix)))
+    if not (np.all(np.isfinite(matrix)) and np.all(length > 0.0)):
+        return False
+    scaled = matrix / length / length[:, None]
+    is_symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
+    return bool(is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12)
+
+
+def examine_constraints(
+    system: DaeSystem, guesses: FloatArray, region: Region | None = None
+) -> tuple[ConstraintStructure, Samples]:
+    """Finds r_1, ..., r_m and A(x) of a system that `check_system` accepts."""
+    try:
+        chains, samples = constraint_chains(system, guesses, region)
+    except AssumptionError as error:
+        if error.violation is not None:
+            raise _as_redundant(system, error.violation).error() from None
+        raise
+    _check_mass_matrix(system, samples.states)
+    derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
+    elimination = eliminate(derivatives)
+    # Friction can change the sign of A(x); the Painleve paradox is tested along motions.
+    matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
+    structure = ConstraintStructure(
+        system=system,
+        constraint_degrees=tuple(len(chain) for chain in chains),
+        manifold=samples.manifold,
+        derivatives=derivatives,
+        elimination=elimination,
+        states=samples.states,
+        scale=samples.scale,
+        constraint_margin=find_margin(samples, matrix) if chains else None,
+    )
+    return structure, samples
+
+
+def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
+    """Finds mu_1, ..., mu_p and B(x) if A(x) is regular."""
+    system, elimination = samples.system, constrained.elimination
+    if (metric := system.control_metric) is not None:
+        for state, (value,) in zip(samples.states, samples.values(metric=metric), strict=True):
+            if not _is_positive_definite(value):
+                raise ModelError(
+                    f"{system.name}: control_metric is not symmetric and positive definite "
+                    f"at x = {show(state)}; give each control a positive weight"
+                )
+    outputs = output_chains(constrained.derivatives, elimination, samples)
+    degrees = tuple(len(chain) for chain in outputs.output_chains)
+    # Rows of n* that are zero except for round-off are no feedthrough.
+    n_star = [
+        ca.SX(1, system.num_controls) if degree else elimination.n_star[i, :]
+        for i, degree in enumerate(degrees)
+    ]
+    attributes = {item.name: getattr(constrained, item.name) for item in fields(constrained)}
+    attributes["elimination"] = replace(elimination, n_star=ca.vertcat(*n_star))
+    margin = find_margin(samples, outputs.control_matrix, outputs.round_off)
+    return Structure(
+        **attributes, output_degrees=degrees, control_margin=margin, **outputs._asdict()
+    )
+
+
+def constraint_violation(structure: ConstraintStructure) -> Violation | None:
+    """Returns the violation of Assumption (1) or (2) by a singular A(x); None if it is regular."""
+    causes = ((1, ViolationKind.CONSTRAINT_DEGREE), (2, ViolationKind.CONSTRAINT_RANK))
+    signals, margin = structure.system.constraint_output_signals, structure.constraint_margin
+    if margin is None:
+        return None
+    system, elimination = structure.system, structure.elimination
+    matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
+    violation = rank_violation(margin, signals, structure.constraint_degrees, *causes)
+    violation = _for_the_family(violation, 2, structure, matrix)
+    if violation is None or violation.cause is ViolationKind.BOUNDS:
+        return violation
+    if violation.cause is ViolationKind.CONSTRAINT_RANK:
+        combinations, everywhere, in_gradients = find_dependence(
+            structure.manifold, elimination, structure.states, margin.state
+        )
+        cause = {  # By whether it is singular everywhere, and by its gradients.
+            (True, True): ViolationKind.REDUNDANT,
+            (False, True): ViolationKind.SINGULAR_CONFIGURATION,
+            (True, False): ViolationKind.HIDDEN_DEGREE,
+            (False, False): ViolationKind.CONSTRAINT_RANK,
+        }[everywhere, in_gradients]
+        violation = replace(violation, cause=cause, combinations=combinations)
+    return _as_redundant(system, violation)
+
+
+def control_violation(structure: Structure) -> Violation | None:
+    """Returns the violation of Assumption (4) or (5) by a singular B(x); None if it is regular."""
+    causes = ((4, ViolationKind.OUTPUT_DEGREE), (5, ViolationKind.CONTROL_RANK))
+    margin, signals = structure.control_margin, structure.system.output_signals
+    violation = rank_violation(margin, signals, structure.output_degrees, *causes)
+    if violation is not None and violation.cause is ViolationKind.CONTROL_RANK:
+        rows = combinations_of([signal.name for signal in signals], [margin.matrix])
+        violation = replace(violation, combinations=tuple(rows))
+    return _for_the_family(violation, 5, structure, structure.control_matrix)
+
+
+def _for_the_family(
+    violation: Violation | None, assumption: int, structure: ConstraintStructure, matrix: ca.SX
+) -> Violation | None:
+    """The violation by a matrix, also for other parameters than the defaults."""
+    system, states = structure.system, structure.states
+    bounded = any(p.bounds is not None for p in system.parameters)
+    if violation is None and not (bounded and matrix.is_square()):
+        return None
+    function = system.trace("rank", {"matrix": ca.densify(matrix)}, often=False)
+    family = Family(structure.manifold, states)
+
+    def value(state: FloatArray, parameters: FloatArray) -> FloatArray:
+        return function(state, parameters)[0].reshape(matrix.shape)
+
+    @np.errstate(all="ignore")
+    def is_regular(state: FloatArray, parameters: FloatArray) -> bool:
+        at = value(state, parameters)
+        if not np.all(np.isfinite(at)):
+            return False
+        return smallest_singular_value(equilibrated(at)) > system.least_margin
+
+    if violation is not None:
+        if any(is_regular(state, system.parameter_values) for state in states):
+            return violation
+        return replace(violation, deciding=family.deciding(is_regular))
+    usual = [np.abs(value(x, system.parameter_values)) for x in states]
+    rows, columns = equilibration(np.mean(usual, axis=0))
+    first = equilibrated(value(states[0], system.parameter_values))
+    sign = np.linalg.slogdet(first)[0]
+
+    @np.errstate(all="ignore")
+    def margin(state: FloatArray, parameters: FloatArray) -> float:
+        """The smallest singular value; minus one where the determinant has another sign."""
+        scaled = value(state, parameters) / rows[:, None] / columns
+        if not np.all(np.isfinite(scaled)):
+            return np.inf
+        if np.linalg.slogdet(scaled)[0] * sign < 0.0:
+            return -1.0
+        return smallest_singular_value(scaled)
+
+    lost = family.lost(margin, system.least_margin)
+    return Violation(assumption, ViolationKind.BOUNDS, (), deciding=lost) if lost else None
+
+
+def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
+    """The actual violation if redundant constraints led to a singular configuration.
+
+    Off N* they are overdetermined, and only singular configurations satisfy them.
+    """
+    possible = (ViolationKind.CONSTRAINT_DEGREE, ViolationKind.SINGULAR_CONFIGURATION)
+    if violation.cause not in possible:
+        return violation
+    try:
+        combinations = redundant_constraints(all_constraints_hold(system))
+    except InconsistentStateError:
+        return violation
+    # A gradient that vanishes wherever its constraint holds does not depend on others.
+    if not combinations or not all(combination.others for combination in combinations):
+        return violation
+    names = tuple(signal.name for signal in system.constraint_output_signals)
+    return Violation(
+        2, ViolationKind.REDUNDANT, names, combinations=combinations, deciding=violation.deciding
+    )

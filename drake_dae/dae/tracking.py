@@ -1,0 +1,289 @@
+"""The tracking law.                                                        (28), (29)"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
+from drake_dae.dae.gains import FeedbackGains, GainDesign
+from drake_dae.dae.law_model import damped
+from drake_dae.dae.law_terms import Deflection, ForceMeasurement, IntegralAction
+from drake_dae.dae.signals import DerivativeLayout, Signal
+from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import GainError, ModelError
+from drake_dae.trace.expressions import result_of
+from drake_dae.trace.functions import TracedFunction
+
+
+@checked(ModelError)
+class TrackingLaw:
+    """The tracking law (28), which makes the controlled outputs follow a reference:
+
+        u(x, R) = B(x)^-1 (-a(x) + ubar),
+        ubar_i = r_i^(mu_i) - sum_j K_ij (L_f*^(j-1) l*_i - r_i^(j-1)),
+
+    with ubar_i = r_i where mu_i = 0. In closed loop the errors e_i = z_i - r_i (29) obey (30), (31)
+    exactly. If there are more controls than outputs, the system's `control_metric` chooses u. The
+    law needs the state x, but no measurement of the constraint inputs.
+
+    The reference is output-major: r_1, r_1', ..., r_1^(mu_1), r_2, ...; it holds sum (mu_i + 1)
+    numbers; with a `contact_stiffness` two more for each force.
+
+    Args:
+        system: The system (1)-(3).
+        gains: A design such as `poles(-4.0)`, or finished gains.
+        structure: The structure of the system; found if None.
+        measured_force: Whether the law takes a measurement of v: see `ForceMeasurement`.
+        force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
+            semidefinite; only with measured_force.
+        constraint_damping: Damping of constraints that the plant may violate, such as a compliant
+            contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi': see `damped`.
+        contact_stiffness: k in N/m of compliant contacts, F = -k phi, for references of forces that
+            change fast: see `Deflection`.
+        integral: The names of the outputs whose errors are integrated as well, positions or
+            measured forces: see `IntegralAction`. They have one more pole.
+        latency: The mean time in s from the measurement of x to the moment when its control acts,
+            for a sampled law delay + period / 2: by it damping is compensated: see `acting_late`.
+
+    `function` is the law as (state, reference, measured_force, integral, parameters) -> control,
+    tracking_error and integral_rate, without what the law does not have, and with the parameters of
+    `all_parameters`; `outputs` are these as expressions of `inputs`, and `pivot` is 0 where the
+    matrix that `regular` names is singular. `layout` is that of reference vectors, and
+    `reference_signals` names them.
+
+    Raises:
+        AssumptionError: The system violates an assumption of the theory.
+        GainError: The gains do not fit, or are not Hurwitz.
+        ModelError: The structure is that of another system, or no output is a constraint input.
+    """
+
+    def __init__(
+        self,
+        system: DaeSystem,
+        gains: GainDesign | FeedbackGains,
+        *,
+        structure: Structure | None = None,
+        measured_force: bool = False,
+        force_gain: ArrayLike = 0.0,
+        constraint_damping: GainDesign | FeedbackGains | None = None,
+        integral: Sequence[str] = (),
+        contact_stiffness: float | None = None,
+        latency: float = 0.0,
+    ) -> None:
+        self.structure = structure_of("TrackingLaw", system, structure)
+        self.damped_structure = damped(self.structure, constraint_damping, latency)
+        self.system, self.latency = system, float(latency)
+        self.deflection, more = None, tuple[int, ...]()
+        if contact_stiffness is not None:
+            self.deflection = Deflection.of(self.structure, contact_stiffness, constraint_damping)
+            more = self.deflection.more
+        self.layout = DerivativeLayout(self.structure.output_degrees, more)
+        self.reference_signals = self.layout.reference_signals(system.output_signals)
+        if not measured_force and numbers("force_gain", force_gain, GainError).any():
+            raise GainError("force_gain needs measured_force=True")
+        self.measured_force = (
+            ForceMeasurement.of(system, self.layout, force_gain) if measured_force else None
+        )
+        self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
+        self.gains = self.design(gains)
+        self._last_gains: tuple[FeedbackGains | None, FloatArray] = None, np.empty(0)
+        self.function = self._trace()
+
+    def __repr__(self) -> str:
+        outputs = listed(signal.name for signal in self.system.output_signals)
+        force = ", measured_force" if self.measured_force else ""
+        return (
+            f"TrackingLaw('{self.system.name}', outputs={outputs}, "
+            f"degrees={list(self.degrees)}{force})"
+        )
+
+    def _trace(self) -> TracedFunction:
+        """The law (28) and the tracking error (29) as one function."""
+        structure, layout, measured = self.damped_structure, self.layout, self.measured_force
+        reference = ca.SX.sym("R", layout.reference_size)
+        # Symbols only for nonzero entries of K: the errors of most outputs are not coupled.
+        gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
+        values = reference[layout.lowest.tolist(), :]
+        highest = reference[layout.highest.tolist(), :]
+        chain = structure.chain
+        inputs = {"reference": reference}
+        if measured:
+            chain, highest = measured.chain(chain), measured.highest(highest, values)
+            inputs["measured_force"] = measured.symbol
+        errors = chain - reference[layout.chained.tolist(), :]
+        ahead = ca.SX.zeros(len(self.degrees))
+        if self.deflection is not None:
+            ahead = self.deflection.force(reference, layout)
+        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors)) + ahead  # (28)
+        control, pivot = structure.control_for(ubar)
+        # By the model; outputs with direct feedthrough have their reference values.
+        output = ubar - ahead
+        output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
+        self.exogenous_degrees = self.system.exogenous.degrees(control, output)
+        outputs = {"control": control, "tracking_error": output - values}  # (29)
+        if self.integral.outputs:
+            inputs["integral"] = self.integral.symbol
+            outputs["integral_rate"] = self.integral.rate(chain, values, measured)
+        self.control_takes_force = measured is not None and bool(
+            ca.depends_on(ca.vertcat(control, output), measured.symbol)
+        )
+        # The initial value of (30).
+        start = self.integral.coordinates(structure.chain - reference[layout.chained.tolist(), :])
+        self.coordinates_function = self.system.trace(
+            "error coordinates",
+            {"coordinates": start},
+            {"reference": reference, "integral": self.integral.symbol},
+            often=False,
+        )
+        numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
+        self._ubar, self.outputs, self.pivot = ubar, outputs, pivot
+        self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
+        self.regular = (
+            f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}"
+        )
+        return TracedFunction(
+            f"{self.system.name} tracking law",
+            self._inputs,
+            outputs,
+            pivot,
+            self.regular,
+            compiled=self.system.compiled,
+        )
+
+    @property
+    def inputs(self) -> dict[str, ca.SX]:
+        """Name -> symbol of each input of `function`."""
+        return dict(self._inputs)
+
+    def trace_motion(self) -> TracedFunction | None:
+        """Traces x' and v of a plant that equals the law's model, under the law."""
+        if self.damped_structure is not self.structure:
+            return None
+        if (motion := self.structure.motion_for(self._ubar)) is None:
+            return None
+        rate, force, pivot = motion
+        outputs, name = {"rate": rate, "force": force}, f"{self.system.name} under its law"
+        return TracedFunction(name, self._inputs, outputs, pivot, often=False)
+
+    @property
+    def degrees(self) -> tuple[int, ...]:
+        """mu_1, ..., mu_p: the number of derivatives of each reference that the law needs."""
+        return self.layout.degrees
+
+    def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
+        """Checks gains, or designs them, for the outputs of this law."""
+        names = tuple(signal.name for signal in self.system.output_signals)
+        degrees, designed = self.integral.all_degrees, gains
+        if not isinstance(designed, FeedbackGains):
+            designed = result_of("gains", designed, names, degrees, error=GainError)
+        if not isinstance(designed, FeedbackGains):
+            raise GainError(f"gains must be a design such as poles(-4.0), got {brief(designed)}")
+        if (designed.names, designed.degrees) != (names, degrees):
+            raise GainError(
+                f"the gains are for the outputs {', '.join(designed.names)} with degrees "
+                f"{designed.degrees}, the system has {', '.join(names)} with {degrees}"
+            )
+        return designed
+
+    def all_parameters(
+        self, parameters: ArrayLike | None = None, gains: GainDesign | FeedbackGains | None = None
+    ) -> FloatArray:
+        """Returns the parameters of `function`: those of the system, then the entries of K.
+
+        The gains are the law's own if None; others must be zero where the law's own are.
+        """
+        values = self.system.parameter_vector(parameters)
+        if gains is not None and gains is self._last_gains[0]:  # As in most runs of a study.
+            return np.concatenate([values, self._last_gains[1]])
+        chosen = self.gains if gains is None else self.design(gains)
+        has = self.gains.matrix != 0.0
+        if np.any(chosen.matrix[~has]):
+            i, j = np.argwhere((chosen.matrix != 0.0) & ~has)[0]
+            signals = self.coordinate_signals
+            raise GainError(
+                f"the law has no gain from the error of {signals[j].name} to "
+                f"{self.system.output_signals[i].name}; make a new law with such a gain"
+            )
+        entries = chosen.matrix.T[has.T]
+        if chosen is gains:
+            self._last_gains = chosen, entries
+        return np.concatenate([values, entries])
+
+    @property
+    def coordinate_signals(self) -> list[Signal]:
+        """Names and units of the error coordinates."""
+        integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))
+        signals = []
+        for i, (signal, degree) in enumerate(
+            zip(self.system.output_signals, self.degrees, strict=True)
+        ):
+            signals += [integrals[i]] if i in integrals else []
+            signals += [signal.derivative(order) for order in range(degree)]
+        return signals
+
+    def control(
+        self,
+        state: ArrayLike,
+        reference: ArrayLike,
+        *,
+        measured_force: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Returns the control u(x, R) of (28).
+
+        Args:
+            state: x, shape (n,).
+            reference: R, shape (sum (mu_i + 1),), output-major.
+            measured_force: v, shape (m,); exactly where the law takes it.
+            integral: The integrals of the errors, shape (k,); zero if None.
+            parameters: Values of all parameters; the defaults if None.
+        """
+        measured = [] if measured_force is None else [measured_force]
+        if self.integral.outputs:
+            measured.append(self._integrals(integral))
+        return self.function(state, reference, *measured, self.all_parameters(parameters))[0]
+
+    def _integrals(self, integral: ArrayLike | None) -> FloatArray:
+        size = len(self.integral.outputs)
+        return vector("integral", np.zeros(size) if integral is None else integral, size, GainError)
+
+    def error_coordinates(
+        self,
+        state: ArrayLike,
+        reference: ArrayLike,
+        parameters: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Returns (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
+
+        The integral of an error stands before it, where the law has one. The arguments are those of
+        `control`.
+        """
+        values, sigma = self.system.parameter_vector(parameters), self._integrals(integral)
+        return self.coordinates_function(state, reference, sigma, values)[0]
+
+    def predicted_error(
+        self,
+        times: ArrayLike,
+        state: ArrayLike,
+        reference: ArrayLike,
+        parameters: ArrayLike | None = None,
+        integral: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Returns the tracking error that the theory predicts at times after a start, shape (k, p).
+
+        The other arguments are those of `control` at the start; times are in s.
+        """
+        start = self.error_coordinates(state, reference, parameters, integral)
+        errors = self.gains.error_response(times, start)
+        if self.integral.outputs:  # There the first coordinate is the integral of the error.
+            rates = self.gains.error_response(times, self.gains.error_matrix @ start)
+            errors[:, self.integral.outputs] = rates[:, self.integral.outputs]
+        return errors

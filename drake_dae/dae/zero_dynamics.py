@@ -1,0 +1,330 @@
+"""What the system does while its outputs follow a reference: Assumption 2.2.        (35)-(36)
+
+On Z(R), see `pinned_outputs`, the state moves by x' = f* + h* u. Its dimension is that of xi; where
+that is 0, the reference alone determines the motion. All is done in the state x: nothing depends
+on the choice of xi in (22).
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, numbers, show, vector
+from drake_dae.dae.equilibria import (
+    AT_REST,
+    ISOLATED,
+    ComplexArray,
+    Equilibria,
+    Stability,
+    Verdict,
+    judge,
+    linearized_eigenvalues,
+    without_dynamics,
+)
+from drake_dae.dae.floquet import PeriodicMotions, StabilityAlong
+from drake_dae.dae.pinned_motion import PinnedMotion, TimeFunction, follow
+from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedSet
+from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.system import DaeSystem
+from drake_dae.errors import InconsistentStateError, ModelError
+
+
+class Exogenous(Protocol):
+    """A `Reference` of an exogenous signal."""
+
+    @property
+    def size(self) -> int: ...
+    def derivatives(self, degrees: Sequence[int]) -> Callable[[float], FloatArray]: ...
+
+
+@checked(ModelError)
+class ZeroDynamics:
+    """The dynamics (35) that remain if the outputs are pinned to a reference.
+
+    In all methods states have shape (n,), outputs z shape (p,); `reference` is R = (r_1, r_1',
+    ..., r_1^(mu_1), r_2, ...), shape (sum (mu_i + 1),), as for `TrackingLaw`; `guess` is a state,
+    the nominal one if None; and `parameters` are values of all parameters, the defaults if None.
+
+    Args:
+        system: The system (1)-(3).
+        structure: The structure of the system; found if None.
+
+    Attributes:
+        dimension: dim xi = n - sum r_i - sum mu_i.
+        residual_signals: What is zero on Z(R): the constraints, then the output errors, each with
+            its derivatives.
+    """
+
+    def __init__(self, system: DaeSystem, *, structure: Structure | None = None) -> None:
+        self.structure = structure = structure_of("ZeroDynamics", system, structure)
+        self.system = system
+        self.dimension = structure.zero_dynamics_dimension
+        self._pinned = PinnedOutputs(structure)
+        self._equilibria = Equilibria(self._pinned)
+        self.residual_signals = self._pinned.residual_signals
+
+    def __repr__(self) -> str:
+        return f"ZeroDynamics('{self.system.name}', dimension={self.dimension})"
+
+    @checked(ModelError)
+    def state(
+        self,
+        reference: ArrayLike,
+        guess: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Returns a state on Z(R), to round-off, by Newton's method from a guess.
+
+        Raises:
+            InconsistentStateError: Newton's method does not reach Z(R) from there.
+        """
+        goal = self._vector("reference", reference, self._pinned.layout.reference_size)
+        pinned = self._pinned.at(goal, self.system.parameter_vector(parameters))
+        return pinned.state(self._guess(guess))
+
+    @checked(ModelError)
+    def motion(
+        self,
+        reference: TimeFunction,
+        times: ArrayLike,
+        guess: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+        exogenous: Sequence[Exogenous] = (),
+    ) -> PinnedMotion:
+        """Computes the motion on Z(R(t)) from a state close to the guess, until it ends.
+
+        Without zero dynamics each state follows from the one before by Newton's method. Else
+        x' = f* + h* u is integrated (Radau IIA of order 5) and projected after each step.
+
+        Args:
+            reference: The function t -> R(t); it is also evaluated between the times.
+            times: Times in s, increasing, shape (k,).
+            guess: A state near the first one; it decides which of several solutions is followed.
+            exogenous: The references of the exogenous signals, as for `make_closed_loop`; without
+                any they stand still.
+
+        Raises:
+            ReferenceSignalError: An exogenous signal is not smooth enough.
+            ModelError: A shape is wrong, or the times do not increase. Other failures are in
+                the returned motion; see `PinnedMotion.ending`.
+        """
+        grid = self._vector("times", times)
+        if grid.size == 0 or np.any(np.diff(grid) <= 0.0):
+            raise ModelError(f"{self.system.name}: times must increase, got {times!r}")
+        start, p = self._guess(guess), self.system.parameter_vector(parameters)
+        return follow(self._pinned, reference, grid, start, self._moving(p, exogenous))
+
+    @checked(ModelError)
+    def equilibrium(
+        self,
+        outputs: ArrayLike,
+        guess: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Returns a state at rest, x' = 0, with constant outputs, by Newton's method from a guess.
+
+        The Jacobian is not singular there: of states at rest that are not isolated none is
+        returned.
+
+        Raises:
+            InconsistentStateError: No state near the guess has these outputs; or there are such
+                states, but no equilibrium: `residual` is then x', shape (n,).
+        """
+        start, p = self._guess(guess), self.system.parameter_vector(parameters)
+        return self._equilibria.find(self._resting(start, outputs, p), start)
+
+    @checked(ModelError)
+    def eigenvalues(
+        self,
+        state: ArrayLike,
+        parameters: ArrayLike | None = None,
+        outputs: ArrayLike | None = None,
+    ) -> ComplexArray:
+        """Returns the eigenvalues at an equilibrium, in 1/s, largest real part first.
+
+        The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; these are its
+        eigenvalues there. In closed loop they stand beside the roots of (32). Those of a linear
+        system are its invariant zeros.
+
+        Args:
+            state: x, shape (n,).
+            outputs: z, shape (p,). If None, those of the state; outputs with mu_i = 0, which the
+                state does not determine, are those with the smallest x'. Give them if this
+                choice is not unique, as for a force that does not affect the motion.
+
+        Raises:
+            ModelError: The state is not an equilibrium on N*.
+        """
+        x, p = self._guess(state), self.system.parameter_vector(parameters)
+        pinned = self._resting(x, outputs, p)
+        onto, _ = pinned.project(x)
+        unrest = self._equilibria.unrest(pinned, pinned.point(x))
+        off = np.any(np.abs(onto - x) > AT_REST * np.maximum(self.system.scale, np.abs(x)))
+        if off or unrest:
+            reason = "it is off N*, or its outputs change" if off else unrest
+            raise ModelError(
+                f"{self.system.name}: x = {show(x)} is no regular equilibrium: {reason}. "
+                "Eigenvalues belong to an equilibrium; 'equilibrium' finds one"
+            )
+        return linearized_eigenvalues(pinned, self._equilibria.sizes, x)[0]
+
+    @checked(ModelError)
+    def stability(
+        self,
+        state: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+        outputs: ArrayLike | None = None,
+    ) -> Stability:
+        """Judges by linearization whether Assumption 2.2 holds near an equilibrium.
+
+        Args:
+            state: The initial guess of the equilibrium.
+            outputs: z at the equilibrium, shape (p,). If None those of the state, where outputs
+                with mu_i = 0, which depend on the control, are as brings it nearest to rest.
+
+        Raises:
+            InconsistentStateError: The state is not near N*.
+        """
+        if self.dimension == 0:
+            return without_dynamics(self.structure)
+        p = self.system.parameter_vector(parameters)
+        start = self.structure.manifold.project(self._guess(state), p)
+        pinned = self._resting(start, outputs, p)
+        try:
+            rest = self._equilibria.search(pinned, start)
+        except InconsistentStateError as error:
+            return Stability(Verdict.UNDECIDED, str(error))
+        if rest.unrest:
+            reason = self._equilibria.none(pinned, rest.state, rest.unrest)
+            return Stability(Verdict.UNDECIDED, reason)
+        values, errors = linearized_eigenvalues(pinned, self._equilibria.sizes, rest.state)
+        where = "at rest" if rest.degenerate else "at the equilibrium"
+        place = f"{where} with {pinned.describe()}"
+        return judge(values, errors, rest.state, place, rest.degenerate)
+
+    @checked(ModelError)
+    def equilibria(
+        self,
+        guesses: ArrayLike | None = None,
+        parameters: ArrayLike | None = None,
+        outputs: ArrayLike | None = None,
+    ) -> FloatArray:
+        """Returns the equilibria with the same outputs, found from guesses, shape (l, n).
+
+        Args:
+            guesses: States from which the search starts, shape (k, n); `structure.states` if None.
+            outputs: z, shape (p,). If None those of the first guess, as in `stability`.
+
+        Raises:
+            InconsistentStateError: The first guess is not near N*.
+        """
+        name = self.system.name
+        rows = numbers(f"{name}: guesses", self.structure.states if guesses is None else guesses)
+        if rows.ndim != 2 or not len(rows):
+            raise ModelError(
+                f"{name}: guesses must have shape (k, {self.system.num_states}), got {rows.shape}"
+            )
+        starts, p = [self._guess(row) for row in rows], self.system.parameter_vector(parameters)
+        pinned = self._resting(self.structure.manifold.project(starts[0], p), outputs, p)
+        distinct = np.zeros((0, self.system.num_states))
+        for start in starts:
+            try:
+                rest = self._equilibria.find(pinned, start)
+            except InconsistentStateError:
+                continue
+            sizes = np.maximum(self._equilibria.sizes, np.abs(rest))
+            if not np.any(np.all(np.abs(distinct - rest) <= ISOLATED * sizes, axis=1)):
+                distinct = np.vstack([distinct, rest])
+        return distinct
+
+    @checked(ModelError)
+    def stability_along(
+        self,
+        reference: TimeFunction,
+        motion: PinnedMotion,
+        period: float,
+        parameters: ArrayLike | None = None,
+        exogenous: Sequence[Exogenous] = (),
+    ) -> StabilityAlong:
+        """Judges by Floquet multipliers whether Assumption 2.2 holds along a periodic reference.
+
+        The motion with the same period is sought, by Newton's method from late in the given motion,
+        and from its start. The multipliers are the eigenvalues of the matrix that takes small
+        disturbances of it, delta' = (dx'/dx) delta on Z(R(t)), through one period.
+
+        Args:
+            reference, exogenous: As for `motion`.
+            motion: The result of `motion` for this reference.
+            period: The period of R(t) and of the exogenous signals, in s.
+
+        Raises:
+            ModelError: A shape is wrong, a number is not finite, or the period is not one.
+        """
+        if not (np.isfinite(period) and period > 0.0):
+            raise ModelError(f"{self.system.name}: period must be positive, got {period!r}")
+        if self.dimension == 0:
+            at_rest = without_dynamics(self.structure)
+            return StabilityAlong(at_rest.verdict, at_rest.reason, period)
+        p, n = self.system.parameter_vector(parameters), self.system.num_states
+        if motion.states.shape != (motion.times.size, n):
+            raise ModelError(
+                f"{self.system.name}: the motion belongs to another system: its states have shape "
+                f"{motion.states.shape}, and not {(motion.times.size, n)}"
+            )
+        motions = PeriodicMotions(
+            self._pinned, reference, self._moving(p, exogenous), self._equilibria.sizes, period
+        )
+        return motions.judge(motion)
+
+    def _moving(
+        self, parameters: FloatArray, exogenous: Sequence[Exogenous]
+    ) -> Callable[[float], FloatArray]:
+        """Returns the function t -> values of all parameters."""
+        if not exogenous:
+            return lambda time: parameters
+        structure, system = self.structure, self.system
+        residual, v = structure.manifold.residual_expression, structure.elimination.alpha
+        matrices = [structure.control_matrix, structure.elimination.constraint_matrix]
+        if system.control_metric is not None:
+            matrices += [system.control_metric, system.free_control]
+        degrees = system.exogenous.degrees(residual, structure.chain, structure.drift, v, *matrices)
+        size = sum(reference.size for reference in exogenous)
+        if size != len(degrees):
+            raise ModelError(
+                f"{system.name}: exogenous covers {size} signals, the system has {len(degrees)}"
+            )
+        ends = np.cumsum([0, *(reference.size for reference in exogenous)])
+        signals = [
+            reference.derivatives(degrees[first:last])
+            for reference, (first, last) in zip(exogenous, pairwise(ends), strict=True)
+        ]
+        places = system.exogenous.places(degrees)
+
+        def at(time: float) -> FloatArray:
+            values = parameters.copy()
+            values[places] = np.concatenate([signal(time) for signal in signals])
+            return values
+
+        return at
+
+    def _vector(self, what: str, value: ArrayLike, size: int | None = None) -> FloatArray:
+        return vector(f"{self.system.name}: {what}", np.ravel(value), size)
+
+    def _guess(self, guess: ArrayLike | None) -> FloatArray:
+        state = self.system.nominal_state if guess is None else guess
+        return self._vector("state", state, self.system.num_states)
+
+    def _resting(
+        self, state: FloatArray, outputs: ArrayLike | None, parameters: FloatArray
+    ) -> PinnedSet:
+        """Returns Z(R) with constant outputs; with those of the state if None."""
+        if outputs is None:
+            goal = self._equilibria.constant_outputs(state, parameters)
+        else:
+            values = self._vector("outputs", outputs, self.system.num_outputs)
+            goal = self._pinned.layout.constant(values)
+        return self._pinned.at(goal, parameters)

@@ -1,0 +1,731 @@
+"""The equations of a `StateEstimator` at a sample, as expressions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.arrays import FloatArray
+from drake_dae.blocks.block import TIME, where_finite
+from drake_dae.dae import Lags, Observation, TrackingLaw
+from drake_dae.dae.beyond.chain_filter import ChainFilter
+from drake_dae.dae.beyond.disturbance import DISTURBANCE
+from drake_dae.dae.beyond.friction_share import Metric, beside, shares
+from drake_dae.errors import ModelError
+from drake_dae.systems.observing.observing import Observing
+from drake_dae.systems.observing.parameter_filter import ParameterFilter, Sampled
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+
+BREAK_RATE = 12.0
+"""The rate in 1/s at which a coefficient of friction rises until its contact breaks away."""
+
+STICKS = 0.5
+"""A contact sticks below this share of the wanted speed."""
+
+LEAST_SHARE = 0.06
+"""The least wanted speed for which this is tested, relative to `Observing.least_speed`."""
+
+EARLY = 2.0
+"""The number of samples that the first value of a coefficient counts for."""
+
+CLEAR = 4.0
+"""A displacement is no noise from this multiple of its standard deviation on: one angle that passes
+to the next value of its encoder makes sqrt(12)."""
+
+_SHARP = 10.0
+"""Friction of a contact that gives way is taken as that of a motion faster by this factor: it is
+fully developed from v_s / 10 on. An ideal contact has the friction of the model."""
+
+_FAST = 1e6
+"""A displacement of 1 m is tested as a speed of this many m/s: friction is then fully developed."""
+
+_LITTLE = 1e-9
+"""The least normal force, in N, by which is divided."""
+
+_SAME = 1e-9
+"""Times that differ by less than this, in periods, count as equal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """What is held between samples, as columns that are stacked; some are empty.
+
+    Attributes:
+        sample: The index k of the sample t_k = k T; -1 before the first.
+        state: The estimated x, if it is estimated.
+        disturbance, rates, lags: r; r', ..., r^(n); the inputs of the lags before r.
+        friction: mu.
+        slid: The samples for which each contact has slid, while they are few.
+        force: The constraint force of the model, if none is measured.
+        momentum, drift: p and its rate without inputs, if the state is exact.
+        control, measured_force: u and v of the sample before.
+        filter: The state of the `ParameterFilter`.
+    """
+
+    sample: ca.SX
+    state: ca.SX
+    disturbance: ca.SX
+    rates: ca.SX
+    lags: ca.SX
+    friction: ca.SX
+    slid: ca.SX
+    force: ca.SX
+    momentum: ca.SX
+    drift: ca.SX
+    control: ca.SX
+    measured_force: ca.SX
+    filter: ca.SX
+
+    @classmethod
+    def of(cls, column: ca.SX, sizes: dict[str, int]) -> Self:
+        ends = [0, *accumulate(sizes[name] for name in cls.__dataclass_fields__)]
+        return cls(*ca.vertsplit(column, ends))
+
+    @property
+    def column(self) -> ca.SX:
+        return ca.vertcat(*vars(self).values())
+
+
+@dataclass(frozen=True, eq=False)
+class ContactTerms:
+    """The directions of friction and constraints at a state.
+
+    Attributes:
+        friction: C, the friction force per unit of each coefficient, shape (k, c).
+        metric: W of `Observation`, as a function of columns.
+        free: Q of `Observation`.
+        planes: T of `Observation`, of each contact.
+        held: T of the contacts that stick, side by side; zero for others.
+        velocity: The velocities, shape (k, 1).
+        slides: 1 for each contact that certainly slides, shape (c,).
+        valid: Finite if all of these are valid.
+    """
+
+    friction: ca.SX
+    metric: Metric
+    free: ca.SX
+    planes: Sequence[ca.SX]
+    held: ca.SX
+    velocity: ca.SX
+    slides: ca.SX
+    valid: ca.SX
+
+
+def disturbance_degree(law: TrackingLaw) -> int:
+    """The number of derivatives of the disturbance that a law needs."""
+    degrees = iter(law.exogenous_degrees)
+    own = {
+        p.name: [next(degrees) for _ in range(p.value.size)] for p in law.system.exogenous.moving
+    }
+    return max(own[DISTURBANCE])
+
+
+class EstimatorSample:
+    """The estimate at a sample.
+
+    Attributes:
+        observation: The observed functions.
+        inputs: The symbols of the input ports.
+        filter: The filter of parameters.
+        memory, sizes: What was held before, as symbols, and the sizes of its parts.
+        start: Its initial value.
+        now: What is held from this sample on. If the state is estimated, it is the same until the
+            next one, so that outputs may depend on it.
+        state, force: The state and the constraint force that the law takes.
+        exogenous: The disturbance to compensate, mu and parameters, with derivatives.
+        hold: 1 if integrals are not updated, otherwise 0.
+    """
+
+    def __init__(
+        self,
+        law: TrackingLaw,
+        observing: Observing,
+        period: float,
+        lag: float,
+        delay: float,
+        step: float,
+        deviations: tuple[FloatArray, FloatArray],
+        is_ideal: bool,
+    ) -> None:
+        self.observation = observation = Observation.of(law.structure, law.layout)
+        self._law, self._system, self._observing, self._period = law, law.system, observing, period
+        self._lag, self._delay, self._step, self._deviations = lag, delay, step, deviations
+        estimates = observing.state_rate is not None
+        system, k, c = law.system, len(observation.rows), len(observation.frictions)
+        self._sharpness = 1.0 if is_ideal and not estimates else _SHARP
+        self._stops = [0, *accumulate(observation.widths)]
+        degree, n = disturbance_degree(law), system.num_states
+        if estimates:
+            _check_rigid(law, observation.rows)
+            self._gains = _gains(observing, period, *deviations)
+        rates = observing.rate, observing.force_rate or observing.rate
+        self._lags = [Lags.of(rate, period, degree) for rate in rates]
+        self._breaks_away = bool(c) and observation.wanted is not None and not degree
+        self.measures = (
+            not estimates or law.measured_force is not None or not system.num_constraints
+        )
+        identified = observation.identified
+        entries = (system.parameter_slice(p.name) for p in identified.parameters)
+        self._places = [i for part in entries for i in range(part.start, part.stop)]
+        if self._places and degree:
+            raise ModelError(
+                f"{system.name}: parameters are estimated for rigid joints; behind springs "
+                "and motors only coefficients of friction are"
+            )
+        values = system.parameter_values
+        frictions = [values[system.parameter_slice(name)] for name in observation.frictions]
+        known = [values[self._places], *frictions] if self._places else [np.zeros(0)]
+        self.filter = ParameterFilter(
+            identified, np.concatenate(known), observing.largest_friction, k, rates[0], period
+        )
+        exact = 0 if estimates else k
+        self.sizes = {
+            "sample": 1,
+            "state": n if estimates else 0,
+            "disturbance": k,
+            "rates": degree * k,
+            "lags": degree * k,
+            "friction": c,
+            "slid": c,
+            "force": 0 if self.measures else system.num_constraints,
+            "momentum": exact,
+            "drift": exact,
+            "control": system.num_controls,
+            "measured_force": system.num_constraints if estimates and self.measures else 0,
+            "filter": self.filter.start.size,
+        }
+        ports = {
+            "measured_state": n,
+            "control": system.num_controls,
+            "hold": 1,
+            "reference": law.layout.reference_size,
+            "measured_force": system.num_constraints if self.measures else 0,
+        }
+        self.inputs = {name: ca.SX.sym(name, size) for name, size in ports.items()}
+        if not self.measures:
+            del self.inputs["measured_force"]
+        own = ca.SX.sym("held", sum(self.sizes.values()) - self.filter.start.size)
+        self.memory = Memory.of(ca.vertcat(own, self.filter.memory.column), self.sizes)
+        # The parameters are part of the filter's state.
+        self._theta = self.memory.filter[: len(self._places)]
+        self.start = np.zeros(sum(self.sizes.values()))
+        self.start[0] = -1.0
+        self.start[self.start.size - self.filter.start.size :] = self.filter.start
+        if c:
+            self.start[self.place("friction")] = np.concatenate(frictions)
+
+        after = self._estimated() if estimates else self._observed()
+        if estimates:
+            sample = ca.floor(TIME / period + _SAME)
+            given = {name: getattr(after, name) for name in ("control", "measured_force")}
+            first = Memory(**{**vars(self.memory), **given, "state": self._measured})
+            begun = ca.if_else(self.memory.sample >= 0, after.column, first.column)
+            fresh = ca.vertcat(sample, begun[1:])
+            column = ca.if_else(ca.eq(self.memory.sample, sample), self.memory.column, fresh)
+            self.now = Memory.of(column, self.sizes)
+            self.state, known_now = self.now.state, self.now
+        else:
+            self.now, self.state, known_now = after, self._measured, self.memory
+        self.force = self._measured_force if self.measures else known_now.force
+        self.exogenous = self._compensated(self.state, self.force, known_now)
+        lost = self._is_lost(self.force)
+        self.hold = ca.fmax(self.inputs["hold"] != 0, ca.mmax(lost) if c else 0)
+
+    def place(self, name: str) -> slice:
+        """The place of a part of the memory."""
+        end = sum(list(self.sizes.values())[: list(self.sizes).index(name) + 1])
+        return slice(end - self.sizes[name], end)
+
+    @property
+    def _measured(self) -> ca.SX:
+        return self.inputs["measured_state"]
+
+    @property
+    def _measured_force(self) -> ca.SX:
+        return self.inputs["measured_force"]
+
+    def _is_lost(self, v: ca.SX) -> ca.SX:
+        """1 for each contact that is lost, shape (c, 1)."""
+        pressing = [v[i] for i in self.observation.frictions.values()]
+        return ca.vertcat(ca.SX(0, 1), *pressing) < self._observing.least_force
+
+    def _parameters(self, friction: ca.SX | None = None, theta: ca.SX | None = None) -> ca.SX:
+        """The model's parameters with estimates, and with given or no friction."""
+        parameters = ca.SX(self._system.parameter_symbol)
+        parameters[self._places] = self._theta if theta is None else theta
+        for j, name in enumerate(self.observation.frictions):
+            value = 0 if friction is None else friction[j]
+            parameters[self._system.parameter_slice(name)] = value
+        return parameters
+
+    def _contact(self, state: ca.SX, v: ca.SX, parameters: ca.SX) -> ContactTerms:
+        """The directions of friction and constraints at a state."""
+        observation = self.observation
+        friction = observation.friction.function(self._faster(state), v, parameters)
+        directions = observation.directions.function(state, v, parameters)
+        free, planes = directions[0], ca.horzsplit(directions[1], self._stops)
+
+        def metric(columns: ca.SX) -> ca.SX:
+            function = observation.metric.function
+            moved = [function(state, d, parameters)[0] for d in ca.horzsplit(columns)]
+            return ca.horzcat(ca.SX(columns.shape[0], 0), *moved)
+
+        is_slow = friction[1] < self._sharpness * self._observing.least_speed
+        is_lost = self._is_lost(v)
+        held = self._side_by_side(planes, ca.logic_and(is_slow, ca.logic_not(is_lost)))
+        slides = ca.logic_not(ca.logic_or(is_slow, is_lost))
+        velocity, valid = state[list(observation.rows)], friction[-1] + directions[-1]
+        return ContactTerms(friction[0], metric, free, planes, held, velocity, slides, valid)
+
+    def _side_by_side(self, planes: Sequence[ca.SX], of_contacts: ca.SX) -> ca.SX:
+        """T of all contacts side by side, each times its entry of a column."""
+        scaled = [plane * of_contacts[j] for j, plane in enumerate(planes)]
+        return ca.horzcat(ca.SX(len(self.observation.rows), 0), *scaled)
+
+    def _faster(self, state: ca.SX) -> ca.SX:
+        """The state in whose motion the model's friction is that of the contact."""
+        faster, rows = ca.SX(state), list(self.observation.rows)
+        faster[rows] = self._sharpness * faster[rows]
+        return faster
+
+    # The exact state.
+
+    def _observed(self) -> Memory:
+        """What is held after a sample of the exact state."""
+        memory, x, v, u = self.memory, self._measured, self._measured_force, self.inputs["control"]
+        mu, has_sample = memory.friction, memory.sample >= 0
+        parameters = self._parameters()
+        late = self._lag * has_sample
+        acted = late * memory.control + (1.0 - late) * u
+        momentum = self.observation.momentum.function(x, acted, v, parameters)
+        contact = self._contact(x, v, parameters)
+        p, drift, inputs = momentum[:3]
+        d = (p - memory.momentum) / self._period - (memory.drift + drift) / 2.0 - inputs
+        d -= ca.mtimes(contact.friction, mu)
+
+        # Each lag is a column.
+        size = len(self.observation.rows)
+        chain = ca.horzcat(ca.reshape(memory.lags, size, -1), memory.disturbance)
+        chain = self._passed(contact, chain, d)
+        chain, change, filtered, moved, slopes = self._explained(
+            chain, x, v, acted, contact, parameters
+        )
+        if slopes is not None:
+            p += ca.mtimes(slopes.momentum, moved)
+            drift += ca.mtimes(slopes.drift, moved)
+        early, slid = self._early(contact, x, v, parameters, d)
+        moves, (fast, slow) = ca.mtimes(contact.free, chain), self._lags
+        rates = fast.derivatives(moves) + slow.derivatives(chain - moves)
+        valid = momentum[-1] + contact.valid
+        after = {
+            "sample": ca.SX(1.0),
+            "disturbance": chain[:, -1],
+            "rates": ca.vec(rates),
+            "lags": ca.vec(chain[:, :-1]),
+            "friction": self._bounded(mu + change + early),
+            "slid": slid,
+            "momentum": p,
+            "drift": drift,
+            "control": u,
+            "filter": filtered,
+        }
+        after = {name: where_finite(value, valid) for name, value in after.items()}
+        return Memory(**{**vars(memory), **after})
+
+    def _passed(self, contact: ContactTerms, chain: ca.SX, signal: ca.SX) -> ca.SX:
+        """The lags of a signal after a sample; what a sticking contact may hide does not enter."""
+        by_fast, by_slow = (
+            beside(
+                contact.held,
+                contact.metric,
+                (self.memory.sample >= 0) * (lags.after(chain, signal) - chain),
+            )
+            for lags in self._lags
+        )
+        return chain + by_slow + ca.mtimes(contact.free, by_fast - by_slow)
+
+    def _bounded(self, mu: ca.SX) -> ca.SX:
+        return ca.fmin(ca.fmax(mu, 0.0), self._observing.largest_friction)
+
+    def _explained(
+        self,
+        chain: ca.SX,
+        x: ca.SX,
+        v: ca.SX,
+        acted: ca.SX,
+        contact: ContactTerms,
+        parameters: ca.SX,
+    ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, Sampled | None]:
+        """Friction, or all parameters, take their share of r.
+
+        Returns:
+            r with its lags, the change of mu, the state of the filter, the change of the parameters
+            and their slopes.
+        """
+        memory, size = self.memory, len(self.observation.rows)
+        mu, hold = memory.friction, self.inputs["hold"] != 0
+        if not self._places:
+            gain = -np.expm1(-self._observing.friction_rate * self._period)
+            terms = contact.friction, contact.planes, contact.velocity, contact.metric
+            after = self._bounded(mu + contact.slides * gain * shares(*terms, chain[:, -1]))
+            change = ca.if_else(hold, 0, after - mu)
+            share = ca.mtimes(contact.friction, change)
+            return chain - ca.repmat(share, 1, chain.shape[1]), change, memory.filter, mu, None
+        slopes = self._slopes(x, acted, v, parameters, contact, hold)
+        before = ca.reshape(memory.filter[self.filter.memory.parts["regressor"]], size, -1)
+        regressor = self.filter.regressor(slopes)
+        columns = zip(ca.horzsplit(before), ca.horzsplit(regressor), strict=True)
+        regressor = ca.horzcat(*(self._passed(contact, *pair) for pair in columns))
+        is_first = memory.sample < 0
+        filtered, moved = self.filter.after(slopes, regressor, chain[:, -1], mu, is_first)
+        known = len(self._places)
+        change = moved[known : known + mu.numel()]
+        return chain - ca.mtimes(regressor, moved), change, filtered, moved[:known], slopes
+
+    def _slopes(
+        self, x: ca.SX, u: ca.SX, v: ca.SX, parameters: ca.SX, contact: ContactTerms, hold: ca.SX
+    ) -> Sampled:
+        """The sample of the functions of the filter."""
+        identified, rows = self.observation.identified, list(self.observation.rows)
+        slopes = identified.slopes.function(x, u, v, parameters)
+        forces = v[list(identified.pressed), :]
+        mass = self._system.mass_matrix[rows, rows]
+        before, after = [self._system.state, self._system.parameter_symbol], [x, parameters]
+        inertia = ca.diag(ca.substitute([mass], before, after)[0])
+        sliding = ca.mtimes(contact.friction, ca.diag(contact.slides))
+        is_closed = forces >= self._observing.least_force
+        momentum, drift, inputs, gaps, gap_slopes, gap_bends = slopes[:6]
+        known = momentum, drift, inputs, sliding, gaps, gap_slopes, gap_bends
+        return Sampled(*known, forces, is_closed, inertia, hold)
+
+    # The state from encoders.
+
+    def _estimated(self) -> Memory:
+        """What is held after a sample of measured positions."""
+        system, old, period, measured = self._system, self.memory, self._period, self._measured
+        u, count = self.inputs["control"], len(self.observation.rows)
+        acted = self._lag * old.control + (1.0 - self._lag) * u
+
+        # Prediction over a sample, from the middle of it; a discrete plant steps from its start.
+        q, qd, r, mu = old.state[:count], old.state[count:], old.disturbance, old.friction
+        middle = ca.vertcat(q + (period - self._step) / 2.0 * qd, qd)
+        parameters = self._parameters()
+        if self.measures:  # A discrete plant's force is that of its step.
+            v, share = self._measured_force, (1.0 + self._step / period) / 2.0
+            force = share * v + (1.0 - share) * old.measured_force
+        else:
+            force = v = self._model_force(middle, r, mu, acted)
+        contact = self._contact(middle, v, parameters)
+        friction_force = ca.mtimes(contact.friction, mu)
+        pushed = ca.SX(parameters)
+        pushed[system.parameter_slice(DISTURBANCE)] = r + friction_force
+        mass, push, damping = self._balance()(middle, acted, force, pushed)
+        factors = stepping = PositiveDefiniteFactorization(mass)
+        moves = mass
+        if not damping.is_zero():  # Implicit, as in Drake's discrete plants: a light link is stiff.
+            moves = mass + period * ca.diag(damping)
+            stepping = PositiveDefiniteFactorization(moves)
+        # A measured force has the reaction of the constraints to the friction that acts, and a
+        # force of the model that to the friction of a contact that slides.
+        through = ca.SX.eye(count) if self.measures else contact.free
+        moved = qd + period * stepping.solve(push - ca.mtimes(through, friction_force))
+        moved += self._rubbed(q, moved, v, stepping, through, parameters)
+        unused = ca.logic_or(self._is_lost(v), self.inputs["hold"] != 0)
+        if self._breaks_away:  # What has not slid yet sticks, with any friction that this needs.
+            sticks = ca.logic_not(ca.logic_or(unused, old.slid > 0))
+            stuck = self._side_by_side(contact.planes, sticks)
+            metric = factors.solve if self.measures else contact.metric
+            momentum = ca.mtimes(mass, moved)
+            stopped = momentum - beside(stuck, metric, momentum)
+            moved -= factors.solve(ca.mtimes(through, stopped))
+        ahead = q + period * qd + (period + self._step) / 2.0 * (moved - qd)
+
+        # Correction by the measurements, along the free and the constrained directions.
+        errors = measured[:count] - ahead, measured[count:] - moved
+        free, constrained = (
+            ca.horzcat(*(own[:, 0] * errors[0] + own[:, 1] * errors[1] for own in gains))
+            for gains in self._gains
+        )
+        difference = free - constrained
+        turned = factors.solve(ca.mtimes(contact.free, ca.mtimes(mass, difference[:, :2])))
+        new_q = ahead + constrained[:, 0] + turned[:, 0]
+        new_v = moved + constrained[:, 1] + turned[:, 1]
+        jump = ca.mtimes(moves, constrained[:, 2])
+        jump += ca.mtimes(contact.free, ca.mtimes(moves, difference[:, 2]))
+        new_r = r + beside(contact.held, contact.metric, jump)
+
+        # Friction and parameters take their share of the disturbance.
+        state = ca.vertcat(new_q, new_v)
+        new_r, change, filtered, _, _ = self._explained(new_r, state, v, acted, contact, parameters)
+        slid = old.slid
+        if self._breaks_away:
+            early, slid, jumps, is_early = self._slipped(
+                contact,
+                middle,
+                new_v,
+                v,
+                parameters,
+                ca.mtimes(mass, errors[0]),
+                errors[0],
+                factors,
+                unused,
+            )
+            forces = self._developed(ca.vertcat(q, new_v), v, parameters)
+            terms = forces, contact.planes, new_v, contact.metric
+            taken = ca.mtimes(contact.free, forces)
+            new_r -= ca.mtimes(taken, is_early * shares(*terms, new_r - r))
+            change += early
+            state += jumps
+        mu = self._bounded(mu + change)
+        after = {
+            "state": state,
+            "disturbance": new_r,
+            "friction": mu,
+            "slid": slid,
+            "control": u,
+            "filter": filtered,
+        }
+        if self.measures:
+            after["measured_force"] = v
+        else:
+            after["force"] = self._model_force(state, new_r, mu, acted)
+        after = {name: where_finite(value, contact.valid) for name, value in after.items()}
+        return Memory(**{**vars(old), **after})
+
+    def _developed(self, state: ca.SX, v: ca.SX, parameters: ca.SX) -> ca.SX:
+        """The friction force per unit of each coefficient, fully developed, shape (k, c)."""
+        friction = self.observation.friction.function
+        return friction(self._faster(state), v, parameters)[0]
+
+    def _rubbed(
+        self,
+        q: ca.SX,
+        moved: ca.SX,
+        v: ca.SX,
+        mass: PositiveDefiniteFactorization,
+        through: ca.SX,
+        parameters: ca.SX,
+    ) -> ca.SX:
+        """The change of velocities by friction over a sample.
+
+        It is implicit: against the velocity that there would be without it, which it at most stops.
+        Otherwise it would turn a light tool about from sample to sample.
+        """
+        forces = self._developed(ca.vertcat(q, moved), v, parameters)
+        made = self._period * mass.solve(ca.mtimes(through, forces))
+        stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, _LITTLE)
+        # The noise of a force sensor may be less than zero.
+        return ca.mtimes(made, ca.fmin(self.memory.friction, ca.fmax(stopping, 0.0)))
+
+    def _model_force(self, state: ca.SX, r: ca.SX, mu: ca.SX, control: ca.SX) -> ca.SX:
+        """v = alpha(x) + beta(x) u (25) with the observed disturbance and friction."""
+        system, elimination = self._system, self._law.structure.elimination
+        parameters = self._parameters(mu)
+        parameters[system.parameter_slice(DISTURBANCE)] = r
+        terms = [elimination.alpha, ca.densify(elimination.beta)]
+        function = ca.Function("force", [system.state, system.parameter_symbol], terms)
+        alpha, beta = function(state, parameters)
+        return alpha + ca.mtimes(beta, control)
+
+    def _balance(self) -> ca.Function:
+        """(x, u, v, parameters) -> M, the total force without M v', and the joints' damping."""
+        system, rows = self._system, list(self.observation.rows)
+        u, v = (ca.SX.sym("u", n) for n in (system.num_controls, system.num_constraints))
+        push = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
+        dry, speed = self._dry(system.state, system.parameter_symbol), system.state[rows]
+        smooth, turning = (
+            [-ca.jacobian(force[i], speed[i]) for i in range(len(rows))]
+            for force in (system.f[rows] - dry, dry)
+        )
+        damping = ca.substitute(ca.vertcat(*smooth), speed, 0 * speed)  # Without Coriolis forces.
+        damping += ca.vertcat(*turning)
+        inputs = [system.state, u, v, system.parameter_symbol]
+        outputs = [system.mass_matrix[rows, rows], push[rows], ca.sparsify(ca.simplify(damping))]
+        return ca.Function("balance", inputs, outputs)
+
+    # The first break-away of a contact.
+
+    def _early(
+        self, contact: ContactTerms, x: ca.SX, v: ca.SX, parameters: ca.SX, d: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """The change of friction at the first break-away, and the samples of sliding after it.
+
+        While a contact sticks where it should slide, its coefficient rises with `BREAK_RATE`, so
+        that it breaks away before the reference is far. Then samples of d are averaged, without a
+        low-pass, until `friction_rate` is faster. Not with a law that needs derivatives of d.
+        """
+        memory, observation, least = self.memory, self.observation, self._least_speed
+        if not self._breaks_away:  # Springs answer jumps by swings.
+            return 0.0 * memory.friction, memory.slid
+        wanted, actual = (
+            observation.friction.function(state, v, parameters)[1]
+            for state in (self._goal(x, parameters)[0], x)
+        )
+        follows = actual >= STICKS * wanted
+        weight = 1.0 / (memory.slid + EARLY)
+        is_early = weight > EARLY * self._observing.friction_rate * self._period
+        unused = ca.logic_or(self._is_lost(v), self.inputs["hold"] != 0)
+        used = is_early * (wanted > least) * ca.logic_not(unused)
+        slides = used * follows * (actual > least)
+        terms = contact.friction, contact.planes, contact.velocity, contact.metric
+        change = slides * weight * shares(*terms, d)
+        change += used * ca.logic_not(follows) * BREAK_RATE * self._period
+        return change, memory.slid + slides
+
+    @property
+    def _least_speed(self) -> float:
+        return LEAST_SHARE * self._observing.least_speed
+
+    def _goal(self, x: ca.SX, parameters: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """The state with the wanted velocities when the control acts, and its check."""
+        wanted, reference = self.observation.wanted, self.inputs["reference"]
+        assert wanted is not None
+        values = wanted.function(x, reference, self._delay, parameters)
+        return values[0], values[-1]
+
+    def _slipped(
+        self,
+        contact: ContactTerms,
+        middle: ca.SX,
+        speed: ca.SX,
+        v: ca.SX,
+        parameters: ca.SX,
+        momentum: ca.SX,
+        error: ca.SX,
+        factors: PositiveDefiniteFactorization,
+        unused: ca.SX,
+    ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """The same as `_early` by measured positions.
+
+        A contact has broken away where positions leave the predicted ones by more than noise, by S.
+        While its coefficient rises with the rate k, a unit of friction makes s'' = b: so this takes
+        the time t = (6 S / (k |b|))^(1/3), from s = k |b| t^3 / 6; the speed is then 3 S / t, and
+        the coefficient less by k t than it has risen to. From there on the gains along the friction
+        are those of the least squares of all positions since it broke away, a parabola.
+
+        Returns:
+            The change of mu, the samples of sliding, the change of the state, and the samples in
+            which friction explains all of r along it.
+        """
+        memory, T = self.memory, self._period
+        least = self._least_speed * T / CLEAR
+        squares = ca.DM(np.square(np.maximum(self._deviations[0], least)))
+        goal = self._goal(middle, parameters)[0]
+        now = ca.vertcat(middle[: error.numel()], speed)
+        friction = self.observation.friction.function
+        wanted, actual = (friction(each, v, parameters)[1] for each in (goal, now))
+        towards, forces = (self._developed(each, v, parameters) for each in (goal, now))
+        pressing = [v[i] for i in self.observation.frictions.values()]
+        pressing = ca.fmax(ca.fabs(ca.vertcat(*pressing)), _LITTLE)
+        is_moved, sticks = wanted > self._least_speed, memory.slid == 0
+        ahead = -ca.mtimes(towards.T, error) > CLEAR * ca.sqrt(ca.sum1(towards**2 * squares).T)
+        aside = [
+            ca.sumsqr(ca.mtimes(plane.T, error)) > CLEAR**2 * ca.dot(ca.sum2(plane**2), squares)
+            for plane in contact.planes
+        ]
+        leaves = ca.logic_or(ca.logic_and(is_moved, ahead), ca.vertcat(*aside))
+        most = max(round(1.0 / (EARLY * self._observing.friction_rate * T)), 1)
+        is_early = (memory.slid < most) * ca.logic_not(unused)
+        stuck = is_early * sticks
+        breaks = stuck * leaves
+        slides = is_early * ca.logic_not(sticks)
+
+        along = factors.solve(ca.mtimes(contact.free, forces))
+        b = ca.fmax(ca.fabs(ca.sum1(forces * along).T) / pressing, _LITTLE)
+        distance = CLEAR * ca.sqrt(ca.sum1(forces**2 * squares).T) / pressing
+        since = (6.0 * distance / (BREAK_RATE * b)) ** (1.0 / 3.0)
+        since = ca.fmin(ca.fmax(since, 2.0 * T), 30.0 * T)
+        rests = slides * (memory.slid > EARLY) * is_moved * (actual <= self._least_speed)
+        kick = ca.mtimes(along, breaks * 3.0 * distance / (since * b))
+
+        n = memory.slid
+        share = slides * shares(forces, contact.planes, speed, contact.metric, momentum)
+        by_all = 60.0 / ((n + 1.0) * (n + 2.0) * (n + 3.0))
+        by_q = by_all * (3.0 * n * (n + 1.0) + 2.0) / 20.0
+        by_v = by_all * (2.0 * n + 1.0) * 0.3
+        usual = [float(gain[0, 0]) for gain in self._gains[0][:2]]
+        moved = [
+            ca.mtimes(along, share * (by_q - usual[0])),
+            ca.mtimes(along, share * (by_v / T - usual[1])) - kick,
+        ]
+        change = share * by_all / T**2 - breaks * BREAK_RATE * since
+        change += stuck * is_moved * ca.logic_not(breaks) * BREAK_RATE * T
+        slid = ca.if_else(rests, 0, n + slides + breaks * ca.floor(since / T))
+        return change, slid, ca.vertcat(*moved), slides
+
+    # What the law takes.
+
+    def _compensated(self, x: ca.SX, v: ca.SX, known: Memory) -> ca.SX:
+        """The signals for the law: disturbance, coefficients of friction and their derivatives."""
+        observation, mu = self.observation, known.friction
+        theta = known.filter[: len(self._places)]
+        parameters, r, valid = self._parameters(mu, theta), known.disturbance, ca.SX(0)
+        if mu.numel() or self._system.dry:
+            goal = x
+            if observation.wanted is not None:
+                goal, valid = self._goal(x, parameters)
+            friction, goal_friction = (
+                observation.friction.function(state, v, parameters)[0]
+                for state in (x, self._faster(goal))
+            )
+            r = r + ca.mtimes(goal_friction - friction, mu)
+            r = r + self._dry(goal, parameters) - self._dry(x, parameters)
+        size, rates = r.numel(), known.rates
+        rows = {DISTURBANCE: [[r[i], *rates[i::size].elements()] for i in range(size)]}
+        for name, value in zip(observation.frictions, mu.elements(), strict=True):
+            rows[name] = [[value]]
+        values = iter(theta.elements())
+        for p in observation.identified.parameters:
+            rows[p.name] = [[next(values)] for _ in range(p.value.size)]
+        stacked, degrees = list[ca.SX](), iter(self._law.exogenous_degrees)
+        for p in self._system.exogenous.moving:
+            for row in rows[p.name]:
+                degree = next(degrees)
+                stacked += [*row, *[ca.SX(0.0)] * degree][: 1 + degree]  # Others are constant.
+        return where_finite(ca.vertcat(*stacked), valid)
+
+    def _dry(self, state: ca.SX, parameters: ca.SX) -> ca.SX:
+        """The generalized force of Coulomb friction in joints, shape (k, 1)."""
+        rows = list(self.observation.rows)
+        if not self._system.dry:
+            return ca.SX(len(rows), 1)
+        without = ca.SX(parameters)
+        for name in self._system.dry:
+            without[self._system.parameter_slice(name)] = 0.0
+        symbols = [self._system.state, self._system.parameter_symbol]
+        f = ca.Function("f", symbols, [self._system.f[rows]])
+        return f(state, parameters) - f(state, without)
+
+
+def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:
+    system, count = law.system, len(rows)
+    is_rigid = rows == tuple(range(count, 2 * count)) and system.num_states == 2 * count
+    if not is_rigid or disturbance_degree(law):
+        raise ModelError(
+            f"{system.name}: a state_rate is for robots with rigid joints, whose states are "
+            "positions and velocities; behind springs, motors or valves measure the velocities, "
+            "or let the encoders form differences by a velocity_bandwidth"
+        )
+    slope = system.f[:count] - system.state[count:]
+    if not ca.simplify(slope).is_zero():
+        raise ModelError(
+            f"{system.name}: a state_rate needs q' = v, and this robot has a body with "
+            "q' = N(q) v; measure its velocities"
+        )
+
+
+def _gains(
+    observing: Observing, period: float, position: FloatArray, velocity: FloatArray
+) -> list[list[ca.DM]]:
+    """Along the free and the constrained directions: the gains of q, v and a, shape (k, 2) each."""
+    assert observing.state_rate is not None
+    found = np.zeros((2, 3, position.size, 2))
+    for which, rate in enumerate((observing.rate, observing.force_rate or observing.rate)):
+        for i, (q, v) in enumerate(zip(position, velocity, strict=True)):
+            ratio = v / q if v > 0.0 and q > 0.0 else None
+            own = ChainFilter.of(observing.state_rate, rate, period, ratio).gain
+            found[which, :, i, : own.shape[1]] = own
+    return [[ca.DM(each) for each in gains] for gains in found]
