@@ -37,8 +37,6 @@ from drake_dae.dae import (
     Manifold,
     PinnedMotion,
     RankMargin,
-    SensedContact,
-    SensorNoise,
     with_disturbance,
 )
 from drake_dae.diagrams.record import Recorded
@@ -68,11 +66,6 @@ def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
 def observed_law() -> dd.TrackingLaw:
     dae = with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
     return dd.TrackingLaw(dae, dd.poles(-4.0))
-
-
-def sensed() -> SensedContact:
-    noise = SensorNoise(1e-5, force=0.1)
-    return SensedContact(1e-3, 1, 1e5, 0.03, 0.3, 0.7, 0.7, 5.0, noise, True)
 
 
 @cache
@@ -143,8 +136,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Sampling: lambda: dd.Sampling(0.01),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     Observing: lambda: Observing(10.0),
-    SensedContact: sensed,
-    SensorNoise: lambda: SensorNoise(),
     dd.NormalForm: normal_form,
     Manifold: lambda: arm("two_link").structure.manifold,
     Derivatives: lambda: arm("two_link").structure.derivatives,
@@ -171,9 +162,6 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
 PLACES: dict[str, Callable[[], Any]] = {
     "states": lambda: state()[None],
     "times": lambda: [0.0, 0.1],
-    "times of sampling_error": lambda: [0.0, 0.1, 0.2],
-    "states of sampling_error": lambda: np.tile(state(), (3, 1)),
-    "controls of sampling_error": lambda: np.zeros((3, 2)),
     "reference": lambda: record()["reference"][0],
     "add_robot": lambda: add_arm,
     "limits of ControlLimits": lambda: [1.0],
@@ -186,7 +174,6 @@ PLACES: dict[str, Callable[[], Any]] = {
     "components": lambda: "xy",
     "duration": lambda: 0.01,
     "law of StateEstimator": observed_law,
-    "gains of AdvisedGains": lambda: dd.contact_gains(1e5, 0.03, 1e-3),
     "observing of StateEstimator": lambda: Observing(10.0, state_rate=40.0),
     "states of with_disturbance": lambda: ["joint1_w", "joint2_w"],
     "center": lambda: (0.0, 0.0, 0.0),

@@ -49,14 +49,21 @@ DECAY = 1.0
 SHARE = 0.003
 """The default of the largest roughness, as a fraction of the largest effort limit."""
 
-FINER, TRIES = 0.6, 6
+LOST = -3.0
+"""The margin below which no gains are given."""
+
+RESTING = 0.5
+"""The factor of gains for references that rest: a contact sticks, and estimates are held, so that
+no linear model tells a margin."""
+
+FINER, TRIES = 0.5, 6
 """What a factor that is too large is multiplied by, and how many pairs are tried."""
 
 SLIDING = ((1.0, 0.8, 0.5), (0.5, 0.8, 2.0), (2.0, 0.8, 1.0))
-STIFF = ((1.0, 0.0, 1.0), (2.0, 0.0, 0.5), (0.5, 0.8, 2.0))
+STIFF = ((1.0, 0.0, 1.0), (2.0, 0.0, 0.5), (0.5, 0.0, 2.0))
 """Stiffness relative to the stated one, friction, and the tool's mass relative to the model's:
 where friction damps most, and where the contact is fastest. Of the corners of 1/2 to 2, 0 to 0.8
-and 1/2 to 2 these are the ones in which loops were slowest or swung most."""
+and 1/2 to 2 loops were slowest, or swung most, in these."""
 
 SETTLE, BEGIN = 40, 0.5
 """The samples from a point of the path to the motion that is linearized, and the time in s for
@@ -80,8 +87,8 @@ class ContactGains:
         roughness: The rms change of the controls from sample to sample by noise, in N m.
         position_error, force_error: The rms errors to expect in m and N: by noise, and by an
             unknown force of 1 N that appears or turns every 2 s.
-        binds: Why the gains are no faster: "roughness", "damping", "decay", "start", or "" where
-            the first ones were taken.
+        binds: Why the gains are no faster: "roughness", "damping", "decay", "start"; "rest" where
+            the references rest, so that no loop was examined; "" where the first were taken.
     """
 
     position_rate: float
@@ -142,6 +149,9 @@ def contact_gains(
     - noise changes the controls by at most `roughness` from sample to sample, in rms,
     - half a second from a start at rest, with friction of 0.8 unknown, ends in contact.
 
+    Where references rest, friction holds the contact, no linear model tells a margin, and half of
+    the rates of the directions are returned.
+
     Those are reduced whose integrals take part in the worst mode. Where slower gains do not help,
     the best ones within the roughness are returned, with their margins.
 
@@ -176,37 +186,56 @@ def contact_gains(
     trials.structure = structure or find_structure(model.dae)
     begin, end = times
     trials.go_along(np.linspace(begin, end, 25), guess, roughness)
+    parts = trials.start
+    rough = float(np.hypot(parts[0].roughness, parts[1].roughness))
+    if rough > 1.5 * roughness:
+        raise GainError(
+            f"the noise of encoders and of the force changes the controls by {rough:.3g} N m from "
+            f"sample to sample with the smoothest gains, and {roughness:.3g} N m are allowed: "
+            "allow more roughness, or use better sensors"
+        )
+    if not trials.slides:
+        return replace(
+            trials.gains(RESTING, RESTING),
+            decay=inf,
+            damping=1.0,
+            roughness=rough,
+            position_error=2.0 * parts[0].error,
+            force_error=2.0 * parts[1].error,
+            binds="rest",
+        )
     free, contact, binds, found = 1.0, 1.0, "", list[ContactGains]()
     for _ in range(TRIES):
         gains, is_of_contact = trials.examined(trials.gains(free, contact), roughness)
         found.append(replace(gains, binds=binds))
         before = found[-2].margin if binds in ("damping", "decay") else -inf
-        if gains.roughness > roughness:
+        if roughness < gains.roughness < inf:
             binds, less = "roughness", _smoother(found, roughness)
             free, contact = less * free, less * contact
         elif gains.margin < 1.0:
-            if gains.margin < min(before + 0.01, 1.0) and gains.decay > 0.0:
-                break  # Slower gains do not help: friction, or a contact that noise lets swing.
+            if gains.margin < before + 0.01:
+                break  # Slower gains do not help against friction, and a contact swings with them.
             binds = "damping" if gains.damping / DAMPING < gains.decay / DECAY else "decay"
             free, contact = (free, FINER * contact) if is_of_contact else (FINER * free, contact)
         elif not trials.starts():
             binds, free, contact = "start", FINER * free, FINER * contact
         else:
             return found[-1]
-    smooth = [g for g in found if g.roughness <= roughness and g.decay > 0.0]
-    if smooth:
-        return max(smooth, key=lambda g: g.margin)
-    if found[-1].decay > 0.0:
+    smooth = [g for g in found if g.roughness <= roughness or g.decay <= 0.0]
+    best = max(smooth, key=lambda g: g.margin, default=None)
+    if best is None:
         raise GainError(
             f"noise changes the controls by {found[-1].roughness:.3g} N m from sample to sample "
             f"with the slowest gains that were tried, and {roughness:.3g} N m are allowed: allow "
             "more roughness, or use better sensors"
         )
-    raise GainError(
-        f"no gains are stable for a contact of {material.stiffness:.3g} N/m, half and twice as "
-        f"stiff, with samples of {trials.period:g} s and this delay: sample more often, or make it "
-        "softer"
-    )
+    if best.margin < LOST:
+        raise GainError(
+            f"with the best gains that were tried a contact of {material.stiffness:.3g} N/m, half "
+            f"or twice as stiff, grows at {-best.decay:.3g} 1/s, with samples of "
+            f"{trials.period:g} s and this delay: sample more often, or make it softer"
+        )
+    return best
 
 
 def _smoother(found: Sequence[ContactGains], roughness: float) -> float:
@@ -216,7 +245,7 @@ def _smoother(found: Sequence[ContactGains], roughness: float) -> float:
         rates = found[-2].position_rate / last.position_rate
         if rates > 1.01 and found[-2].roughness > last.roughness:
             power = float(np.log(found[-2].roughness / last.roughness) / np.log(rates))
-    return float(np.clip(0.95 * (roughness / last.roughness) ** (1.0 / power), 0.1, 0.9))
+    return float(np.clip(0.95 * (roughness / last.roughness) ** (1.0 / power), 0.3, 0.9))
 
 
 @dataclass(eq=False)
@@ -297,13 +326,21 @@ class _Trials:
                 }
             )
         chosen = int(np.argmax(across)), int(np.argmax(along))
+        self.slides = max(across) > 0.0
         self.path = [
-            (round(times[i] / self.period) * self.period, motion.states[i], ways[i], cases)
+            (
+                round(times[i] / self.period) * self.period,
+                motion.states[i],
+                motion.constraint_inputs[i],
+                ways[i],
+                cases,
+            )
             for i, cases in zip(chosen, (SLIDING, STIFF), strict=True)
         ]
         rest = motion.states[0].copy()
         rest[v] = 0.0
-        self.begin = round(times[0] / self.period) * self.period, rest
+        begin = round(times[0] / self.period) * self.period
+        self.begin = begin, rest, motion.constraint_inputs[0]
         self.start = direction_gains(self._situation(sizes[chosen[1]]), 0.8 * roughness)
 
     def _situation(self, sizes: dict[str, float]) -> SensedContact:
@@ -365,20 +402,23 @@ class _Trials:
     def examined(self, gains: ContactGains, roughness: float) -> tuple[ContactGains, bool]:
         """Gains with their margins, and whether the worst mode is one of the contact.
 
-        Gains that are too rough where friction damps most are not examined further.
+        Gains that are too rough, or unstable, are not examined further.
         """
         self.run = run = _Run(self.loop(gains), self.model, self.material)
         found = list[LinearLoop]()
         errors: tuple[float, ...] = (inf, inf, inf)
-        for moment, state, way, cases in self.path:
+        for moment, state, force, way, cases in self.path:
             for k, mu, mass in cases:
                 x = state + way / (k * self.material.stiffness)
-                linear, at = run.linear(moment, x, (k, mu), mass)
+                linear, at = run.linear(moment, x, force, (k, mu), mass)
                 found.append(linear)
-                if linear.decay > 0.0 and len(found) == 1:
+                if len(found) == 1 and linear.decay > 0.0:
                     errors = self._errors(run, linear, *at)
-                    if errors[0] > roughness:
-                        break
+                is_done = not linear.decay > 0.0 or not errors[0] <= roughness
+                if is_done:
+                    break
+            if is_done:
+                break
         margins = [min(linear.decay / DECAY, linear.damping / DAMPING) for linear in found]
         worst = int(np.argmin(margins))
         shares = found[worst].participation(DAMPING / DECAY)
@@ -406,9 +446,9 @@ class _Trials:
 
     def starts(self) -> bool:
         """Whether the last loop is in contact half a second after a start from rest."""
-        moment, state = self.begin
+        moment, state, force = self.begin
         run = self.run
-        x, p = run.begun(moment, state, 0.0)[:, None], run.parameters(1.0, 0.8)[:, None]
+        x, p = run.begun(state, force, 0.0)[:, None], run.parameters(1.0, 0.8)[:, None]
         x = run.advanced(moment, x, p, round(BEGIN / self.period))
         shown = run.sampled.shown(moment + BEGIN, x, p)["controlled_output"]
         return bool(np.isfinite(x).all() and np.all(shown[len(self.positions) :] > 0.0))
@@ -430,27 +470,35 @@ class _Run:
         """All parameters, with the plant's relative stiffness, friction and mass of the tool."""
         stiffness *= self.material.stiffness
         changed = replace(self.material, stiffness=stiffness, friction=friction)
-        self.loop.plant.set_contact(self.at_plant, changed)  # type: ignore[attr-defined]
+        self.loop.plant.set_contact(self.at_plant, changed)
         values = self.sampled.block.default("parameters")
         own = self.at_plant.get_numeric_parameter(0).CopyToVector()
         values[self.composed.parameters[self.loop.plant]] = own
         values[self.tool] *= mass
         return values
 
-    def begun(self, time: float, state: FloatArray, friction: float) -> FloatArray:
-        """x at the start from a state of the plant, with friction that the estimator knows."""
+    def begun(self, state: FloatArray, force: FloatArray, friction: float) -> FloatArray:
+        """x at the start from a state and a measured force, with friction that is known."""
         loop, x = self.loop, self.sampled.start.copy()
         loop.plant.set_state(self.at_plant, state)
         assert loop.observer is not None
         at_observer = loop.observer.GetMyMutableContextFromRoot(self.context)
         loop.observer.set_friction(at_observer, friction)
-        for system, at in ((loop.plant, self.at_plant), (loop.observer, at_observer)):
+        systems = {loop.plant: self.at_plant, loop.observer: at_observer}
+        if loop.sensor is not None:
+            at_sensor = loop.sensor.GetMyMutableContextFromRoot(self.context)
+            loop.sensor.set_force(at_sensor, force)
+            systems[loop.sensor] = at_sensor
+        for system, at in systems.items():
             if system in self.composed.states:
                 x[self.composed.states[system]] = at.get_continuous_state_vector().CopyToVector()
             for i in range(at.num_discrete_state_groups()):
                 name, part = self.composed.held[system, i]
                 first = self.sampled.places[name]
                 own = at.get_discrete_state(i).CopyToVector()
+                if system is loop.observer and loop.observer.observing.state_rate is not None:
+                    # Behind the number of the sample; at zeros an arm may be singular.
+                    own[1 : 1 + state.size] = state
                 x[first + part.start : first + part.stop] = own
         return x
 
@@ -462,10 +510,15 @@ class _Run:
         return x
 
     def linear(
-        self, moment: float, state: FloatArray, contact: tuple[float, float], mass: float
+        self,
+        moment: float,
+        state: FloatArray,
+        force: FloatArray,
+        contact: tuple[float, float],
+        mass: float,
     ) -> tuple[LinearLoop, tuple[float, FloatArray, FloatArray]]:
         """The linear model some samples after a state, with the tool's mass wrong; and where."""
-        x, p = self.begun(moment, state, contact[1]), self.parameters(*contact)
+        x, p = self.begun(state, force, contact[1]), self.parameters(*contact)
         x = self.advanced(moment, x[:, None], p[:, None], SETTLE)[:, 0]
         at = moment + SETTLE * self.sampled.period, x, self.parameters(*contact, mass)
         return self.sampled.linear(*at), at

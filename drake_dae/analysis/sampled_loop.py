@@ -12,8 +12,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, Block, stacked
 from drake_dae.errors import ModelError
 
-HELD = 0.1
-"""Real poles within 0.1/s of 0 are left out: counters, and estimates that are held where nothing
+HELD = 0.3
+"""Real poles within 0.3/s of 0 are left out: counters, and estimates that are held where nothing
 moves them; as the posture turns, these drift. Slow modes by friction are pairs."""
 
 EVERY = 2.0
@@ -46,6 +46,8 @@ class LinearLoop:
     @property
     def poles(self) -> np.ndarray:
         """log(z) / T of the eigenvalues z, in 1/s, the slowest first."""
+        if not np.isfinite(self.A).all():  # A state without a sample after it.
+            return np.array([np.inf + 0j])
         found = self._logarithms(np.linalg.eigvals(self.A))
         found = found[np.isfinite(found)]
         return found[np.argsort(-found.real)]
@@ -64,13 +66,17 @@ class LinearLoop:
 
     @property
     def damping(self) -> float:
-        """The least damping ratio below half the Nyquist rate, pi / (2 T)."""
+        """The least damping ratio below half the Nyquist rate, pi / (2 T); -1 if it has none."""
         poles = self.poles
+        if not np.isfinite(poles).all():
+            return -1.0
         poles = poles[np.abs(poles.imag) < pi / (2.0 * self.period)]
         return float(np.min(-poles.real / np.abs(poles), initial=1.0))
 
     def participation(self, ratio: float) -> FloatArray:
         """The shares of all x in the worst mode: decays count in 1/s, damping ratios by `ratio`."""
+        if not np.isfinite(self.A).all():
+            return np.zeros(len(self.A))
         values, left, right = scipy.linalg.eig(self.A, left=True)
         poles = self._logarithms(values)
         with np.errstate(invalid="ignore"):

@@ -259,13 +259,21 @@ def _note(best: ContactGains, chosen: Scenario, stiffness: float) -> str:
         f"recommended for a contact of {stiffness:.2g} N/m: Butterworth's poles of positions at "
         f"{_rounded(best.position_rate):g} 1/s, of forces one at {-_rounded(best.force_gain):g} "
         f"1/s, with integrals of {', '.join(law.integral or ())}, damping of the constraint "
-        f"{_rounded(best.constraint_damping):g} 1/s, {observed}. On the loop itself, with "
-        "stiffness and tool's mass from 1/2 to 2 times the model's and friction up to 0.8, the "
-        f"slowest mode decays at {best.decay:.2g} 1/s, the least damping ratio is "
-        f"{best.damping:.2g}, and noise changes the controls by {best.roughness:.2g} N m from "
-        f"sample to sample; {binds} keeps the gains from being faster. Expected are "
-        f"{1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N rms, if an unknown force "
-        f"of {FORCE:g} N appears every {EVERY:g} s"
+        f"{_rounded(best.constraint_damping):g} 1/s, {observed}. "
+    )
+    if best.binds == "rest":
+        text += "The references rest, so that no loop was examined. "
+    else:
+        text += (
+            "On the loop itself, with stiffness and tool's mass from 1/2 to 2 times the model's "
+            f"and friction up to 0.8, the slowest mode decays at {best.decay:.2g} 1/s, and the "
+            f"least damping ratio is {best.damping:.2g}; {binds} keeps the gains from being "
+            "faster. "
+        )
+    text += (
+        f"Noise changes the controls by {best.roughness:.2g} N m from sample to sample. Expected "
+        f"are {1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N rms, if an unknown "
+        f"force of {FORCE:g} N appears every {EVERY:g} s"
     )
     if best.margin >= 1.0:
         return text

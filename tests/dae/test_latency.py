@@ -7,8 +7,6 @@ from runs import roll, run_scenario, scenario
 from scipy.linalg import expm
 
 from drake_dae import DaeSystem, TrackingLaw, poles
-from drake_dae.dae import sampling_error
-from drake_dae.errors import ModelError
 
 INERTIA, DAMPING, PERIOD, POLE = 1e-3, 2.0, 1e-3, -10.0
 LATENCY = 1.5 * PERIOD
@@ -51,12 +49,6 @@ def test_a_light_damped_joint_decays_as_designed_under_a_late_control():
     assert sampled_error(LATENCY) < 0.01
     # The latency is neither half nor twice as long.
     assert min(sampled_error(0.5 * LATENCY), sampled_error(2.0 * LATENCY)) > 0.03
-
-
-def test_the_error_by_sampling_is_predicted_without_a_latency_for_damping():
-    law, times = TrackingLaw(joint(), poles(POLE), latency=LATENCY), np.arange(3.0)
-    with pytest.raises(ModelError, match=r"latency.*0\.0015"):
-        sampling_error(law, times, np.zeros((3, 2)), np.zeros((3, 1)), PERIOD)
 
 
 def tool_with_drag():

@@ -317,7 +317,7 @@ def direction_gains(situation: SensedContact, roughness: float) -> tuple[Part, P
         free = _best(
             [_free(situation, 2.0 * share * highest, state_rate) for share in _RATES], roughness
         )
-        most = max((roughness**2 - free.roughness**2) ** 0.5, 0.7 * roughness)
+        most = max(roughness**2 - free.roughness**2, 0.5 * roughness**2) ** 0.5
         contact = [_contact(situation, share * highest, state_rate) for share in _RATES]
         pairs.append((free, _best(contact, most)))
 
