@@ -72,10 +72,9 @@ benchmark: $(VENV)/installed-benchmark
 	$(BIN)/python -m pytest tests/benchmarks -q
 
 campaign: $(VENV)/installed-dev
-	$(BIN)/python tests/campaign/run.py --count 1600 --files 2000 --robots 520 --seed $(SEED)
+	$(BIN)/python tests/campaign/run.py --inputs 1600 --files 2000 --robots 520 --seed $(SEED)
 	$(BIN)/python tests/campaign/memory.py
 	$(PYTEST) -m thorough
-	OMP_NUM_THREADS=1 $(BIN)/python tests/campaign/random_tasks.py --count 1000 --seed $(SEED)
 
 # Robots are those of example-robot-data, and of pybullet_data and robosuite where these are
 # installed; engines of the referee that are not installed are left out: .[referee] brings them.

@@ -4,122 +4,104 @@ All else is imported from its room, as `from drake_dae.robots import RollingBall
 """
 
 from . import errors as errors
-from .dae import (
-    DaeSystem as DaeSystem,
-    Signal as Signal,
-    Parameter as Parameter,
-    find_structure as find_structure,
-    NormalForm as NormalForm,
-    ZeroDynamics as ZeroDynamics,
-    dynamic_extension as dynamic_extension,
-    linearize as linearize,
-    drop_constraints as drop_constraints,
-    share_forces as share_forces,
-    TrackingLaw as TrackingLaw,
-    poles as poles,
-)
-from .references import (
-    Reference as Reference,
-    ConstantReference as ConstantReference,
-    LineReference as LineReference,
-    PolylineReference as PolylineReference,
-    CircleReference as CircleReference,
-    SinusoidReference as SinusoidReference,
-    PointToPointReference as PointToPointReference,
-    WaypointsReference as WaypointsReference,
-    ExpressionReference as ExpressionReference,
-    CsvReference as CsvReference,
-)
-from .robots import (
-    RobotModel as RobotModel,
-    LinkExpressions as LinkExpressions,
-    Constraint as Constraint,
-    PointOnSurface as PointOnSurface,
-    FixedDistance as FixedDistance,
-    CoincidentPoints as CoincidentPoints,
-    WeldedFrames as WeldedFrames,
-    JointCoupler as JointCoupler,
-    AxisNormalToSurface as AxisNormalToSurface,
-    RevoluteLoopJoint as RevoluteLoopJoint,
-    PrismaticLoopJoint as PrismaticLoopJoint,
-    RollingWheel as RollingWheel,
-    Surface as Surface,
-    Plane as Plane,
-    Sphere as Sphere,
-    Cylinder as Cylinder,
-    Ellipsoid as Ellipsoid,
-    Torus as Torus,
-    ImplicitSurface as ImplicitSurface,
-    MeasuredSurface as MeasuredSurface,
-    Stage as Stage,
-    FlexibleJoints as FlexibleJoints,
-    DcMotors as DcMotors,
-    ElectrohydraulicServos as ElectrohydraulicServos,
-    JointPositions as JointPositions,
-    PointCoordinates as PointCoordinates,
-    AxisCoordinates as AxisCoordinates,
-    SurfaceCoordinates as SurfaceCoordinates,
-    TiltFromNormal as TiltFromNormal,
-    ExpressionOutput as ExpressionOutput,
-    ForceOutput as ForceOutput,
-    ForceCombination as ForceCombination,
-    Squeeze as Squeeze,
-    JointFriction as JointFriction,
-)
-from .blocks import (
-    Block as Block,
-    TracedSystem as TracedSystem,
-    compile_diagram as compile_diagram,
-    from_symbolic as from_symbolic,
-)
-from .systems import (
-    DaePlant as DaePlant,
-    RobotPlant as RobotPlant,
-    CompliantPlant as CompliantPlant,
-    ContactPlant as ContactPlant,
-    ContactMaterial as ContactMaterial,
-    TrackingController as TrackingController,
-    ReferenceGenerator as ReferenceGenerator,
-    Sampling as Sampling,
-    ControlLimits as ControlLimits,
-    Encoders as Encoders,
-    ForceSensor as ForceSensor,
-    StateEstimator as StateEstimator,
-    Task as Task,
-    TaskController as TaskController,
-    Phase as Phase,
-    Move as Move,
-    Approach as Approach,
-    Press as Press,
-    Dwell as Dwell,
-    Release as Release,
-    Retreat as Retreat,
-)
-from .diagrams import (
-    make_closed_loop as make_closed_loop,
-    ClosedLoop as ClosedLoop,
-    Record as Record,
-)
+from .dae import DaeSystem as DaeSystem
+from .dae import Signal as Signal
+from .dae import Parameter as Parameter
+from .dae import find_structure as find_structure
+from .dae import NormalForm as NormalForm
+from .dae import ZeroDynamics as ZeroDynamics
+from .dae import dynamic_extension as dynamic_extension
+from .dae import linearize as linearize
+from .dae import drop_constraints as drop_constraints
+from .dae import share_forces as share_forces
+from .dae import TrackingLaw as TrackingLaw
+from .dae import poles as poles
+from .references import Reference as Reference
+from .references import ConstantReference as ConstantReference
+from .references import LineReference as LineReference
+from .references import PolylineReference as PolylineReference
+from .references import CircleReference as CircleReference
+from .references import SinusoidReference as SinusoidReference
+from .references import PointToPointReference as PointToPointReference
+from .references import WaypointsReference as WaypointsReference
+from .references import ExpressionReference as ExpressionReference
+from .references import CsvReference as CsvReference
+from .robots import RobotModel as RobotModel
+from .robots import LinkExpressions as LinkExpressions
+from .robots import Constraint as Constraint
+from .robots import PointOnSurface as PointOnSurface
+from .robots import FixedDistance as FixedDistance
+from .robots import CoincidentPoints as CoincidentPoints
+from .robots import WeldedFrames as WeldedFrames
+from .robots import JointCoupler as JointCoupler
+from .robots import AxisNormalToSurface as AxisNormalToSurface
+from .robots import RevoluteLoopJoint as RevoluteLoopJoint
+from .robots import PrismaticLoopJoint as PrismaticLoopJoint
+from .robots import RollingWheel as RollingWheel
+from .robots import Surface as Surface
+from .robots import Plane as Plane
+from .robots import Sphere as Sphere
+from .robots import Cylinder as Cylinder
+from .robots import Ellipsoid as Ellipsoid
+from .robots import Torus as Torus
+from .robots import ImplicitSurface as ImplicitSurface
+from .robots import MeasuredSurface as MeasuredSurface
+from .robots import Stage as Stage
+from .robots import FlexibleJoints as FlexibleJoints
+from .robots import DcMotors as DcMotors
+from .robots import ElectrohydraulicServos as ElectrohydraulicServos
+from .robots import JointPositions as JointPositions
+from .robots import PointCoordinates as PointCoordinates
+from .robots import AxisCoordinates as AxisCoordinates
+from .robots import SurfaceCoordinates as SurfaceCoordinates
+from .robots import TiltFromNormal as TiltFromNormal
+from .robots import ExpressionOutput as ExpressionOutput
+from .robots import ForceOutput as ForceOutput
+from .robots import ForceCombination as ForceCombination
+from .robots import Squeeze as Squeeze
+from .robots import JointFriction as JointFriction
+from .blocks import Block as Block
+from .blocks import TracedSystem as TracedSystem
+from .blocks import compile_diagram as compile_diagram
+from .blocks import from_symbolic as from_symbolic
+from .systems import DaePlant as DaePlant
+from .systems import RobotPlant as RobotPlant
+from .systems import CompliantPlant as CompliantPlant
+from .systems import ContactPlant as ContactPlant
+from .systems import ContactMaterial as ContactMaterial
+from .systems import TrackingController as TrackingController
+from .systems import ReferenceGenerator as ReferenceGenerator
+from .systems import Sampling as Sampling
+from .systems import ControlLimits as ControlLimits
+from .systems import Encoders as Encoders
+from .systems import ForceSensor as ForceSensor
+from .systems import StateEstimator as StateEstimator
+from .systems import Task as Task
+from .systems import TaskController as TaskController
+from .systems import Phase as Phase
+from .systems import Move as Move
+from .systems import Approach as Approach
+from .systems import Press as Press
+from .systems import Dwell as Dwell
+from .systems import Release as Release
+from .systems import Retreat as Retreat
+from .diagrams import make_closed_loop as make_closed_loop
+from .diagrams import ClosedLoop as ClosedLoop
+from .diagrams import Record as Record
 from .scene import start_meshcat as start_meshcat
-from .analysis.analyze import analyze as analyze
-from .analysis.contact_gains import contact_gains as contact_gains
+from .analysis import analyze as analyze
+from .analysis import contact_gains as contact_gains
 from .running.simulate import simulate as simulate
 from .running.rollout.rollout import rollout as rollout
-from .running import (
-    export_controller as export_controller,
-    write_page as write_page,
-)
-from .pictures import (
-    plot_runs as plot_runs,
-    make_animation as make_animation,
-)
-from .scenario import (
-    Scenario as Scenario,
-    load_scenario as load_scenario,
-    build_scenario as build_scenario,
-    new_scenario as new_scenario,
-    shipped_model as shipped_model,
-)
+from .running import export_controller as export_controller
+from .running import write_page as write_page
+from .pictures import plot_runs as plot_runs
+from .pictures import make_animation as make_animation
+from .scenario import Scenario as Scenario
+from .scenario import load_scenario as load_scenario
+from .scenario import build_scenario as build_scenario
+from .scenario import new_scenario as new_scenario
+from .scenario import shipped_model as shipped_model
 from .studies.sweep import sweep as sweep
 
 __version__: str

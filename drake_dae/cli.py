@@ -29,12 +29,12 @@ COMMANDS = {
     "schema": ("texts", "print the JSON Schema of a scenario, for editors"),
     "new": ("scenarios", "write a scenario for a robot of your own"),
     "analyze": ("scenarios", "examine a scenario without running it"),
-    "simulate": ("simulate", "run a scenario"),
+    "simulate": ("runs", "run a scenario"),
     "sweep": ("sweep", "run a scenario many times with other values"),
-    "plot": ("results", "draw signals of runs over each other, or make a film of one"),
-    "play": ("results", "play the animation of a run in the browser, or of several"),
-    "page": ("written", "write a scenario as one HTML file in which it runs"),
-    "export": ("written", "write controller, plant and loop as C99 or WebAssembly"),
+    "plot": ("runs", "draw signals of runs over each other, or make a film of one"),
+    "play": ("runs", "play the animation of a run in the browser"),
+    "page": ("scenarios", "write a scenario as one HTML file in which it runs"),
+    "export": ("scenarios", "write controller, plant and loop as C99 or WebAssembly"),
 }
 """Command -> its module, which has the functions of `COMMANDS` by its name, and what it does."""
 

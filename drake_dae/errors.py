@@ -1,9 +1,17 @@
 """The exceptions: each says what was wrong, which value, and what to do."""
 
-from typing import Any
+from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+
+def _array(values: ArrayLike) -> Any:
+    import numpy as np  # Only where there is an error: a command that lists files is quick.
+
+    return np.array(values, dtype=float)
 
 
 class DrakeDaeError(Exception):
@@ -63,7 +71,7 @@ class AssumptionError(DrakeDaeError):
     ) -> None:
         super().__init__(message)
         self.assumption = assumption
-        self.state = None if state is None else np.array(state, dtype=float)
+        self.state = None if state is None else _array(state)
         self.violation = violation
 
 
@@ -78,7 +86,7 @@ class InconsistentStateError(DrakeDaeError):
 
     def __init__(self, message: str, residual: ArrayLike) -> None:
         super().__init__(message)
-        self.residual = np.array(residual, dtype=float)
+        self.residual = _array(residual)
 
 
 class WiringError(DrakeDaeError, ValueError):
@@ -100,9 +108,9 @@ class SimulationError(DrakeDaeError):
     def __init__(self, message: str, time: float, state: ArrayLike) -> None:
         super().__init__(message)
         self.time = time
-        self.state = np.array(state, dtype=float)
+        self.state = _array(state)
 
-    def retold(self, message: str, time: float, state: ArrayLike) -> "SimulationError":
+    def retold(self, message: str, time: float, state: ArrayLike) -> SimulationError:
         """The same error with another text, time and state."""
         return type(self)(message, time, state)
 
@@ -117,7 +125,7 @@ class SingularityError(SimulationError):
 
     constraints: tuple[str, ...] = ()
 
-    def retold(self, message: str, time: float, state: ArrayLike) -> "SimulationError":
+    def retold(self, message: str, time: float, state: ArrayLike) -> SimulationError:
         error = super().retold(message, time, state)
         vars(error).update(constraints=self.constraints)
         return error
@@ -127,14 +135,14 @@ class PainleveError(SingularityError):
     """The Painleve paradox in a frictional contact: A(x) is not a P-matrix.
 
     Attributes:
-        outcome: A `dae.system.contacts.PainleveOutcome`; None if it is not known.
+        outcome: A `dae.contacts.PainleveOutcome`; None if it is not known.
     """
 
     def __init__(self, message: str, time: float, state: ArrayLike, outcome: Any = None) -> None:
         super().__init__(message, time, state)
         self.outcome = outcome
 
-    def retold(self, message: str, time: float, state: ArrayLike) -> "PainleveError":
+    def retold(self, message: str, time: float, state: ArrayLike) -> PainleveError:
         return type(self)(message, time, state, self.outcome)
 
 
@@ -148,10 +156,6 @@ class NonMinimumPhaseWarning(UserWarning):
 
 class AdviceWarning(UserWarning):
     """Recommended gains outside of the range of validity of the recommendation."""
-
-
-class NegligibleWarning(UserWarning):
-    """A number larger than round-off is treated as zero in the relative degrees."""
 
 
 class MachineCodeWarning(UserWarning):

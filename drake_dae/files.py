@@ -1,15 +1,12 @@
-"""Files that a user names: read if they are not too large, written if they replace none."""
+"""Files that a user names: opened if they are files, and read if they are not too large."""
 
 import errno
 import os
 import stat
 import zipfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO
-from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,42 +24,24 @@ MOST_RECORDED = 1 << 31
 
 
 def open_file(path: str | Path) -> BinaryIO:
-    """Opens a file for reading, if it is one.
-
-    Pipes, on which reading may block for ever, and devices, which may never end, are refused.
+    """Opens a file for reading: no pipe, which may block for ever, and no device without end.
 
     Raises:
         OSError: It cannot be read, or is no regular file.
         ValueError: The path contains a null byte, or characters that paths must not have.
     """
-    return open(path, "rb", opener=_open_regular)
-
-
-def _open_regular(path: str, flags: int) -> int:
-    """The descriptor of a file; `open` owns it, also where a signal ends the caller."""
-    # A pipe is opened without waiting for its writer.
-    number = os.open(path, flags | os.O_NONBLOCK)
-    try:
-        mode = os.fstat(number).st_mode
-        if stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        if not stat.S_ISREG(mode):
-            raise OSError(errno.EINVAL, "it is a pipe or a device, and no file", str(path))
-    except BaseException:
-        os.close(number)
-        raise
-    return number
+    mode = os.stat(path).st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "it is a pipe or a device, and no file", str(path))
+    return open(path, "rb")
 
 
 def check_file(
     path: str | Path, error: type[Exception], most: int = MOST_BYTES
 ) -> tuple[str, int, int]:
-    """Checks a file that another library will read: its size, and of an archive what is packed.
-
-    Args:
-        path: The file.
-        error: The class of exception to raise.
-        most: How many bytes it may have, also unpacked.
+    """Checks the size of a file that another library will read, and of an archive what is packed.
 
     Returns:
         Its name, the time of its last change in ns, and its size in bytes.
@@ -72,7 +51,8 @@ def check_file(
             status = os.fstat(file.fileno())
             size = status.st_size
             if size <= most and zipfile.is_zipfile(file):
-                size = max(size, sum(member.file_size for member in ZipFile(file).infolist()))
+                members = zipfile.ZipFile(file).infolist()
+                size = max(size, sum(member.file_size for member in members))
     except (OSError, ValueError, zipfile.BadZipFile) as cause:
         raise error(f"no file '{path}': {getattr(cause, 'strerror', None) or cause}") from None
     if size > most:
@@ -81,16 +61,7 @@ def check_file(
 
 
 def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
-    """The bytes of a file.
-
-    Args:
-        path: The file.
-        most: How many bytes it may have.
-
-    Raises:
-        OSError: It cannot be read, is no regular file, or is too large; see `open_file`.
-        ValueError: The path contains a null byte, or characters that paths must not have.
-    """
+    """The bytes of a file of at most this size; raises what `open_file` raises, or OSError."""
     with open_file(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
@@ -100,10 +71,7 @@ def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
 
 
 def read_text(path: str | Path, most: int = MOST_BYTES) -> str:
-    """The text of a file in UTF-8, without a byte order mark, and with single line feeds.
-
-    The arguments and errors are those of `read_bytes`; UnicodeDecodeError is a ValueError.
-    """
+    """The text of a file in UTF-8, without a byte order mark, and with single line feeds."""
     text = read_bytes(path, most).decode("utf-8-sig")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
@@ -148,35 +116,3 @@ def check_unwritten(files: Iterable[Path], force: bool) -> None:
         names = ", ".join(f"'{path}'" for path in there)
         are = "exists, and is" if len(there) == 1 else "exist, and are"
         raise ModelError(f"{names} {are} not overwritten; choose another name, or --force")
-
-
-def check_folder(folder: Path) -> None:
-    """Checks that a path is a folder, or can become one.
-
-    Raises:
-        ModelError: It is a file or a device, or a link that leads nowhere.
-    """
-    if os.path.lexists(folder) and not folder.is_dir():
-        raise ModelError(f"'{folder}' is a file, and no folder; name a folder")
-
-
-@contextmanager
-def complete(folder: Path, *names: str) -> Iterator[Path]:
-    """A temporary folder for files, all or those named, which are moved when they are complete.
-
-    Raises:
-        OSError: A file cannot be written; the error names the first of the files if it has no other
-            path.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = TemporaryDirectory(prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True)
-    try:
-        with temporary as place:
-            yield Path(place)
-            for name in names or os.listdir(place):
-                Path(place, name).replace(folder / name)
-    except OSError as error:
-        # Errors of NumPy, zipfile and Pillow have no path, or one in the removed temporary folder.
-        if str(error.filename or temporary.name).startswith(temporary.name):
-            error.filename, error.filename2 = str(folder.joinpath(*names[:1])), None
-        raise

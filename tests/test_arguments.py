@@ -27,8 +27,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 import drake_dae as dd
-from drake_dae.analysis import Analysis
-from drake_dae.analysis.report import Assumption
+from drake_dae.analysis import Analysis, Assumption
 from drake_dae.blocks.block import Block
 from drake_dae.dae import (
     Derivatives,

@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import struct
-import sys
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -48,44 +47,6 @@ def in_time():
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
-
-
-# Between the call of `open` and its `with`, the file is closed when it is freed.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_an_interruption_at_any_instruction_stays_one(tmp_path):
-    """A descriptor that is closed twice would end as "Bad file descriptor"."""
-    file = tmp_path / "data"
-    file.write_bytes(b"abc")
-
-    def interrupt_at(place):
-        """Reads, interrupted at an instruction of Python; returns how many there are."""
-        count = 0
-
-        def trace(frame, event, _):
-            nonlocal count
-            if Path(frame.f_code.co_filename).name not in ("files.py", "<frozen os>"):
-                return None
-            frame.f_trace_opcodes = True
-            if event == "opcode":
-                count += 1
-                if count == place:
-                    raise KeyboardInterrupt
-            return trace
-
-        known = sys.gettrace()
-        sys.settrace(trace)
-        try:
-            assert read_bytes(file) == b"abc"
-        finally:
-            sys.settrace(known)
-        return count
-
-    count = interrupt_at(0)
-    assert count > 50
-    for place in range(1, count + 1):
-        with pytest.raises(KeyboardInterrupt):
-            interrupt_at(place)
 
 
 @pytest.mark.parametrize("what", READERS)

@@ -262,9 +262,7 @@ class Analysis:
                 "undetermined_forces": list(sharing.undetermined),
             },
             "output_degrees": _by_name(system.output_signals, self.output_degrees),
-            "output_order": order
-            if order is None
-            else [system.output_signals[i].name for i in order],
+            "output_order": order and [system.output_signals[i].name for i in order],
             "zero_dynamics_dimension": self.zero_dynamics_dimension,
             "assumptions": [
                 {
@@ -309,32 +307,28 @@ def _by_name(signals: Sequence[Signal], values: Sequence[int] | None) -> dict[st
 
 
 def _margin(margin: RankMargin | None) -> dict[str, Any] | None:
-    return (
-        None
-        if margin is None
-        else {
-            "singular_value": float(margin.singular_value),
-            "relative": float(margin.relative),
-            "state": margin.state.tolist(),
-        }
-    )
+    if margin is None:
+        return None
+    return {
+        "singular_value": float(margin.singular_value),
+        "relative": float(margin.relative),
+        "state": margin.state.tolist(),
+    }
 
 
 def _friction(margin: ContactMargin | None) -> dict[str, Any] | None:
     """The distance from the Painleve paradox; a coefficient without a critical value is None."""
-    return (
-        None
-        if margin is None
-        else {
-            "reserve": margin.reserve,
-            "critical_friction": {
-                name: value if np.isfinite(value) else None
-                for name, value in margin.critical_friction.items()
-            },
-            "state": margin.state.tolist(),
-            "time": margin.time,
-        }
-    )
+    if margin is None:
+        return None
+    return {
+        "reserve": margin.reserve,
+        "critical_friction": {
+            name: value if np.isfinite(value) else None
+            for name, value in margin.critical_friction.items()
+        },
+        "state": margin.state.tolist(),
+        "time": margin.time,
+    }
 
 
 def _stability(stability: Stability) -> dict[str, Any]:

@@ -13,13 +13,7 @@ _WIDTH = 100
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts. The first `left` columns and those without a head are left-aligned.
-
-    Attributes:
-        head: A title per column.
-        rows: As many texts in each row.
-        left: The number of left-aligned columns.
-    """
+    """A table of texts. The first `left` columns and those without a head are left-aligned."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -28,20 +22,15 @@ class Table:
     def _is_left(self, column: int) -> bool:
         return column < self.left or not self.head[column]
 
-    def lines(self) -> list[str]:
-        """Returns the lines of the table; columns are as wide as necessary."""
+    def __str__(self) -> str:
         rows = [self.head, *self.rows]
         widths = [max(len(row[i]) for row in rows) for i in range(len(self.head))]
-        return [
-            "  ".join(
-                text.ljust(width) if self._is_left(i) else text.rjust(width)
-                for i, (text, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in rows
-        ]
-
-    def __str__(self) -> str:
-        return "\n".join(self.lines())
+        lines = []
+        for row in rows:
+            cells = enumerate(zip(row, widths, strict=True))
+            aligned = [t.ljust(w) if self._is_left(i) else t.rjust(w) for i, (t, w) in cells]
+            lines.append("  ".join(aligned).rstrip())
+        return "\n".join(lines)
 
     def to_markdown(self) -> str:
         """Returns the table in Markdown, for notebooks and GitHub."""

@@ -108,7 +108,7 @@ def compile_diagram(
 ) -> Block:
     """A diagram as one block: the expressions of its blocks, with wires in place of inputs.
 
-    The diagram may contain `TracedSystem`s, and every system that Drake converts to symbolic
+    The diagram may contain `TracedSystem` blocks, and all that Drake converts to symbolic
     expressions: its primitives, and LeafSystems templated on the scalar type. Nested diagrams are
     flattened. Systems on which no output depends, such as loggers, are left out. Output ports of
     other systems, such as a MultibodyPlant or a RandomSource, become inputs of the block, and so do

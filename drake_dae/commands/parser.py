@@ -1,15 +1,20 @@
-"""What the commands of `drake-dae` share: kinds of options, printed commands, long waits."""
+"""What the commands of `drake-dae` share: options, files that are written, waits that are told."""
 
 import argparse
+import os
 import shlex
 import shutil
 import sys
 import threading
 import time
+import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+
+from drake_dae.errors import ModelError
 
 PATIENCE = 2.0
 """The time in s after which a command tells on a terminal what it does."""
@@ -55,6 +60,53 @@ class Parser(argparse.ArgumentParser):
         self.flag("--json", text)
 
 
+def check_folder(folder: Path) -> None:
+    """Checks that a path is a folder, or can become one.
+
+    Raises:
+        ModelError: It is a file or a device, or a link that leads nowhere.
+    """
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise ModelError(f"'{folder}' is a file, and no folder; name a folder")
+
+
+@contextmanager
+def complete(folder: Path, name: str = "") -> Iterator[Path]:
+    """A temporary folder, whose files are moved into a folder when they are complete.
+
+    Raises:
+        OSError: A file cannot be written; the error names this file if it has no other path.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = TemporaryDirectory(prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True)
+    try:
+        with temporary as place:
+            yield Path(place)
+            for written in os.listdir(place):
+                Path(place, written).replace(folder / written)
+    except OSError as error:
+        # Errors of NumPy, zipfile and Pillow have no path, or one in the removed temporary folder.
+        if str(error.filename or temporary.name).startswith(temporary.name):
+            error.filename, error.filename2 = str(folder / name), None
+        raise
+
+
+def open_page(page: Path) -> None:
+    """Opens a file in the browser.
+
+    Raises:
+        ModelError: There is no browser.
+    """
+    address = page.resolve().as_uri()
+    try:
+        opened = webbrowser.open(address)
+    except webbrowser.Error:
+        opened = False
+    if not opened:
+        raise ModelError(f"found no browser here; open {address} in one")
+    print(f"opened {address}")
+
+
 def program() -> str:
     """The words before a command that is printed for the user, so that it works as printed."""
     script = Path(sys.argv[0])
@@ -71,10 +123,12 @@ def waiting(what: str) -> Iterator[None]:
     done, began = threading.Event(), time.perf_counter()
 
     def tell() -> None:
-        while not done.wait(PATIENCE / 2.0):
+        if done.wait(PATIENCE):
+            return
+        while not done.wait(0.5):
             passed = time.perf_counter() - began
-            if passed > PATIENCE:
-                print(f"\r{what} ... {passed:.0f} s", end="", file=sys.stderr, flush=True)
+            print(f"\r{what} ... {passed:.0f} s", end="", file=sys.stderr, flush=True)
+        print(file=sys.stderr)
 
     teller = threading.Thread(target=tell, daemon=True)
     if sys.stderr.isatty():
@@ -83,6 +137,5 @@ def waiting(what: str) -> Iterator[None]:
         yield
     finally:
         done.set()
-        if teller.is_alive() and time.perf_counter() - began > PATIENCE:
+        if teller.is_alive():
             teller.join()
-            print(file=sys.stderr)

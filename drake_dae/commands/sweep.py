@@ -1,42 +1,19 @@
 """`drake-dae sweep`: runs a scenario many times with other values."""
 
 import argparse
-import re
 import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from drake_dae.arrays import number_in
-from drake_dae.commands.parser import Parser
+from drake_dae.commands.parser import Parser, check_folder
 from drake_dae.errors import ModelError
-from drake_dae.files import check_folder
 from drake_dae.scenario.scenario import load_scenario
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.studies.runs import Outcome
 from drake_dae.studies.study import FILES
 from drake_dae.studies.sweep import sweep
 from drake_dae.studies.variations import parse_variations
-
-JOURNAL = "runs.db"
-"""The name of the file with the results, from which the command continues."""
-
-TIME_LIMIT = 3600.0
-"""The default time limit of a run, in s."""
-
-
-def _whole_number(text: str) -> int:
-    """A whole number; Python also reads 1_000 and digits of other alphabets."""
-    if not re.fullmatch("-?[0-9]{1,15}", text):
-        raise argparse.ArgumentTypeError(f"expected a whole number, got '{text}'")
-    return int(text)
-
-
-def _seconds(text: str) -> float:
-    value = number_in(text)
-    if value is None or value <= 0.0:
-        raise argparse.ArgumentTypeError(f"expected a positive number of seconds, got '{text}'")
-    return value
 
 
 def _options(parser: Parser) -> None:
@@ -51,18 +28,18 @@ def _options(parser: Parser) -> None:
         required=True,
     )
     chosen = parser.add_mutually_exclusive_group()
-    count: dict[str, Any] = {"type": _whole_number, "metavar": "COUNT"}
+    count: dict[str, Any] = {"type": int, "metavar": "COUNT"}
     random = "number of runs with random values, even in their ranges, instead of a grid"
     chosen.add_argument("--random", **count, help=random)
     together = "the first values of all keys, then the second ones, instead of a grid"
     chosen.add_argument("--together", action="store_true", help=together)
-    parser.add_argument("--seed", type=_whole_number, default=0, help="of random values (0)")
+    parser.add_argument("--seed", type=int, default=0, help="of random values (0)")
     parser.flag("--rollout", "as `simulate --rollout` does: many times as fast")
     parser.add_argument("--workers", **count, help="how many processes (default: one per core)")
     parser.add_argument(
         "--time-limit",
-        type=_seconds,
-        default=TIME_LIMIT,
+        type=float,
+        default=3600.0,
         metavar="SECONDS",
         help="how long a run may take by the clock until its process is ended (3600)",
     )
@@ -82,7 +59,7 @@ def _sweep(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     variations = parse_variations(options.vary, options.random, options.seed, options.together)
     folder = options.out or Path("runs") / f"{path.stem}-sweep"
     check_folder(folder)
-    file = folder / JOURNAL
+    file = folder / "runs.db"
     others = [name for name in FILES if (folder / name).exists()]
     if others and not file.exists():
         names = ", ".join(others)

@@ -5,7 +5,6 @@ import json
 
 from drake_dae.commands.parser import Parser
 from drake_dae.errors import ScenarioError
-from drake_dae.files import read_text
 from drake_dae.scenario.shipped import (
     DEFAULT_SCENARIO,
     description,
@@ -33,16 +32,14 @@ def _print_options(parser: Parser) -> None:
 
 def _print(options: argparse.Namespace) -> int:
     """Prints a shipped scenario with its comments, as the beginning of your own."""
+    from drake_dae.files import read_text
+
     path = find_scenario(options.scenario)
     try:
         print(f"{path}\n" if options.path else read_text(path), end="")
     except UnicodeDecodeError:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
     return 0
-
-
-def _schema_options(parser: Parser) -> None:
-    pass
 
 
 def _schema(options: argparse.Namespace) -> int:
@@ -56,5 +53,5 @@ def _schema(options: argparse.Namespace) -> int:
 COMMANDS = {
     "list": (_list_options, _list),
     "print": (_print_options, _print),
-    "schema": (_schema_options, _schema),
+    "schema": (lambda parser: None, _schema),
 }

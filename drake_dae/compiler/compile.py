@@ -241,8 +241,16 @@ def _rates(
     for key, updates in groups.items():
         places = tuple(i for block, _ in updates for i in parts[block.system])
         values = expressions.checked(partial(next_held, updates))
-        function = dense_function("update", arguments, expressions.expanded(values))
-        rates.append((UpdateRate(*key, function, places), values))
+        expanded = expressions.expanded(values)
+        # A block of several rates changes only a part of what it holds at each.
+        kept = [
+            j
+            for j, (new, i) in enumerate(zip(expanded[0].elements(), places, strict=True))
+            if not ca.is_equal(new, arguments[2][i])
+        ]
+        values, expanded = (values[0][kept], values[1]), [expanded[0][kept], *expanded[1:]]
+        function = dense_function("update", arguments, expanded)
+        rates.append((UpdateRate(*key, function, tuple(places[j] for j in kept)), values))
     for block in blocks.values():
         if (stepped := block.stepped) is not None:
             values = expressions.checked(partial(stepped_input, block, stepped.into))

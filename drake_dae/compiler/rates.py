@@ -49,4 +49,5 @@ def appended(column: ca.SX, values: ca.SX) -> tuple[ca.SX, slice]:
 def dense_function(name: str, arguments: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.Function:
     """A function with dense outputs that computes common subexpressions once."""
     dense = [ca.densify(value) for value in values]
-    return ca.Function(name, list(arguments), ca.cse(dense), {"cse": False})
+    shared = ca.cse(dense) if dense else []  # Of an empty list CasADi makes a number.
+    return ca.Function(name, list(arguments), shared, {"cse": False})

@@ -72,7 +72,7 @@ def linearized_eigenvalues(
     free, moved = coordinates(pinned.gradients(state), scale)
     # The tangent directions are known to round-off, relative to the scale of the states.
     least = np.where(moved == 0.0, 0.0, ROUNDED / LINEARIZED * scale[:, None] / scale[free])
-    sizes = pinned.sizes_of_slopes(state)
+    sizes = np.abs(slopes)
     off = LINEARIZED * (sizes @ np.maximum(np.abs(moved), least))[free]
     # The numbers of a model are rounded as well, such as the cosine of a right angle.
     units = scale[free][:, None] / scale[free]
@@ -320,7 +320,7 @@ class Equilibria:
         if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate))):
             return free.size
         left, sizes, right = np.linalg.svd(slopes)
-        terms = pinned.sizes_of_slopes(state) @ np.abs(state)
+        terms = np.abs(pinned.slopes(state)) @ np.abs(state)
         rates = np.abs(left.T @ rate) + ROUNDED * np.abs(left.T) @ (terms / scale)[free]
         count = 0
         for u, size, v, rest in zip(left.T, sizes, right, rates, strict=True):

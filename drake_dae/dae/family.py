@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import fields_at
 from drake_dae.errors import InconsistentStateError
@@ -22,8 +22,9 @@ NEARER, TRIES = 0.25, 6
 """If there is no consistent state for drawn numbers, they are moved towards the defaults by this
 factor, so often."""
 
-CORNERS, PLACES = 16, 64
-"""The number of random corners and of random places at which a box of bounds is searched."""
+CORNERS, STARTS, DESCENTS, STEP = 16, 3, 25, 1e-4
+"""How a box of bounds is searched: the number of random corners and of random places, of the places
+from which a margin is minimized, of steps, and the difference for its gradient."""
 
 SAME = 1e-3
 """Parameters that differ less from their defaults, relative to the others, do not decide."""
@@ -89,7 +90,8 @@ class Family:
     def lost(self, margin: OfMember, least: float) -> Deciding | None:
         """Returns parameters within their bounds where a margin is not above the least, or None.
 
-        It is evaluated at the ends of each range, and at corners and random places of the box.
+        The margin is tried at corners and random places of the box of bounds, and then minimized
+        from the lowest, as far as its gradient leads.
         """
         system, defaults = self._system, self._system.parameter_values
         names, places = list[str](), list[int]()
@@ -99,25 +101,29 @@ class Family:
                 names += [signal.name for signal in p.signals]
                 places += range(first, first + p.value.size)
         low, high = (bound[places] for bound in system.parameter_box)
-        count, random = len(places), np.random.default_rng(0)
-        default = (defaults[places] - low) / np.where(high > low, high - low, 1.0)
-        alone = [np.where(row > 0, end, default) for row in np.eye(count) for end in (0, 1)]
-        corners = random.integers(0, 2, (CORNERS, count))
-        boxes = [*alone, *np.unique(corners, axis=0), *random.uniform(size=(PLACES, count))]
+        count, width, random = len(places), high - low, np.random.default_rng(0)
+        default = (defaults[places] - low) / np.where(width > 0.0, width, 1.0)
 
         def at(box: FloatArray) -> float:
             values = defaults.copy()
-            values[places] = low + (high - low) * box
+            values[places] = low + width * box
             member = self._consistent(self._states[0], values)
             return np.inf if member is None else margin(*member)
 
-        lowest = min(boxes, key=at)
-        if at(lowest) > least:
-            return None
-        moved = np.abs(lowest - default)
-        rows = zip(names, low + (high - low) * lowest, defaults[places], moved, strict=True)
-        far = SAME * np.max(moved)
-        return Deciding(tuple((n, float(v), float(d)) for n, v, d, off in rows if off > far))
+        alone = [np.where(row > 0, end, default) for row in np.eye(count) for end in (0, 1)]
+        corners = random.integers(0, 2, (CORNERS, count))
+        tried = [*alone, *np.unique(corners, axis=0), *random.uniform(size=(CORNERS, count))]
+        lowest = sorted((at(box), k) for k, box in enumerate(tried))
+        for value, k in lowest[:STARTS]:
+            box, value = _lowest(at, np.array(tried[k], dtype=float), value, least, width > 0.0)
+            if not value > least:
+                moved = np.abs(box - default)
+                rows = zip(names, low + width * box, defaults[places], moved, strict=True)
+                far = SAME * np.max(moved)
+                return Deciding(
+                    tuple((n, float(v), float(d)) for n, v, d, off in rows if off > far)
+                )
+        return None
 
     @cached_property
     def _places(self) -> dict[str, list[int]]:
@@ -160,3 +166,27 @@ class Family:
         fields = fields_at(self._system, consistent, parameters)
         is_finite = all(np.all(np.isfinite(field)) for field in fields.values())
         return (consistent, parameters) if is_finite else None
+
+
+def _lowest(
+    at: Callable[[FloatArray], float], box: FloatArray, value: float, least: float, free: Booleans
+) -> tuple[FloatArray, float]:
+    """Descends in the unit box to the zeros of a linearized margin, until it is low enough."""
+    for _ in range(DESCENTS):
+        if not value > least:
+            break
+        slope = np.zeros(box.size)
+        for i in np.flatnonzero(free):
+            other = box.copy()
+            other[i] += STEP if box[i] < 0.5 else -STEP
+            slope[i] = (at(other) - value) / (other[i] - box[i])
+        square = float(slope @ slope)
+        if not 0.0 < square < np.inf:
+            break
+        # To the zero of the linearized margin, or as far as the margin falls.
+        trials = (np.clip(box - c * value / square * slope, 0.0, 1.0) for c in (1.0, 0.25, 0.06))
+        lower = next(((t, v) for t in trials if (v := at(t)) < value), None)
+        if lower is None:
+            break
+        box, value = lower
+    return box, value

@@ -36,10 +36,8 @@ def damped(
     system = acting_late(structure.system, latency)
     if damping is None and system is structure.system:
         return structure
-    layout, residual = (
-        DerivativeLayout(structure.constraint_degrees),
-        structure.manifold.residual_expression,
-    )
+    layout = DerivativeLayout(structure.constraint_degrees)
+    residual = structure.manifold.residual_expression
     force = ca.SX.zeros(len(structure.constraint_degrees))
     if damping is not None:
         gains = damping_gains(structure, damping)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, show, vector
 from drake_dae.dae.manifold import coordinates
-from drake_dae.dae.signals import DerivativeLayout, Indices, Signal
+from drake_dae.dae.signals import Indices, Signal
 from drake_dae.dae.structure import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
@@ -19,8 +18,7 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
 SINGULAR = 1e-12
-"""The equations of the motion are singular below this singular value, rows and columns scaled."""
-
+"""A loop of control and measured force has no solution below this singular value."""
 
 ComplexArray = np.typing.NDArray[np.complex128]
 
@@ -51,7 +49,16 @@ class LinearModel:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """The linear models of one system at one state and input."""
+    """The linear models of one system at one state and input.
+
+    Attributes:
+        descriptor: In x and v, with the constraints as rows of E without a derivative.
+        minimal: In the n - sum r_i states that are coordinates of N*.
+        index: The index of the DAE.
+        coordinates: The indices of these states.
+        basis: The derivatives of all states by them, shape (n, n - sum r_i).
+        state, rate, control, constraint_input: x, x', u and v where it is linearized.
+    """
 
     descriptor: LinearModel
     minimal: LinearModel
@@ -130,112 +137,63 @@ def linearize_loop(
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)
     plant = _PlantModel(law.structure, state, system.parameter_vector(parameters))
     n, m, p = system.num_states, system.num_constraints, system.num_controls
-    measured = [np.zeros(m)] if law.measured_force else []
-    moving = tuple(range(2 + len(measured)))
-    slope = law.function.derivative(law.function.output_names.index("control"), moving)
-    _, free_force = plant.motion(np.zeros(p))
+    free, _, by_control = plant.motion(np.zeros(p))
     # u = u_0 + K_v v and v = v_0 + beta u: the law is affine in the measured force.
-    first = law.function(plant.state, R, *measured, values)[0].copy()
-    gains = slope(plant.state, R, *measured, values)[0].reshape(p, -1).copy()
-    by_force = gains[:, n + R.size :] if measured else np.zeros((p, m))
-    around = np.eye(p) - by_force @ plant.by_control[n:]
-    if smallest_singular_value(around) < SINGULAR:
-        raise ModelError(
-            f"{system.name}: the measured force and the control do not determine each other at x = "
-            f"{show(plant.state)}; take another force gain"
-        )
-    control = np.asarray(np.linalg.solve(around, first + by_force @ free_force), dtype=np.float64)
-    if measured:
-        _, force = plant.motion(control)
-        gains = slope(plant.state, R, force, values)[0].reshape(p, -1).copy()
+    force = [np.zeros(m)] if law.measured_force else []
+    slope = law.function.derivative(
+        law.function.output_names.index("control"), range(2 + len(force))
+    )
+    control = law.function(plant.state, R, *force, values)[0].copy()
+    if law.measured_force:
+        gains = slope(plant.state, R, *force, values)[0].reshape(p, -1)[:, n + R.size :]
+        around = np.eye(p) - gains @ by_control[n:]
+        if smallest_singular_value(around) < SINGULAR:
+            raise ModelError(
+                f"{system.name}: the measured force and the control do not determine each other at "
+                f"x = {show(plant.state)}; take another force gain"
+            )
+        solved = np.linalg.solve(around, control + gains @ free[n:])
+        control = np.asarray(solved, dtype=np.float64)
+        force = [plant.motion(control)[0][n:]]
+    gains = slope(plant.state, R, *force, values)[0].reshape(p, -1)
+    by_force = gains[:, n + R.size :] if force else np.zeros((p, m))
     feedback = np.hstack([gains[:, :n], by_force])
     return plant.linearization(control, feedback, gains[:, n : n + R.size], law.reference_signals)
 
 
 class _PlantModel:
-    """The equations of motion at a state, in numbers.
-
-    With c the last derivatives of the constraints the motion solves
-
-        [[E, -g], [C, 0]] (x', v) = (f + h u, -c_t),    C = dc/dx,
-
-    where c_t is the part of c' from exogenous signals; a deviation solves the linearized equations.
-    """
+    """The motion of a plant at a state: (x', v) and their derivatives by x and u."""
 
     def __init__(
         self, structure: ConstraintStructure, state: ArrayLike | None, parameters: FloatArray
     ) -> None:
-        self.structure, self.system = structure, structure.system
+        self.structure, self.system, self.parameters = structure, structure.system, parameters
         system, manifold = self.system, structure.manifold
-        x = system.state_vector(structure.states[0] if state is None else state)
-        if not manifold.is_consistent(x, parameters):
-            residual = manifold.residual(x, parameters)
+        self.state = system.state_vector(structure.states[0] if state is None else state)
+        if not manifold.is_consistent(self.state, parameters):
             raise InconsistentStateError(
-                f"{system.name}: x = {show(x)} is not on N*, where the motion is; linearize at "
-                "`find_structure(system).manifold.project(x)`",
-                residual,
+                f"{system.name}: x = {show(self.state)} is not on N*, where the motion is; "
+                "linearize at `find_structure(system).manifold.project(x)`",
+                manifold.residual(self.state, parameters),
             )
-        self.state, self.parameters = x, parameters
-        m = system.num_constraints
-        outputs = {
-            "mass": system.mass_matrix,
-            "f": system.f,
-            "g": system.g,
-            "h": system.h,
-            "C": structure.elimination.constraint_gradient,
-            "c_t": self._carried,
-        }
-        self._mass, self._f, self._g, self._h, self._C, self._c_t = self._values(outputs)
-        matrix = np.block([[self._mass, -self._g], [self._C, np.zeros((m, m))]])
-        self._rows, self._columns = equilibration(np.abs(matrix))
-        self._matrix = matrix / self._rows[:, None] / self._columns
-        if not np.all(np.isfinite(matrix)) or smallest_singular_value(self._matrix) < SINGULAR:
+        motion = structure.derivatives
+        moved = ca.cse(motion.expand(ca.vertcat(motion.rate, motion.constraint_input)))
+        outputs = {"moved": moved, "by_state": ca.jacobian(moved, system.state)}
+        outputs["by_control"] = ca.jacobian(moved, motion.control)
+        inputs, pivot = {"control": motion.control}, structure.elimination.pivot
+        self._motion = system.trace("linearized motion", outputs, inputs, pivot, often=False)
+
+    def motion(self, control: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(x', v), and the derivatives by x and by u, shapes (n + m, n) and (n + m, p)."""
+        moved, *slopes = self._motion(self.state, control, self.parameters)
+        if not self._motion.is_valid:
             raise ModelError(
-                f"{system.name}: A(x) of Assumption (2) is singular at x = {show(x)}, so the "
-                "motion is not determined there; linearize at another state"
+                f"{self.system.name}: A(x) of Assumption (2) is singular at x = "
+                f"{show(self.state)}, so the motion is not determined there; linearize at another "
+                "state"
             )
-
-    def _values(self, outputs: dict[str, ca.SX], **inputs: FloatArray) -> list[FloatArray]:
-        """Expressions as matrices of numbers at the state."""
-        symbols = {name: self._symbols[name] for name in inputs}
-        dense = {name: ca.densify(value) for name, value in outputs.items()}
-        function = self.system.trace("linearization", dense, symbols, often=False)
-        values = function(self.state, *inputs.values(), self.parameters)
-        shapes = [value.shape for value in outputs.values()]
-        return [np.array(value).reshape(shape) for value, shape in zip(values, shapes, strict=True)]
-
-    @property
-    def _carried(self) -> ca.SX:
-        """c_t, shape (m, 1)."""
-        ends = DerivativeLayout(self.structure.constraint_degrees).ends.tolist()
-        return self.system.exogenous.rate(self.structure.manifold.residual_expression[ends, :])
-
-    @cached_property
-    def _symbols(self) -> dict[str, ca.SX]:
-        system = self.system
-        return {
-            "rate": ca.SX.sym("x'", system.num_states),
-            "constraint_input": ca.SX.sym("v", system.num_constraints),
-            "control": ca.SX.sym("u", system.num_controls),
-        }
-
-    def _solve(self, right: FloatArray) -> FloatArray:
-        """(x', v) of right sides, shape (n + m, k)."""
-        solved = np.linalg.solve(self._matrix, right / self._rows[:, None])
-        return np.asarray(solved / self._columns[:, None], dtype=np.float64)
-
-    @cached_property
-    def by_control(self) -> FloatArray:
-        """The derivatives of x' and v by u, shape (n + m, p)."""
-        m, p = self.system.num_constraints, self.system.num_controls
-        return self._solve(np.vstack([self._h, np.zeros((m, p))]))
-
-    def motion(self, control: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """x' and v at the state with a control."""
-        n = self.system.num_states
-        push = np.concatenate([self._f[:, 0] + self._h @ control, -self._c_t[:, 0]])
-        moved = self._solve(push[:, None])[:, 0]
-        return moved[:n], moved[n:]
+        by_state, by_control = (slope.reshape(moved.size, -1) for slope in slopes)
+        return moved, by_state, by_control
 
     def linearization(
         self,
@@ -245,44 +203,50 @@ class _PlantModel:
         inputs: Sequence[Signal],
     ) -> Linearization:
         """The linear models with du = feedback (dx, dv) + forward dw."""
-        system, structure, symbols = self.system, self.structure, self._symbols
-        rate, force = self.motion(control)
+        system, structure, x = self.system, self.structure, self.system.state
         n, m, p = system.num_states, system.num_constraints, system.num_controls
-        x, v = system.state, symbols["constraint_input"]
-        balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, symbols["control"])
-        balance -= ca.mtimes(system.mass_matrix, symbols["rate"])
-        constraint_rate = ca.mtimes(structure.elimination.constraint_gradient, symbols["rate"])
-        constraint_rate += self._carried
+        moved, by_state, by_control = self.motion(control)
+        rate, force = moved[:n], moved[n:]
+        v, u, r = ca.SX.sym("v", m), ca.SX.sym("u", p), ca.SX.sym("r", n)
+        balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
+        balance -= ca.mtimes(system.mass_matrix, r)
         outputs = {
+            "mass": system.mass_matrix,
+            "g": system.g,
+            "h": system.h,
             "balance": ca.jacobian(balance, x),
-            "kept": ca.jacobian(constraint_rate, x),
             "k": ca.jacobian(system.k, x),
             "z": ca.jacobian(system.outputs(v), x),
             "m": system.m,
         }
-        slope, constraint_slope, k_slope, z_slope, z_force = self._values(
-            outputs, rate=rate, constraint_input=force, control=control
+        dense = {name: ca.densify(value) for name, value in outputs.items()}
+        function = system.trace("linearization", dense, {"r": r, "v": v, "u": u}, often=False)
+        values = function(self.state, rate, force, control, self.parameters)
+        shapes = [value.shape for value in outputs.values()]
+        mass, g, h, slope, k_slope, z_slope, z_force = (
+            value.reshape(shape) for value, shape in zip(values, shapes, strict=True)
         )
         # In descriptor form, in (x, v).
-        none = np.zeros((m, m))
-        E = np.block([[self._mass, np.zeros((n, m))], [np.zeros((m, n + m))]])
-        A = np.block([[slope, self._g], [k_slope, none]])
-        B = np.vstack([self._h, np.zeros((m, p))])
-        C = np.hstack([z_slope, z_force])
-        no_feedthrough = np.zeros((system.num_outputs, forward.shape[1]))
+        E = np.block([[mass, np.zeros((n, m))], [np.zeros((m, n + m))]])
+        A = np.block([[slope, g], [k_slope, np.zeros((m, m))]])
+        B = np.vstack([h, np.zeros((m, p))])
         unknowns = (*system.state_signals, *system.constraint_input_signals)
         signals = (tuple(inputs), system.output_signals)
+        no_feedthrough = np.zeros((system.num_outputs, forward.shape[1]))
         descriptor = LinearModel(
-            E, A + B @ feedback, B @ forward, C, no_feedthrough, unknowns, *signals
+            E,
+            A + B @ feedback,
+            B @ forward,
+            np.hstack([z_slope, z_force]),
+            no_feedthrough,
+            unknowns,
+            *signals,
         )
-        # On N*: (dx', dv) = moved dx + by_control du, and dv out of du.
-        moved = self._solve(np.vstack([slope, -constraint_slope]))
+        # On N*: (dx', dv) = by_state dx + by_control du, and dv out of du.
         of_x, of_v = feedback[:, :n], feedback[:, n:]
-        around = np.eye(p) - of_v @ self.by_control[n:]
-        control_by_state = np.linalg.solve(around, of_x + of_v @ moved[n:])
-        control_by_input = np.linalg.solve(around, forward)
-        by_state = moved + self.by_control @ control_by_state
-        by_input = self.by_control @ control_by_input
+        around = np.eye(p) - of_v @ by_control[n:]
+        by_state = by_state + by_control @ np.linalg.solve(around, of_x + of_v @ by_state[n:])
+        by_input = by_control @ np.linalg.solve(around, forward)
         gradients = structure.manifold.gradients(self.state, self.parameters)
         free, basis = coordinates(gradients, structure.scale)
         minimal = LinearModel(
@@ -294,14 +258,5 @@ class _PlantModel:
             tuple(system.state_signals[i] for i in free),
             *signals,
         )
-        return Linearization(
-            descriptor,
-            minimal,
-            structure.index,
-            free,
-            basis,
-            self.state,
-            rate,
-            control,
-            force,
-        )
+        at = (self.state, rate, control, force)
+        return Linearization(descriptor, minimal, structure.index, free, basis, *at)

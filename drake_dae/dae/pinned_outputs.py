@@ -81,7 +81,6 @@ class PinnedOutputs:
             ca.substitute(derivatives.expand(unknown), derivatives.control, control)
             for unknown in (derivatives.rate, derivatives.constraint_input)
         )
-        self._moved = ca.vertcat(constraint_input, control)
         self._inputs = {"reference": goal}
         self.residual = system.trace("pinned outputs", {"residual": residual}, self._inputs)
         self.gradient = system.trace(
@@ -114,31 +113,13 @@ class PinnedOutputs:
 
     @cached_property
     def slope(self) -> TracedFunction:
-        """The derivatives of x' and (v, u) along a direction of state and reference."""
+        """The derivative of x' along a direction of state and reference."""
         system, dr = self.system, ca.SX.sym("dR", self.layout.reference_size)
         dx = ca.SX.sym("dx", system.num_states)
         at, along = ca.vertcat(system.state, self._R), ca.vertcat(dx, dr)
-        slopes = {
-            name: ca.jtimes(ca.cse(moving), at, along)
-            for name, moving in (("rate", self._rate), ("inputs", self._moved))
-        }
+        slopes = {"rate": ca.jtimes(ca.cse(self._rate), at, along)}
         inputs = {**self._inputs, "dx": dx, "dR": dr}
         return system.trace("slope of the pinned motion", slopes, inputs, often=False)
-
-    @cached_property
-    def balance(self) -> TracedFunction:
-        """E, the derivative of f + g v + h u - E x' by the state alone, and (g, h)."""
-        system, u = self.system, self.structure.derivatives.control
-        rate, v = ca.SX.sym("x'", system.num_states), ca.SX.sym("v", system.num_constraints)
-        balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
-        balance -= ca.mtimes(system.mass_matrix, rate)
-        outputs = {
-            "mass": system.mass_matrix,
-            "slope": ca.jacobian(balance, system.state),
-            "fields": ca.densify(ca.horzcat(system.g, system.h)),
-        }
-        inputs = {"rate": rate, "u": u, "v": v}
-        return system.trace("balance", outputs, inputs, often=False)
 
     @cached_property
     def usual_margins(self) -> tuple[float, float]:
@@ -232,24 +213,14 @@ class PinnedSet:
         return self.slopes_along(state, np.eye(state.size))
 
     def slopes_along(
-        self, state: FloatArray, directions: FloatArray, by: FloatArray | None = None, of: int = 0
+        self, state: FloatArray, directions: FloatArray, by: FloatArray | None = None
     ) -> FloatArray:
-        """Returns the derivatives of x', or of (v, u), along columns of dx, and of dR if given."""
+        """Returns the derivatives of x' along columns of dx, and of dR if given."""
         if by is None:
             by = np.zeros((self.reference.size, directions.shape[1]))
         slope = self.outputs.slope
         columns = [
-            slope.evaluate(state, self.reference, dx, dr, self.parameters)[of].copy()
+            slope.evaluate(state, self.reference, dx, dr, self.parameters)[0].copy()
             for dx, dr in zip(directions.T, by.T, strict=True)
         ]
         return np.array(columns).reshape(len(columns), -1).T
-
-    def sizes_of_slopes(self, state: FloatArray) -> FloatArray:
-        """Returns the sizes of the terms of dx'/dx before cancellation, shape (n, n)."""
-        point, n = self.point(state), state.size
-        values = (point.rate, point.control, point.constraint_input, self.parameters)
-        mass, slope, fields = (
-            m.reshape(n, -1) for m in self.outputs.balance.evaluate(state, *values)
-        )
-        moved = self.slopes_along(state, np.eye(n), of=1)
-        return np.abs(np.linalg.inv(mass)) @ (np.abs(slope) + np.abs(fields) @ np.abs(moved))

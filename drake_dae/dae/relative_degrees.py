@@ -5,7 +5,6 @@ its numbers at consistent states, with the default parameters and signals at res
 there must be zero with all other numbers.
 """
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -26,18 +25,16 @@ from drake_dae.dae.family import VISIBLE, Deciding, Family
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Region, Samples, as_matrix, fields_at
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import ModelError, NegligibleWarning
+from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.round_off import Sized, multiply
 
 MANY = 10
 """A function that is zero at this many random states is zero."""
 
-DOUBTFUL = 1e-13
-"""An entry above this, relative to the others in its row or column, may be intended."""
-
-Row = Callable[[FloatArray, FloatArray, float], Sized]
-"""A row of numbers at a state for values of all parameters, and the threshold for zero."""
+Row = Callable[[FloatArray, FloatArray], Sized]
+"""Rows of numbers at a state for values of all parameters, without round-off, with their sizes
+before cancellation."""
 
 
 def constraint_chains(
@@ -47,55 +44,50 @@ def constraint_chains(
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
     chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
-    undecided, by_numbers = list(range(system.num_constraints)), ByNumbers()
+    undecided, others = list(range(system.num_constraints)), _OtherNumbers()
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, explicit.g, x)
         by_control = lie_derivative_along(last, explicit.h, x)
         samples = Samples(Manifold(system, chains), guesses, region)
-        actions, next_undecided, stuck = InputActions(samples), [], []
+        actions, following, stuck = InputActions(samples), list[int](), list[int]()
         force_acts = actions.acts(by_force, actions.along(last, "g"))
         control_acts = actions.acts(by_control, actions.along(last, "h"))
         reached = _reached(explicit.g, f, last, x)
         for row, i in enumerate(undecided):
-            order = len(chains[i])
+            order, name = len(chains[i]), (names[i],)
             if force_acts[row].all():
-                by_numbers.refuse(i)
+                others.refuse(i)
                 continue
             if force_acts[row].any():
                 state = samples.states[int(np.argmin(force_acts[row]))]
-                raise Violation(
-                    1, ViolationKind.CONSTRAINT_DEGREE, (names[i],), order, state
-                ).error()
+                raise Violation(1, ViolationKind.CONSTRAINT_DEGREE, name, order, state).error()
             if control_acts[row].any():
                 state = samples.states[int(np.argmax(control_acts[row]))]
-                raise Violation(3, ViolationKind.EARLY_CONTROL, (names[i],), order, state).error()
+                raise Violation(3, ViolationKind.EARLY_CONTROL, name, order, state).error()
             for key, rows, assumption in (("g", by_force, 1), ("h", by_control, 3)):
                 if rows[row, :].nnz():
-                    violation = Violation(assumption, ViolationKind.NUMBERS, (names[i],), order)
-                    along = actions.along(chains[i][-1], key)
-                    by_numbers.examine(i, violation, samples, along)
-            next_undecided.append(i)
+                    violation = Violation(assumption, ViolationKind.NUMBERS, name, order)
+                    others.examine(i, violation, samples, actions.along(chains[i][-1], key))
+            following.append(i)
             if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
             ):
                 stuck.append(i)
-        if not next_undecided:
+        if not following:
             return chains, samples
-        if sum(len(chain) for chain in chains) + len(next_undecided) > system.num_states:
-            stuck = next_undecided
+        if sum(len(chain) for chain in chains) + len(following) > system.num_states:
+            stuck = following
         if stuck:
-            dependent = redundant_constraints(samples)
-            those = tuple(names[i] for i in stuck)
-            deciding = by_numbers.deciding(stuck)
+            those, dependent = tuple(names[i] for i in stuck), redundant_constraints(samples)
             violation = Violation(2, ViolationKind.NO_FORCE, those, combinations=dependent)
-            raise replace(violation, deciding=deciding).error()
-        for i in next_undecided:
+            raise replace(violation, deciding=others.deciding(stuck)).error()
+        for i in following:
             derivative = lie_derivative(chains[i][-1], f, x)
             if system.exogenous:
                 derivative += system.exogenous.rate(chains[i][-1])
             chains[i].append(derivative)
-        undecided = next_undecided
+        undecided = following
     return chains, Samples(Manifold(system, chains), guesses, region)
 
 
@@ -117,33 +109,31 @@ def output_chains(
     system = derivatives.system
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     names, count = [s.name for s in system.output_signals], system.num_outputs
-    controls = system.num_controls
-    moving = system.outputs(derivatives.constraint_input)
-    drift, control_matrix = ca.SX(count, 1), ca.SX(count, controls)
-    highest_derivatives = ca.SX(count, 1)
-    round_off, need_force = np.zeros((count, controls), dtype=bool), False
+    shape = (count, system.num_controls)
+    drift, control_matrix, highest = ca.SX(count, 1), ca.SX(*shape), ca.SX(count, 1)
+    round_off, need_force = np.zeros(shape, dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
-    by_numbers, actions = ByNumbers(), InputActions(samples, elimination)
+    others, actions = _OtherNumbers(), InputActions(samples, elimination)
     slopes = actions.numbers(actions.feedthrough)
+    moving = system.outputs(derivatives.constraint_input)
     following, rows = elimination.l_star, elimination.n_star
     undecided = list(range(count))
     while True:
         acts, still = np.asarray(slopes.any(axis=2)).T, []
         for row, i in enumerate(undecided):
+            order, name = len(chains[i]), (names[i],)
             if acts[row].all():
-                by_numbers.refuse(i)
-                drift[i] = following[row]
+                others.refuse(i)
+                drift[i], highest[i] = following[row], moving[row]
                 control_matrix[i, :] = rows[row, :]  # (16)
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
-                highest_derivatives[i] = moving[row]
             elif acts[row].any():
                 state = samples.states[int(np.argmin(acts[row]))]
-                order = len(chains[i])
-                raise Violation(4, ViolationKind.OUTPUT_DEGREE, (names[i],), order, state).error()
+                raise Violation(4, ViolationKind.OUTPUT_DEGREE, name, order, state).error()
             else:
                 if not chains[i] and rows[row, :].nnz():
-                    violation = Violation(4, ViolationKind.NUMBERS, (names[i],), 0)
-                    by_numbers.examine(i, violation, samples, actions.feedthrough, i)
+                    violation = Violation(4, ViolationKind.NUMBERS, name, 0)
+                    others.examine(i, violation, samples, actions.feedthrough, i)
                 still.append(i)
                 chains[i].append(following[row])
                 need_force = need_force or derivatives.has_unknowns(moving[row])
@@ -161,34 +151,25 @@ def output_chains(
                 continue
             if rows[row, :].nnz():
                 violation = Violation(4, ViolationKind.NUMBERS, (names[i],), len(chains[i]))
-                by_numbers.examine(i, violation, samples, actions.along(chains[i][-1], "h*"))
+                others.examine(i, violation, samples, actions.along(chains[i][-1], "h*"))
             # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
             # where nothing acts although the structure allows it.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
-            if (
-                used.numel() >= system.num_states
-                or not reached[row]
-                or (rows[row, :].nnz() and samples.dependent(used))
-            ):
+            is_full = used.numel() >= system.num_states or not reached[row]
+            if is_full or (rows[row, :].nnz() and samples.dependent(used)):
                 stuck.append(i)
         if stuck:
-            those, deciding = tuple(names[i] for i in stuck), by_numbers.deciding(stuck)
-            following = tuple(following_outputs(samples, those))
-            violation = Violation(
-                5, ViolationKind.NO_CONTROL, those, combinations=following, deciding=deciding
-            )
-            raise violation.error()
+            those = tuple(names[i] for i in stuck)
+            dependent = tuple(following_outputs(samples, those))
+            violation = Violation(5, ViolationKind.NO_CONTROL, those, combinations=dependent)
+            raise replace(violation, deciding=others.deciding(stuck)).error()
         undecided = still
-    every = tuple(tuple(chain) for chain in chains)
-    return OutputChains(every, drift, control_matrix, highest_derivatives, need_force, round_off)
+    every = tuple(map(tuple, chains))
+    return OutputChains(every, drift, control_matrix, highest, need_force, round_off)
 
 
 class InputActions:
-    """The numbers by which inputs act on functions, at states and for values of all parameters.
-
-    A `Row` is a function of state, parameters and the threshold for zero. It returns numbers in
-    which round-off is zero, with their sizes before cancellation.
-    """
+    """The numbers by which inputs act on functions, at states and for values of all parameters."""
 
     def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
         self._samples, self._system, self._scale = samples, samples.system, samples.scale
@@ -203,9 +184,9 @@ class InputActions:
         gradient = ca.jacobian(functions, system.state)
         trace = system.trace("sample", {"gradient": gradient}, often=False)
 
-        def row(state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
+        def row(state: FloatArray, parameters: FloatArray) -> Sized:
             if key == "h*":
-                field, _ = self._eliminated(state, parameters, negligible)
+                field, _ = self._eliminated(state, parameters)
             else:
                 value = fields_at(system, state, parameters)[key]
                 field = value, np.abs(value)
@@ -213,20 +194,20 @@ class InputActions:
             if not np.all(np.isfinite(gradients)):
                 nowhere = np.full((len(gradients), field[0].shape[1]), np.nan)
                 return nowhere, nowhere
-            return multiply(gradients, field, self._scale, negligible)
+            return multiply(gradients, field, self._scale, system.negligible)
 
         return row
 
-    def feedthrough(self, state: FloatArray, parameters: FloatArray, negligible: float) -> Sized:
+    def feedthrough(self, state: FloatArray, parameters: FloatArray) -> Sized:
         """Returns n* (12)."""
-        return self._eliminated(state, parameters, negligible)[1]
+        return self._eliminated(state, parameters)[1]
 
     def numbers(self, row: Row, pattern: ca.SX | None = None) -> FloatArray:
-        """Returns a row at the samples; zeros if an expression of it, if given, is zero."""
+        """Returns rows at the samples; zeros if an expression of them, if given, is zero."""
         samples, system = self._samples, self._system
         if pattern is not None and not pattern.nnz():
             return np.zeros((len(samples.states), *pattern.shape))
-        values = [row(x, system.parameter_values, system.negligible)[0] for x in samples.states]
+        values = [row(x, system.parameter_values)[0] for x in samples.states]
         for state, value in zip(samples.states, values, strict=True):
             if not np.all(np.isfinite(value)):
                 raise ModelError(
@@ -237,23 +218,21 @@ class InputActions:
         return np.array(values)
 
     def acts(self, pattern: ca.SX, row: Row) -> Booleans:
-        """Returns where a row is not zero, shape (functions, samples)."""
+        """Returns where rows are not zero, shape (functions, samples)."""
         return np.asarray(self.numbers(row, pattern).any(axis=2)).T
 
-    def _eliminated(
-        self, state: FloatArray, parameters: FloatArray, negligible: float
-    ) -> tuple[Sized, Sized]:
+    def _eliminated(self, state: FloatArray, parameters: FloatArray) -> tuple[Sized, Sized]:
         """h* and n*."""
         fields = fields_at(self._system, state, parameters)
         gradient, matrix = map(as_matrix, self._factors(state, parameters))
         try:
-            return eliminate_numbers(fields, gradient, matrix, self._scale, negligible)
+            return eliminate_numbers(fields, gradient, matrix, self._scale, self._system.negligible)
         except np.linalg.LinAlgError:
             h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
             return (h_star, h_star), (n_star * np.nan, n_star)
 
 
-class ByNumbers:
+class _OtherNumbers:
     """Constraints and outputs whose row is zero at the default parameters, but not at others."""
 
     def __init__(self) -> None:
@@ -263,31 +242,16 @@ class ByNumbers:
         self, index: int, violation: Violation, samples: Samples, row: Row, of: int = 0
     ) -> None:
         """Evaluates a row, or one of several, that is zero at the default parameters at others."""
-        if index in self._violations:
-            return
-        system = samples.system
 
         @np.errstate(all="ignore")  # Values that are not finite decide nothing.
-        def acts(state: FloatArray, parameters: FloatArray, negligible: float) -> bool:
-            value, size = (each[of] for each in row(state, parameters, negligible))
+        def acts(state: FloatArray, parameters: FloatArray) -> bool:
+            value, size = (each[of] for each in row(state, parameters))
             return bool(np.any(np.abs(value) > VISIBLE * size))
 
-        family = Family(samples.manifold, samples.states)
-        deciding = family.deciding(lambda x, p: acts(x, p, system.negligible))
-        if deciding:
-            self._violations[index] = replace(violation, deciding=deciding)
-        defaults = system.parameter_values
-        if system.negligible > DOUBTFUL and all(
-            acts(state, defaults, DOUBTFUL) for state in samples.states
-        ):
-            warnings.warn(
-                f"{system.name}: what acts on derivative {violation.order} of "
-                f"'{violation.names[0]}' is less than {system.negligible:g} of the others, the "
-                "system's `negligible`, and counts as zero. If it is meant, choose other units, or "
-                "set a smaller number",
-                NegligibleWarning,
-                stacklevel=5,
-            )
+        if index not in self._violations:
+            deciding = Family(samples.manifold, samples.states).deciding(acts)
+            if deciding:
+                self._violations[index] = replace(violation, deciding=deciding)
 
     def refuse(self, index: int) -> None:
         """Raises AssumptionError if a degree is another one for other parameters."""
@@ -302,13 +266,9 @@ class ByNumbers:
 
 def _reached(fields: ca.SX, drift: ca.SX, expressions: ca.SX, state: ca.SX) -> Booleans:
     """The expressions that an input along the fields can influence, by structure."""
-    influence = _pattern(drift, state)
+    influence = nonzeros(ca.jacobian_sparsity(drift, state))
     moved = nonzeros(fields.sparsity()).any(axis=1)
     for _ in range(state.numel()):
         moved = moved | influence[:, moved].any(axis=1)
-    return np.asarray((_pattern(expressions, state) & moved).any(axis=1))
-
-
-def _pattern(expression: ca.SX, state: ca.SX) -> Booleans:
-    """Which entries (rows) depend on which states (columns)."""
-    return nonzeros(ca.jacobian_sparsity(expression, state))
+    used = nonzeros(ca.jacobian_sparsity(expressions, state))
+    return np.asarray((used & moved).any(axis=1))

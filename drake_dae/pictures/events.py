@@ -6,7 +6,7 @@ from enum import Enum
 
 import numpy as np
 
-from drake_dae.analysis.limits import LimitKind, robot_limits
+from drake_dae.analysis import LimitKind, robot_limits
 from drake_dae.diagrams.record import Record
 from drake_dae.robots import RobotModel
 

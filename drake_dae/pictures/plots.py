@@ -18,7 +18,6 @@ from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, Recorded, phase_spans
 from drake_dae.errors import ModelError
-from drake_dae.files import complete
 from drake_dae.pictures.events import RunEvent, events_of, kinds_of
 from drake_dae.pictures.motion import ContactPath, contact_paths, follow
 from drake_dae.running.judgement import output_sizes
@@ -116,9 +115,9 @@ def save_plots(
     figures = figures_of_run(record, predicted, limits, accuracy, events)
     if paths := contact_paths(motion):
         figures["path.png"] = plot_paths(paths)
-    with complete(folder, *figures) as place:
-        for name, figure in figures.items():
-            figure.savefig(place / name, dpi=110)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures.items():
+        figure.savefig(folder / name, dpi=110)
 
 
 def figures_of_run(

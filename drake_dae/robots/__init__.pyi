@@ -2,7 +2,7 @@
 
 from .actuation.drives import DcMotors as DcMotors
 from .actuation.drives import ElectrohydraulicServos as ElectrohydraulicServos
-from .actuation.flexible_joints import FlexibleJoints as FlexibleJoints
+from .actuation.drives import FlexibleJoints as FlexibleJoints
 from .actuation.stage import AttachedStage as AttachedStage
 from .actuation.stage import Stage as Stage
 from .actuation.stage import chain as chain

@@ -143,16 +143,14 @@ def check_outputs(
     if nu == 0 and count + forces:
         raise ModelError(
             f"{name}: there are no actuators, so no output can be controlled, but {count} "
-            f"positions and {forces} constraint forces are outputs. To simulate it leave "
-            "`positions` empty, and `forces` out; to steer it give joints actuators, by "
-            "plant.AddJointActuator before Finalize or a <transmission> in its file"
+            f"positions and {forces} constraint forces are outputs. To simulate it leave both out; "
+            "to steer it give joints actuators, by plant.AddJointActuator or a <transmission>"
         )
     if is_chosen:
         if not 0 < count + forces < nu:
             raise ModelError(
                 f"{name}: control_weights choose among the controls of more actuators than "
-                f"outputs, but there are {nu} actuators and {count + forces} outputs; leave them "
-                "out"
+                f"outputs, but there are {nu} actuators and {count + forces} outputs"
             )
         return
     rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if of_joints else 0
@@ -160,24 +158,16 @@ def check_outputs(
         actuators = ", ".join(signal.name for signal in links.actuator_signals)
         raise ModelError(
             f"{name}: the {of_joints} actuators {actuators} move the joints in only {rank} "
-            "independent ways, for example if two drive one joint; leave one out, or give "
-            "control_weights and fewer outputs"
-        )
-    if forces > nu:
-        raise ModelError(
-            f"{name}: {forces} constraint forces are outputs, but {nu} actuators can steer {nu} "
-            "outputs; name in `forces` those to be steered ([] is none), remove constraints, or "
-            "add actuators"
+            "independent ways; leave one out, or give control_weights and fewer outputs"
         )
     if count + forces and count + forces != nu:  # A robot that is only simulated needs no outputs.
         names = ", ".join(signal.name for signal in positions) or "none"
-        fewer = ". For fewer, control_weights choose the control" if count + forces < nu else ""
-        if forces and count + forces > nu:
-            fewer = ". Name in `forces` those that shall be steered; [] is none"
+        remedy = "for fewer, control_weights choose the control"
+        if count + forces > nu:
+            remedy = "name in `forces` those that shall be steered, [] for none, or add actuators"
         raise ModelError(
-            f"{name}: {nu} actuators can steer {nu} outputs. The {forces} constraint forces "
-            f"are outputs already, so {nu - forces} position outputs are needed; given are "
-            f"{count} ({names}){fewer}"
+            f"{name}: {nu} actuators can steer {nu} outputs, not {forces} constraint forces and "
+            f"{count} positions ({names}); {remedy}"
         )
 
 

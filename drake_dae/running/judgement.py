@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from drake_dae.analysis.limits import LimitKind, SignalRange
+from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.arrays import FloatArray, by_columns
 from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record

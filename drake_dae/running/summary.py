@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_dae.analysis.limits import LimitKind, SignalRange
-from drake_dae.analysis.tables import Table
+from drake_dae.analysis import LimitKind, SignalRange, Table
 from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record
 from drake_dae.running.judgement import (
@@ -127,7 +126,7 @@ class RunSummary:
         why = f"; as {off[0]}" if off and not self.missed else ""
         note = "late: in the second half; off prediction: from the error that the gains alone leave"
         head = ["tracking error", "unit", "start", "largest", "late rms", "off prediction"]
-        table = Table([*head, "tolerated"], rows, left=2).lines()
+        table = str(Table([*head, "tolerated"], rows, left=2)).splitlines()
         return [*table, fill(f"{note}{why}", WIDTH, subsequent_indent="  ")] if rows else []
 
     @property
@@ -147,7 +146,7 @@ class RunSummary:
             remark = f"cut off for {cut:.3g} s" if cut else ""
             rows.append([r.signal.name, r.signal.unit or "1", *texts, limit, remark])
         head = ["force or control", "unit", "least", "largest", "limit", ""]
-        return Table(head, rows, left=2).lines() if rows else []
+        return str(Table(head, rows, left=2)).splitlines() if rows else []
 
     def _cut_off(self, limited: SignalRange) -> float:
         """The time for which a control was cut off at its limit, in s."""

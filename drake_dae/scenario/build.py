@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, cast
 
 import casadi as ca
@@ -18,6 +17,7 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import (
     ConstraintStructure,
+    DaeSystem,
     Structure,
     TrackingLaw,
     find_constraint_structure,
@@ -277,6 +277,20 @@ def _task_controller(
     return TaskController(made, law, free_law, sample_period=period or 1e-3)
 
 
+class _NoLaw:
+    """Has of a law what records ask for, its system; all else of a law is an error."""
+
+    structure = None
+
+    def __init__(self, system: DaeSystem) -> None:
+        self.system = system
+
+    def __getattr__(self, name: str) -> Any:
+        raise ModelError(
+            f"robot.actuators is [], and there is no law with {name}; simulate runs it"
+        )
+
+
 class _NoController(TracedSystem, Controller):
     """Steers nothing: the place of a controller in the loop of a mechanism without drive."""
 
@@ -284,8 +298,7 @@ class _NoController(TracedSystem, Controller):
 
     def __init__(self, structure: ConstraintStructure) -> None:
         self._structure = structure
-        # Of a law, records ask for its system.
-        self.law = cast(TrackingLaw, SimpleNamespace(system=structure.system, structure=None))
+        self.law = cast(TrackingLaw, _NoLaw(structure.system))
         x = ca.SX.sym("x", structure.system.num_states)
         ports = {"estimated_state": x}, {"control": NOTHING}
         super().__init__(Block("no_controller", *ports))

@@ -1,6 +1,6 @@
 """Builds a scenario so that a person can move references, surfaces and links while it runs."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,41 +65,13 @@ def build_commanded(scenario: Scenario) -> Commanded:
         else:
             extended = result
     try:
-        return _build(scenario, extended, left_out)
+        completed, loop = build_completed(extended, commanded=True)
     except DrakeDaeError as error:
-        commanded = _build(scenario, scenario, left_out)  # Its own errors come first.
-        reasons = [f"{name}: {error}" for name in _PARTS]
-        return replace(commanded, left_out=tuple(reasons))
-
-
-def _build(original: Scenario, extended: Scenario, left_out: Sequence[str]) -> Commanded:
-    """Builds the loop of an extended scenario, with the initial state of the original one."""
-    completed, loop = build_completed(extended, commanded=True)
+        completed, loop = build_completed(scenario, commanded=True)  # Its own errors come first.
+        left_out = [f"{name}: {error}" for name in _PARTS]
     # The original exogenous signals decide whether the loop starts at rest.
-    initial = replace(completed.scenario, exogenous=original.exogenous)
+    initial = replace(completed.scenario, exogenous=scenario.exogenous)
     return Commanded(completed.scenario, loop, start_scenario(initial, loop), tuple(left_out))
-
-
-def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
-    """Makes the positions of surfaces constant exogenous signals; or returns why it cannot.
-
-    In a compliant contact, positions are parameters of the plant, and not of the law.
-    """
-    if scenario.plant.material is not None:
-        return scenario
-    for part, what in ((scenario.task, "a task"), (scenario.estimator, "an estimator")):
-        if part is not None:
-            return (
-                f"none, since {what} does not know how a surface moves, and an ideal contact needs "
-                "a law that does; with `plant: !CompliantContact` they are dragged"
-            )
-    moving = dict[str, Any]()
-    for constraint in scenario.constraints:
-        if isinstance(constraint, PointOnSurface):
-            position = constraint.parameters[0]
-            if position.name not in scenario.exogenous:
-                moving[position.name] = [ConstantReference(x) for x in position.value.tolist()]
-    return replace(scenario, exogenous={**scenario.exogenous, **moving})
 
 
 def _with_friction(scenario: Scenario) -> Scenario | str:
@@ -116,6 +88,25 @@ def _with_friction(scenario: Scenario) -> Scenario | str:
     if scenario.actuation:
         return "none, since the law would differentiate it; give the constraint a friction"
     return replace(scenario, constraints=constraints)
+
+
+def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
+    """Makes the positions of surfaces constant exogenous signals; or returns why it cannot."""
+    if scenario.plant.material is not None:
+        return scenario  # Of a compliant contact they are parameters of the plant alone.
+    for part, what in ((scenario.task, "a task"), (scenario.estimator, "an estimator")):
+        if part is not None:
+            return (
+                f"none, since {what} does not know how a surface moves, and an ideal contact needs "
+                "a law that does; with `plant: !CompliantContact` they are dragged"
+            )
+    moving = dict[str, Any]()
+    for constraint in scenario.constraints:
+        if isinstance(constraint, PointOnSurface):
+            position = constraint.parameters[0]
+            if position.name not in scenario.exogenous:
+                moving[position.name] = [ConstantReference(x) for x in position.value.tolist()]
+    return replace(scenario, exogenous={**scenario.exogenous, **moving})
 
 
 def _with_pushes(scenario: Scenario) -> Scenario | str:
@@ -136,4 +127,4 @@ _PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
     "surfaces that are dragged": _with_moving_surfaces,
     "links that are pushed": _with_pushes,
 }
-"""Name -> function that adds this part to a scenario, or returns why it cannot; in this order."""
+"""What a person changes -> the function that adds it to a scenario, or says why it cannot."""

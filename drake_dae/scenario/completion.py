@@ -523,21 +523,15 @@ def _check_forces(names: Sequence[str], posture: Posture) -> None:
     """Refuses force outputs z_2 = S lambda that depend on each other, with their names."""
     left, values, _ = np.linalg.svd(posture.forces)
     rank = int(np.count_nonzero(values > 1e-6 * np.max(values, initial=0.0)))
-    if rank == len(names):
-        return
-    weights = np.linalg.norm(left[:, rank:], axis=1)
-    dependent = [name for name, weight in zip(names, weights, strict=True) if weight > 1e-6]
-    text = (
-        f"{', '.join(dependent)} depend on each other at the start: of {len(names)} force outputs "
-        f"only {rank} are independent. Leave out {dependent[-1]}"
-    )
-    if rank < len(names) - 1:
-        text += f" and {len(names) - rank - 1} more"
-    text += (
-        "; what squeezes between contacts of one plane cannot do is a force across it, as a "
-        "!ForceCombination of the forces that are normal to it"
-    )
-    raise ScenarioError(("forces", text))
+    if rank < len(names):
+        weights = np.linalg.norm(left[:, rank:], axis=1)
+        dependent = [name for name, weight in zip(names, weights, strict=True) if weight > 1e-6]
+        text = (
+            f"{', '.join(dependent)} depend on each other at the start: of {len(names)} force "
+            f"outputs {rank} are independent. Leave out {len(names) - rank} of them; a force "
+            "across several contacts of one plane is a !ForceCombination of those normal to it"
+        )
+        raise ScenarioError(("forces", text))
 
 
 def _why_none(
@@ -548,24 +542,13 @@ def _why_none(
     lacking = rows.given + missing - ways
     if lacking <= 0:
         names = ", ".join(rows.signals[row].name for row in named) or "the constraints"
-        text = (
-            f"{missing} are missing, and no positions of joints beside {names} leave B(x) regular"
+        return "outputs", (
+            f"{missing} are missing, and no positions of joints beside {names} leave B(x) regular; "
+            "name others under outputs"
         )
-        return "outputs", f"{text}; name others under outputs"
-    held = [*named, *posture.independent(named, rows.points(posture), ways - len(named))]
-    held += posture.independent(held, rows.joints, ways - len(held))
-    found: list[str] = []
-    for place, signal in enumerate(bound.force_signals):
-        more = np.vstack([posture.forces, np.eye(bound.size)[place]])
-        tried = replace(posture, forces=more)
-        if len(found) < lacking and tried.independence(held) > INDEPENDENT:
-            posture, found = tried, [*found, signal.name]
-    text = (
+    return "forces", (
         f"{rows.given + missing} outputs more are needed, one for each actuator that is left, but "
         f"on its constraints the robot moves in {ways} ways: at most {ways} can be positions, and "
-        f"{lacking} more must be forces"
+        f"{lacking} more must be forces, of {', '.join(s.name for s in bound.force_signals)}; or "
+        "leave actuators out by robot.actuators"
     )
-    if len(found) == lacking:
-        return "forces", f"{text}. Name them under forces, for example {', '.join(found)}"
-    fewer = "fewer are independent there, so leave actuators out by robot.actuators"
-    return "forces", f"{text}; {fewer}"

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from drake_dae.analysis.contact_gains import DAMPING, DECAY, FORCE, ContactGains, contact_gains
+from drake_dae.analysis.gains import DAMPING, DECAY, FORCE, ContactGains, contact_gains
 from drake_dae.analysis.sampled_loop import EVERY
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Structure

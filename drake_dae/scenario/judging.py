@@ -1,8 +1,7 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, is_dataclass
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -10,17 +9,24 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context
 
-from drake_dae.analysis.analyze import along, analyze, examine
-from drake_dae.analysis.limits import (
+from drake_dae.analysis import (
+    Analysis,
     LimitKind,
     LimitsAlong,
+    Part,
     SignalLimits,
     SignalRange,
+    Table,
+    along,
+    analyze,
+    count_of,
+    digits,
+    examine,
     limits_along,
     robot_limits,
+    to_markdown,
+    to_text,
 )
-from drake_dae.analysis.report import Analysis
-from drake_dae.analysis.tables import Part, Table, count_of, digits, to_markdown, to_text
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal, ZeroDynamics, find_structure
 from drake_dae.diagrams.closed_loop import ClosedLoop
@@ -45,7 +51,6 @@ from drake_dae.scenario.model import (
 )
 from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.systems.control.contract import PhaseChange
 from drake_dae.trace.functions import TracedFunction
 
 SAMPLES, MOST_SAMPLES = 1001, 20_000
@@ -63,10 +68,6 @@ BREAK = 0.01
 
 WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
 """The remedy for a link behind a surface."""
-
-AT_ONCE, AWAY = 0.1, 1e-3
-"""A touch within this time of the start of its phase, in s, and as far before the surface, in m, is
-none: a tool does not come that far."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +105,10 @@ class Feasibility:
         )
 
     @property
-    def wrong_sides(self) -> tuple[str, ...]:
-        """The problems with links behind a surface."""
-        return tuple(f"{link}: {WRONG_SIDE}" for link in self.behind)
-
-    @property
     def problems(self) -> tuple[str, ...]:
         """The problems, one text each; empty if there are none."""
         found = [*self.analysis.problems, *(str(r.excess) for r in self.ranges if r.excess)]
-        found += [*self.wrong_sides, *filter(None, [self.gains])]
+        found += [*(f"{link}: {WRONG_SIDE}" for link in self.behind), *filter(None, [self.gains])]
         if self.slowing is not None:
             found.append(f"most of all {self.slowing.excess}; {self.slowing.remedy}")
         return tuple(found)
@@ -312,7 +308,6 @@ def judge_run(
             notes.append(f"{constraint.name}: {surface.remark}")
     notes += [_beyond_edge(constraint, model, record) for constraint in model.constraints]
     notes += _remarks([scenario.references, scenario.exogenous, scenario.task])
-    notes += _early_touches(changes)
     ended = failure
     if statistics is not None:
         ended = ended or "interrupted" * (statistics.interrupted is not None)
@@ -388,19 +383,6 @@ def _remarks(value: Any) -> Iterator[str]:
     elif is_dataclass(value):
         for field in fields(value):
             yield from _remarks(getattr(value, field.name))
-
-
-def _early_touches(changes: Sequence[PhaseChange]) -> Iterator[str]:
-    """Touches that a task felt as soon as a phase began, away from the surface."""
-    for before, after in pairwise(changes):
-        lasted, away = after.time - before.time, after.distance
-        touched = after.in_contact > before.in_contact
-        if touched and not after.failed and lasted < AT_ONCE and away > AWAY:
-            yield (
-                f"{before.phase} felt {after.force:.3g} N {1e3 * lasted:.3g} ms after its start, "
-                f"{1e3 * away:.3g} mm before the surface of the model: a bias of the force sensor "
-                "feels like a touch; task.tare_time finds it"
-            )
 
 
 def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:

@@ -9,9 +9,7 @@ import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.tree import BodyIndex
 
-from drake_dae.analysis.analyze import examine
-from drake_dae.analysis.limits import robot_limits
-from drake_dae.analysis.report import Analysis
+from drake_dae.analysis import Analysis, examine, robot_limits
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import DaeSystem, PinnedMotion, Structure, ZeroDynamics, find_structure

@@ -5,12 +5,12 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from math import ceil, log10, pi
 from pathlib import Path
 from time import process_time
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -58,17 +58,14 @@ from drake_dae.scenario.typed_yaml import dump_yaml
 
 SurfaceKind = Literal["plane", "cylinder", "sphere"]
 
+# Joints of grippers and wheels are locked, if others are left. A hand may be the link that the last
+# joint of an arm turns, a finger not. Frames at the end of an arm have these names, the best first.
 _NOT_OF_AN_ARM = re.compile(r"grip|finger|thumb|jaw|knuckle|hand|wheel|caster", re.IGNORECASE)
-"""Names of joints of grippers and wheels: they are locked, if others are left."""
-
-# A hand may be the link that the last joint of an arm turns, a finger not.
 _FINGER = re.compile(r"finger|thumb|jaw|knuckle|inner|outer", re.IGNORECASE)
-
 _TOOLS = [
     re.compile(word, re.IGNORECASE)
     for word in ("tcp", "tool", "end_?effector|eef|(^|_)ee(_|$)", "flange", "tip")
 ]
-"""Vendors' names of the frame at the end of an arm, the best first."""
 
 # A table, walls around, and a ceiling: axis of the normal, its sign, and the preference.
 _NORMALS = (
@@ -105,24 +102,23 @@ def new_scenario(
 
     The base is the free root body of the file. The working chain is the longest one without mimic
     joints, grippers and wheels, or the one that ends at `tip`; all other joints are locked. If the
-    last joint does not move the tip, the far end of its link is the tip. The surface is placed
-    where the tip reaches it with its axis along the normal, and the directions of the task are most
-    independent. Circle and force keep a margin to the limits of the joints. `complete_scenario`
-    finds nothing in the way along the circle.
+    last joint does not move the tip, the far end of its link is the tip. The surface is where the
+    tip reaches it with its axis along the normal, and the directions of the task are most
+    independent. Circle and force keep a margin to the limits of the joints.
 
     Args:
         file: The robot's file, as a scenario has it.
         surface: The surface: "plane", "cylinder" or "sphere".
         tip: The frame in contact; found if empty.
         point: The point in that frame, m, shape (3,).
-        folder: The folder in which the text will be saved: a robot's file below it gets a name
-            relative to it. Without one the name is absolute, and the text may be saved anywhere.
+        folder: Where the text will be saved: a robot's file below it gets a name relative to it.
+            Without one the name is absolute.
         progress: Called with a phrase on each step.
         seconds: After this processor time no further place is tried.
 
     Returns:
-        The scenario, and its text with a comment on each choice; `load_scenario` reads the same
-        scenario from it.
+        The scenario, in whose way `complete_scenario` finds nothing, and its text with a comment on
+        each choice, which `load_scenario` reads back equal.
 
     Raises:
         ScenarioError: The file cannot be read or has no such tip, or no place is reached; the
@@ -168,10 +164,8 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
     plant, robot = _read(file)
     why = {"packages": "where package://<name>/ leads", "leave_out": "what no equation has"}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
-    joints, bodies = (
-        joints_of(plant),
-        [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())],
-    )
+    joints = joints_of(plant)
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     above = {joint.child_body().index(): joint for joint in joints}
     body_of = dict(zip(unique_names(plant, bodies), bodies, strict=True))
     # The base.
@@ -187,8 +181,7 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
     if len(roots) > 1:
         raise ModelError(
             f"{len(roots)} bodies are held by nothing ({', '.join(roots[:8])}), and a new scenario "
-            "holds one; copy a shipped scenario with several bodies, as two_arms_free_box, and "
-            "write robot.base or robot.free"
+            "holds one; copy two_arms_free_box, and write robot.base or robot.free"
         )
     if roots:
         robot, why["base"] = replace(robot, base=RobotPlacement(roots[0])), "nothing holds it"
@@ -197,12 +190,10 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
     coupled = {name for c in couplings for name in (c.follower, c.leader)}
     works = [j for j in joints if _has_room(j) and names[j.index()] not in coupled]
     if not works:
-        mimics = (
-            f"; joints that mimic, or are mimicked: {', '.join(sorted(coupled))}" if coupled else ""
-        )
+        mimics = f" (mimicking: {', '.join(sorted(coupled))})" if coupled else ""
         raise ModelError(
-            f"no joint turns or slides for itself, so that there is nothing to drive{mimics}; "
-            "write a scenario by hand, in which robot.actuators names what is driven"
+            f"no joint turns or slides for itself{mimics}; write a scenario by hand, in which "
+            "robot.actuators names what is driven"
         )
 
     def path(body: RigidBody) -> list[Joint]:
@@ -232,12 +223,10 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
     skipped = {names[joint.index()] for joint in chain} | {c.follower for c in couplings}
     locked = {}
     for joint in joints:
-        if (
-            isinstance(joint, RevoluteJoint | PrismaticJoint)
-            and names[joint.index()] not in skipped
-        ):
+        is_simple = isinstance(joint, RevoluteJoint | PrismaticJoint)
+        if is_simple and (name := names[joint.index()]) not in skipped:
             low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
-            locked[names[joint.index()]] = float(min(max(0.0, low), high))
+            locked[name] = float(min(max(0.0, low), high))
     why["locked"] = "m or rad; all that is not of the chain, or mimics"
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
     is_driven = all(joint.index() in driven for joint in chain)
@@ -251,9 +240,9 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
     elif directions < 2:
         moves = "in one direction alone" if directions else "nowhere"
         raise ModelError(
-            f"the tip '{tip}' moves {moves} by {len(chain)} joints "
-            f"({', '.join(names[joint.index()] for joint in chain)}), and a contact takes one "
-            "direction to press and another to move along; give another tip, as --tip LINK:x,y,z"
+            f"the tip '{tip}' moves {moves} by its joints "
+            f"({', '.join(names[joint.index()] for joint in chain)}), and a contact takes two "
+            "directions; give another tip, as --tip LINK:x,y,z"
         )
     last = names[chain[-1].index()]
     return replace(robot, locked=locked, actuators=actuators), tip, point, last, why
@@ -361,17 +350,9 @@ def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
         lever = place - origin.translation()
         return float(np.linalg.norm(lever if axis is None else np.cross(axis, lever)))
 
-    size = float(
-        np.linalg.norm(
-            np.ptp(
-                [
-                    plant.EvalBodyPoseInWorld(context, plant.get_body(BodyIndex(i))).translation()
-                    for i in range(1, plant.num_bodies())
-                ],
-                axis=0,
-            )
-        )
-    )
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    origins = [plant.EvalBodyPoseInWorld(context, one).translation() for one in bodies]
+    size = float(np.linalg.norm(np.ptp(origins, axis=0)))
     for places in choices:
         farthest = max(places, key=distance)
         if distance(farthest) > 0.01 * size:
@@ -380,12 +361,10 @@ def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """A place for a surface: its center in m, and normal, for a tip in a posture q.
+class _Place(NamedTuple):
+    """A place for a surface, for a tip in a posture q that can move along the axes `ways`.
 
-    `ways` are the axes of the world along the surface in which the tip can move; `speed` and
-    `force` are the largest ones within the limits of joints, in m/s and N.
+    `speed` and `force` are the largest ones within the limits of joints, in m/s and N.
     """
 
     center: Vector

@@ -1,13 +1,11 @@
 """The files that come with drake_dae; they are found and listed without Drake."""
 
-import re
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 from drake_dae import diagrams
-from drake_dae.arrays import unknown_name
 from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.scenario.typed_yaml import load_yaml
 
 FOLDER = Path(diagrams.__file__).resolve().parent
 DEFAULT_SCENARIO = "seven_joint_wall"
@@ -27,7 +25,7 @@ def find_scenario(name: str) -> Path:
     with suppress(OSError, ValueError):  # Such as a null byte.
         if path.is_file():
             return path
-    raise ScenarioError(("", unknown_name("scenario file", name, shipped)))
+    raise ScenarioError(("", _unknown("scenario file", name, shipped)))
 
 
 def shipped_model(name: str) -> Path:
@@ -39,11 +37,19 @@ def shipped_model(name: str) -> Path:
     files = sorted((FOLDER / "models").iterdir())
     shipped = {file.name: file for file in files if file.suffix in (".urdf", ".yaml")}
     if str(name) not in shipped:
-        raise ModelError(unknown_name("model", str(name), shipped))
+        raise ModelError(_unknown("model", str(name), shipped))
     return shipped[str(name)]
 
 
+def _unknown(kind: str, name: str, known: Iterable[str]) -> str:
+    from drake_dae.arrays import unknown_name  # It loads NumPy, which takes as long as `list`.
+
+    return unknown_name(kind, name, known)
+
+
 def description(path: Path) -> str:
-    """The description of a shipped scenario, which begins with it; the rest is not read."""
-    (entry,) = re.findall(r"\Adescription:.*\n(?:[ \n].*)*", path.read_text("utf-8"))
-    return str(load_yaml(entry, str(path))["description"])
+    """The description of a shipped scenario: its first line, in plain YAML."""
+    with path.open(encoding="utf-8") as file:
+        key, _, text = file.readline().partition(": ")
+    assert key == "description", path
+    return text.strip().strip("\"'")

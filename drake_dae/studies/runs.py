@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context
 
-from drake_dae.analysis.limits import SignalLimits, robot_limits
+from drake_dae.analysis import SignalLimits, robot_limits
 from drake_dae.arrays import brief
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record

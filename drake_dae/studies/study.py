@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from drake_dae.analysis.tables import Part, Table, count_of, to_text
+from drake_dae.analysis import Part, Table, count_of, to_text
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.studies.runs import Outcome, RunResult

@@ -17,6 +17,7 @@ from book.generated import generated_pages  # noqa: E402
 from book.notebooks import has_code, notebook  # noqa: E402
 from book.pages import pages, run_page  # noqa: E402
 from drake_dae.cli import main as command  # noqa: E402
+from drake_dae.scenario.shipped import shipped_scenarios  # noqa: E402
 
 NO_FIGURE = "<p>This figure needs zig: pip install 'drake_dae[compiler]'; drake-dae page {name}</p>"
 """The replacement for the live page of a scenario that could not be written."""
@@ -47,6 +48,7 @@ def main() -> int:
     shutil.copytree(BOOK / "_static", source / "_static", dirs_exist_ok=True)
     shutil.copytree(BOOK.parent / "pictures", out / "pictures", dirs_exist_ok=True)
     _live_figures(texts.values(), library, out)
+    _gallery(library, source / "gallery")
     # Sphinx keeps an older one, with an older search.js in it.
     (site / "_static" / "searchtools.js").unlink(missing_ok=True)
     sphinx = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
@@ -70,6 +72,19 @@ def _live_figures(texts: Iterable[str], library: str, out: Path) -> None:
         if command(["page", name, "--force", "--out", str(page)]):
             page.write_text(NO_FIGURE.format(name=name), "utf-8")
         else:
+            stamp.write_text(library)
+
+
+def _gallery(library: str, folder: Path) -> None:
+    """Makes a picture of a run of each shipped scenario."""
+    for name in shipped_scenarios():
+        run, picture, stamp = (folder / f"{name}{end}" for end in ("", ".png", ".stamp"))
+        if picture.exists() and stamp.exists() and stamp.read_text() == library:
+            continue
+        print(f"makes the picture of {name}", flush=True)
+        write = "write={animation: false, plots: false}"
+        command(["simulate", name, "--rollout", "--force", "--out", str(run), "--set", write])
+        if command(["plot", "--film", str(run), "--force", "--out", str(picture)]) == 0:
             stamp.write_text(library)
 
 

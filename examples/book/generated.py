@@ -13,36 +13,48 @@ import drake_dae
 from book.keys import keys_page
 from book.pages import BOOK, blocks, pages
 from drake_dae.cli import main
+from drake_dae.scenario.shipped import description, shipped_scenarios
 
 ROOT = BOOK.parents[1]
 sys.path.append(str(ROOT / "tests" / "support"))
 
-TOPICS = {
+ROOMS = {
     "dae": "Systems, laws and theory",
-    "analysis": "Analysis",
+    "references": "References",
     "robots": "Robots",
     "blocks": "Blocks",
     "systems": "Blocks of a diagram",
     "diagrams": "Closed loops and records",
+    "scene": "The view in Meshcat",
+    "analysis": "Analysis",
     "running": "Runs, rollouts and exports",
-    "compiler": "Diagrams as functions",
+    "pictures": "Pictures",
     "scenario": "Scenarios",
     "studies": "Studies",
-    "scene": "The view in Meshcat",
-    "pictures": "Pictures",
-    "errors": "Errors",
 }
-"""Folder of the library -> title of the section with its public names."""
+"""Room of the library -> title of the page with its public names."""
 
 
 def generated_pages() -> dict[str, str]:
     """Returns path relative to the book's folder -> text of the page."""
     return {
+        "gallery.md": gallery_page(),
         "reference/names.md": names_page(),
+        **{f"reference/names/{room}.md": room_page(room) for room in ROOMS},
         "reference/keys.md": keys_page(),
         "reference/commands.md": commands_page(),
         "reference/equations.md": equations_page(),
     }
+
+
+def gallery_page() -> str:
+    """Returns a page with a picture of a run of each shipped scenario."""
+    lines = ["# Gallery", "", "The shipped scenarios: `drake-dae simulate NAME` runs one."]
+    for name, path in shipped_scenarios().items():
+        text = description(path)
+        picture = f"![Moments of a run of {name}: {text}](gallery/{name}.png)"
+        lines += ["", f"## {name}", "", text, "", picture]
+    return "\n".join(lines) + "\n"
 
 
 def public_names() -> dict[str, str]:
@@ -69,16 +81,27 @@ def uses() -> dict[str, list[Path]]:
 
 
 def names_page() -> str:
-    """Returns a page of all public names by topic: signature, docstring, and pages that use it."""
-    modules, users, by_topic = public_names(), uses(), defaultdict(list)
-    for name, module in modules.items():
-        by_topic[module.split(".")[1]].append(name)
-    lines = ["# Public names", "", "Each is a name of `drake_dae`: `import drake_dae as dd`."]
-    for topic, title in TOPICS.items():
-        lines += ["", f"## {title}", ""]
-        for name in sorted(by_topic[topic], key=str.lower):
-            lines += _entry(name, modules[name], users.get(name, []))
+    """Returns a page that lists the public names by room, each with a link to its documentation."""
+    lines = ["# Public names", "", "Each is a name of `drake_dae`: `import drake_dae as dd`.", ""]
+    for room, title in ROOMS.items():
+        names = [name for name, module in public_names().items() if _room(module) == room]
+        names = [f"[`{name}`](#name-{name})" for name in names]
+        lines += [f"**[{title}](names/{room}.md)**: {', '.join(names)}", ""]
+    contents = "\n".join(f"names/{room}" for room in ROOMS)
+    return "\n".join(lines) + f"\n```{{toctree}}\n:hidden:\n\n{contents}\n```\n"
+
+
+def room_page(room: str) -> str:
+    """Returns a page of the public names of a room: signature, docstring, and pages that use it."""
+    users, lines = uses(), [f"# {ROOMS[room]}", ""]
+    for name, module in public_names().items():
+        if _room(module) == room:
+            lines += _entry(name, module, users.get(name, []))
     return "\n".join(lines) + "\n"
+
+
+def _room(module: str) -> str:
+    return module.split(".")[1]
 
 
 def _entry(name: str, module: str, users: list[Path]) -> list[str]:

@@ -66,7 +66,7 @@ class Block:
 def pages() -> list[Path]:
     """Returns all pages that can run."""
     return [
-        BOOK / "index.md",
+        *sorted(BOOK.glob("*.md")),  # index.md is the first.
         *(path for kind in KINDS for path in sorted((BOOK / kind).glob("*.md"))),
     ]
 

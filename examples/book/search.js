@@ -21,10 +21,9 @@ document.addEventListener("DOMContentLoaded", () => {
   };
 });
 
-// Pages that answer a question come first, lists of them last; the name of an object leads to it.
+// Pages that answer a question come first; the name of an object leads to it.
 var Scorer = {
   score: ([docname, , , , score]) => {
-    if (docname.startsWith("how_to/index_")) return score * 0.5;
     return docname.startsWith("how_to/") ? score * 1.5 : score;
   },
   objNameMatch: 99,

@@ -8,9 +8,8 @@ from numpy.testing import assert_allclose
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
 
 from drake_dae import ConstantReference, DaeSystem, SinusoidReference, ZeroDynamics, load_scenario
-from drake_dae.analysis.limits import LimitKind, SignalLimits, limits_along, robot_limits
+from drake_dae.analysis import LimitKind, SignalLimits, limits_along, robot_limits
 from drake_dae.dae import Signal, find_structure
-from drake_dae.errors import ScenarioError
 from drake_dae.running.judgement import FindingKind
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_scenario
@@ -80,16 +79,6 @@ def test_torques_and_speeds_of_an_arm_by_inverse_dynamics():
     assert_allclose(found.rate, slower, rtol=CLOSE)
 
 
-def test_a_speed_alone():
-    found, motion = on_the_wall(joint1_w=0.5)
-    assert found.excess.signal.name == "joint1_w"
-    assert_allclose(found.rate, 0.5 / np.abs(motion.states[:, 2]).max(), rtol=CLOSE)
-
-
-def test_references_within_limits_need_nothing():
-    assert on_the_wall(joint2_motor=1e4, joint1_motor=1e4)[0] is None
-
-
 def test_what_gravity_needs_at_rest_no_slower_motion_helps():
     found, motion = on_the_wall(joint1_motor=50.0)
     rest = required(motion)[0]
@@ -100,42 +89,6 @@ def test_what_gravity_needs_at_rest_no_slower_motion_helps():
     plant.SetPositions(context, motion.states[np.argmax(np.abs(rest[:, 0])), :2])
     gravity = -plant.CalcGravityGeneralizedForces(context)[0]
     assert f"by gravity alone it has {gravity:.4g} N m" in found.reason
-
-
-def test_a_force_that_is_commanded_to_pull():
-    found, _ = on_the_wall(force=-3.0)
-    assert found.rate is None
-    assert found.excess.signal.name == "wall.force"
-    assert (found.excess.value, found.excess.time) == (pytest.approx(-3.0), 0.0)
-    assert "by gravity alone it has 0 N" in found.reason
-
-
-def test_a_force_that_would_pull_on_a_hump():
-    """N = m (g cos a - R a'^2) on a hump of radius R, at the angle a from its top."""
-    radius, amplitude, frequency, mass = 0.5, 0.8, 8.0, 2.0
-    x, force = ca.SX.sym("x", 4), ca.SX.sym("force")
-    system = DaeSystem(
-        state=x,
-        f=ca.vertcat(x[2:], 0, -9.81),
-        g=ca.vertcat(0, 0, x[:2]) / (radius * mass),
-        h=ca.vertcat(0, 0, x[1], -x[0]) / (radius * mass),
-        k=ca.norm_2(x[:2]) - radius,
-        l=ca.atan2(x[0], x[1]),
-        m=ca.SX(1, 1),
-        nominal_state=np.array([0.1, 0.49, 0.0, 0.0]),
-    )
-    symbols, bounds = (ca.SX.sym("u"), force), np.array([[0.0], [np.inf]])
-    kinds = [LimitKind.FORCE]
-    limits = SignalLimits(system, [Signal("force", "N")], kinds, force, bounds, symbols)
-    references = [SinusoidReference(0.0, amplitude, frequency)]
-    found, _ = judged(find_structure(system), limits, references, [0.0, radius, 0.0, 0.0])
-    angle = amplitude * np.sin(frequency * TIMES)
-    centrifugal = radius * (amplitude * frequency * np.cos(frequency * TIMES)) ** 2
-    normal = mass * (9.81 * np.cos(angle) - centrifugal)
-    assert_allclose(found.excess.value, normal.min(), rtol=1e-9)
-    slower = np.sqrt((9.81 * np.cos(angle) / centrifugal).min())
-    assert slower < 0.8
-    assert_allclose(found.rate, slower, rtol=CLOSE)
 
 
 LINK = """<link name="{name}"><inertial><mass value="{mass}"/>
@@ -188,11 +141,6 @@ def test_a_friction_cone_of_a_scenario(tray):
     said = [one for one in run.judgement.findings if one.kind is FindingKind.LIMIT]
     assert [one.signal.name for one in said] == ["the friction cone of grip.fz"]
     assert f"{1.0 / found.rate:.4g} times slower" in run.look_next[0]
-
-
-def test_a_cone_of_a_force_that_is_not_there_is_refused(tray):
-    with pytest.raises(ScenarioError, match=r"grip\.fy"):
-        find_feasibility(load_scenario(tray, ["judgement.friction_cones.0.tangents=[grip.fy]"]))
 
 
 def test_slower_references_are_not_examined_beside_zero_dynamics():

@@ -4,17 +4,23 @@ Counterparts are the same interpreted, the same in Drake with blocks that do not
 imports. What is compared computes the same, which is checked first. Peers stand in `test_peers`.
 """
 
+import resource
 import subprocess
 import sys
 import time
 
 import numpy as np
 import pytest
+from empty import empty_loop, stepping
+from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
 from runs import scenario
-from test_speed import empty_loop, stepping
 from timing import calls, has_compiler, race, times
 from two_arms import two_arms
 
@@ -31,8 +37,12 @@ from drake_dae import (
     poles,
     rollout,
     simulate,
+    sweep,
 )
 from drake_dae.running import start_values
+from drake_dae.scenario.build import make_plant
+from drake_dae.scenario.model import completed_model, scenario_structure
+from drake_dae.studies import make_variations
 
 SPRINGS = FlexibleJoints(8000.0, inertia=1.0)
 MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
@@ -41,6 +51,9 @@ FIXED = [
     "integrator.use_error_control=false",
     "integrator.max_step_size=1e-3",
 ]
+CONTACT = 2.0
+"""The simulated time of a run on contact, in s."""
+
 CHOICES = {"interpreted": "false", "machine code": "true"}
 
 
@@ -148,23 +161,6 @@ def test_rollout(case, compare):
         compare(figure, took[how], "simulate", took["simulate"])
 
 
-def test_projection(compare):
-    """Of a state that a step has left 1e-7 off N*: two arms that hold a box."""
-    found = {}
-    for how, _, loop, _ in loops("two_arms"):
-        manifold = loop.plant.structure.manifold
-        values = manifold.system.parameter_values
-        nominal = manifold.project(manifold.system.nominal_state)
-        state = nominal + 1e-7 * np.random.default_rng(0).normal(size=nominal.size)
-        for _ in range(2):
-            assert np.abs(manifold.residual(manifold.project(state))).max() < 1e-13
-        found[how] = lambda m=manifold, x=state, p=values: m.projected(x, p)
-    took = race(found)
-    if "machine code" in took:
-        figure = "projection of a state, 14 joints in a loop: machine code"
-        compare(figure, took["machine code"], "interpreted", took["interpreted"])
-
-
 def arms_with_motors() -> RobotModel:
     """14 joints with springs and motors, and a weld."""
     return two_arms([SPRINGS, MOTORS])
@@ -208,20 +204,102 @@ def test_tracing(label, compare):
     compare(f"tracing, {label}", min(seconds), wanted=wanted)
 
 
-def test_starting(compare):
-    def seconds(*words):
-        began = time.perf_counter()
-        subprocess.run([sys.executable, *words], check=True, capture_output=True)
-        return time.perf_counter() - began
+def test_starting(compare, tmp_path):
+    """Processor time of commands and of what they stand on, in alternation."""
 
-    pairs = {
-        "drake-dae list": (("-m", "drake_dae", "list"), "import numpy"),
-        "import of drake_dae and its parts": (
-            ("-c", "import drake_dae; drake_dae.build_scenario, drake_dae.simulate"),
-            "import pydrake.all, casadi",
+    def seconds(*words):
+        began = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, *words], check=True, capture_output=True)
+        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return ended.ru_utime + ended.ru_stime - began.ru_utime - began.ru_stime
+
+    run = "-m", "drake_dae", "simulate", "two_link_wall", "--set=duration=0.5", "--force"
+    for figure, words, bare in (
+        ("drake-dae list", ("-m", "drake_dae", "list"), "import numpy"),
+        (
+            "drake-dae simulate, 0.5 s of two joints",
+            (*run, f"--out={tmp_path}"),
+            "import pydantic, scipy.linalg, pydrake.multibody.plant",
         ),
-    }
-    for figure, (words, bare) in pairs.items():
+    ):
         found = np.array([[seconds(*words), seconds("-c", bare)] for _ in range(5)])
-        ours, theirs = found.min(axis=0)
-        compare(figure, ours, bare, theirs)
+        compare(figure, *found.min(axis=0)[:1], bare, found.min(axis=0)[1])
+
+
+@pytest.mark.parametrize("name", ["two_link_wall", "seven_joint_wall"])
+def test_a_run_beside_real_time(name, compare):
+    chosen = scenario(name, "integrator.accuracy=1e-6")
+    loop, context = build_scenario(chosen)
+    run = simulate(loop.diagram, context, chosen.duration, chosen.integrator)
+    compare(f"1 s of {name}", 1.0 / run.times_real_time, "real time", 1.0, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"), [("wall_point_contact", 2.5), ("wall_hydroelastic", 1.3)]
+)
+def test_a_run_on_contact_beside_its_plant(name, wanted, compare):
+    """1 s of the loop, and of its `ContactPlant` alone under the torques of that run."""
+    compiled = "compiled=true" if has_compiler() else "compiled=false"
+    chosen = scenario(name, f"duration={CONTACT}", compiled)
+    loop, start = build_scenario(chosen)
+    _, model, _ = completed_model(chosen, SceneGraph())
+    plant = make_plant(chosen, model, scenario_structure(model))
+    builder = DiagramBuilder()
+    builder.AddSystem(plant)
+
+    def whole():
+        context = start.Clone()
+        began = time.process_time()
+        simulate(loop.diagram, context, CONTACT, chosen.integrator)
+        return time.process_time() - began, loop.record(context)
+
+    record = whole()[1]
+    torques = record["control"]
+    breaks = plant.time_step * np.arange(len(torques) + 1)
+    path = PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([torques, torques[-1:]]).T)
+    source = builder.AddSystem(TrajectorySource(path))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    diagram = builder.Build()
+
+    def alone():
+        context = diagram.CreateDefaultContext()
+        own = plant.GetMyMutableContextFromRoot(context)
+        plant.set_state(own, record["state"][0])
+        simulator = Simulator(diagram, context)
+        simulator.Initialize()
+        began = time.process_time()
+        simulator.AdvanceTo(CONTACT)
+        took = time.process_time() - began
+        np.testing.assert_allclose(plant.state(own), record["state"][-1], atol=1e-6)
+        return took
+
+    best = np.min([[whole()[0], alone()] for _ in range(3)], axis=0) / CONTACT
+    compare(f"1 s of {name}", best[0], "its plant alone", best[1], wanted)
+
+
+@pytest.mark.skipif(not has_compiler(), reason="there is no C compiler")
+def test_many_rollouts(compare, tmp_path):
+    """10,000 of 1 s with other starts, side by side; and a run of a sweep of 10 s."""
+    chosen = scenario("two_link_wall", "integrator.accuracy=1e-6")
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    manifold, random = loop.plant.structure.manifold, np.random.default_rng(0)
+    starts = [manifold.settle(start + 0.05 * random.normal(size=4)) for _ in range(500)] * 20
+
+    def run():
+        found = rollout(
+            loop, starts, parameters, [0.0, 1.0], config=chosen.integrator, compiled=True
+        )
+        assert all(each.failure is None for each in found)
+
+    run()
+    began = time.process_time()
+    run()
+    compare("10,000 rollouts of 1 s, two joints", time.process_time() - began, wanted=0.5)
+    variations = make_variations({"start.errors.tool.z": np.linspace(-0.05, 0.05, 3000)})
+    for workers in (1, 2):
+        began, file = time.perf_counter(), tmp_path / f"{workers}.db"
+        study = sweep(scenario("two_link_wall"), variations, file, workers=workers, rollout=True)
+        took = time.perf_counter() - began
+        assert study.table()["outcome"] == ["finished"] * 3000
+        compare(f"sweep of 3,000 rollouts of 10 s, {workers} processes", took, wanted=20.0)

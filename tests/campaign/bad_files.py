@@ -58,23 +58,6 @@ def _outcome(what: str, read: Callable[[], object], excuse: str) -> Outcome:
     return outcome
 
 
-def _table(choice: random.Random) -> tuple[str, bytes, str]:
-    rows = [[f"{np.sin(i + 2 * j) / 50:.4f}" for j in range(5)] for i in range(4)]
-    return _with_cell(rows, choice, choice.choice((",", ";", "\t")), "")
-
-
-def _with_cell(
-    rows: list[list[str]], choice: random.Random, between: str, head: str
-) -> tuple[str, bytes, str]:
-    row, cell = choice.choice(rows), choice.choice(CELLS)
-    place = choice.randrange(len(row))
-    row[place] = cell
-    split = cell == "1,5" and between == ","  # In a path the last columns are not looked at.
-    excuse = "another number" if cell == "1e-320" or (split and head) else ""
-    text = "\n".join(between.join(one) for one in rows)
-    return f"{cell[:8]!r} between {between!r}", (head + text).encode(), excuse
-
-
 def _npy(choice: random.Random) -> tuple[str, bytes, str]:
     size, kind = choice.choice(SIZES), choice.choice(KINDS)
     head = f"{{'descr': '{kind}', 'fortran_order': {choice.random() < 0.2}, 'shape': {size}, }}"

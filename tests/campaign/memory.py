@@ -1,4 +1,4 @@
-"""Memory of many closed loops and of a long run: python tests/campaign/memory.py --loops 1000."""
+"""Memory of many closed loops: python tests/campaign/memory.py --loops 1000."""
 
 import argparse
 import ctypes
@@ -7,8 +7,6 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-
-from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae import RobotPlant, build_scenario, load_scenario, make_closed_loop, simulate
 from drake_dae.scenario.shipped import find_scenario
@@ -37,7 +35,6 @@ def growth(make: Callable[[], object], count: int) -> float:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--loops", type=int, default=1000)
-    parser.add_argument("--steps", type=int, default=50_000)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     scenario = load_scenario(find_scenario("two_link_wall"))
@@ -57,21 +54,6 @@ def main() -> int:
         kept = growth(make, given.loops)
         bad |= kept > BOUND
         print(f"{kept:8.2f} kB stay per closed loop {name} ({given.loops} of them)", flush=True)
-
-    # One sample of all logged signals and of the time, in each step.
-    loop, context = build_scenario(scenario)
-    config = SimulatorConfig(
-        integration_scheme="runge_kutta5", max_step_size=1e-5, use_error_control=False
-    )
-    size = sum(map(len, loop.signals.values())) + 1
-    before = resident()
-    done = simulate(loop.diagram, context, given.steps * 1e-5, config)
-    per_step = (resident() - before) * 1e3 / done.steps
-    print(
-        f"{per_step:8.0f} bytes per step in {done.steps} steps; {8 * size} are logged, so "
-        f"2 million steps take {2e6 * 8 * size / 1e9:.2f} to "
-        f"{2e6 * 16 * size / 1e9:.2f} GB (a full log doubles)"
-    )
     return int(bad)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from campaign.outcomes import WRONG, Outcome, checked
+from campaign.outcomes import Outcome, checked
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -24,17 +24,14 @@ from drake_dae import (
     DcMotors,
     ElectrohydraulicServos,
     Ellipsoid,
-    Encoders,
     FlexibleJoints,
     ImplicitSurface,
     JointPositions,
     Plane,
     PointCoordinates,
     PointOnSurface,
-    Record,
     RobotModel,
     RobotPlant,
-    Sampling,
     SinusoidReference,
     Sphere,
     SurfaceCoordinates,
@@ -46,15 +43,11 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.dae import find_structure
-from drake_dae.diagrams import LoopSettings
 from drake_dae.robots import Constraint, MultibodyExpressions, PositionOutput, Stage, Surface
 
 Random = np.random.Generator
 
 DURATION, STEP = 0.2, 1e-3
-
-SILENT = 200.0
-"""An error that stays above so many times its size has diverged."""
 
 CHAINS = ("rigid", "flexible", "motors", "hydraulics", "flexible motors")
 SURFACES = ("plane", "sphere", "cylinder", "ellipsoid", "torus", "implicit")
@@ -101,21 +94,7 @@ class Plan:
         return ", ".join(parts)
 
 
-def measured(seed: int, folder: Path) -> Outcome:
-    """The robot of a seed under a law that samples, late, and sees encoders.
-
-    Where that is too slow for it, it diverges, and the run says so. Bad encoders shake the robot,
-    so that a step leaves a larger residual before its projection; with half of the step an error of
-    the integrator is 2^6 times smaller.
-    """
-    found = attempt(seed, folder, is_measured=True)
-    if found.kind == WRONG and np.isfinite(found.residual):
-        finer = attempt(seed, folder, is_measured=True, step=0.5 * STEP)
-        return finer if finer.residual < found.residual / 32.0 else found
-    return found
-
-
-def attempt(seed: int, folder: Path, is_measured: bool = False, step: float = STEP) -> Outcome:
+def attempt(seed: int, folder: Path) -> Outcome:
     """Makes, checks and runs a random robot."""
     random = np.random.default_rng(seed)
     plan = _plan(random)
@@ -132,9 +111,8 @@ def attempt(seed: int, folder: Path, is_measured: bool = False, step: float = ST
         law = TrackingLaw(model.dae, poles(-random.uniform(3.0, 8.0)), structure=structure)
         goals = _goals(random, model, links, tree)
         references = [_reference(random, goal) for goal in goals]
-        settings = _measured(np.random.default_rng([seed, 1])) if is_measured else None
         plant = RobotPlant(model, structure=structure)
-        loop = make_closed_loop(plant, law, references, settings)
+        loop = make_closed_loop(plant, law, references)
         context = loop.diagram.CreateDefaultContext()
         wanted = law.layout.values(loop.reference.reference(0.0))
         count = len(model.position_signals)
@@ -143,42 +121,14 @@ def attempt(seed: int, folder: Path, is_measured: bool = False, step: float = ST
         own = loop.plant.GetMyMutableContextFromRoot(context)
         loop.plant.set_consistent_state(own, model.rest_state(configuration, wanted[count:]))
         config = SimulatorConfig(
-            integration_scheme="runge_kutta5", max_step_size=step, use_error_control=False
+            integration_scheme="runge_kutta5", max_step_size=STEP, use_error_control=False
         )
         simulate(loop.diagram, context, DURATION, config)
         record = loop.record(context)
-        outcome.figures(record, None if is_measured else loop.predicted_error(record))
-        if is_measured and (share := _diverged(record)) > SILENT:
-            outcome.kind, outcome.text = WRONG, f"diverged {share:.3g} times its size in silence"
+        outcome.figures(record, loop.predicted_error(record))
         outcome.accepted(f"{plan.binding}, {plan.stage}")
     outcome.what = str(plan)
     return outcome
-
-
-def _measured(random: Random) -> LoopSettings:
-    """Samples, delays and encoders, from good ones to bad ones."""
-    period = 10.0 ** random.uniform(-3.0, -1.7)
-    encoders = Encoders(
-        resolution=10.0 ** random.uniform(-6.0, -3.0),
-        velocity_bandwidth=random.uniform(10.0, 500.0) if random.random() < 0.7 else None,
-    )
-    delay = period * random.integers(0, 3)
-    return LoopSettings(sampling=Sampling(period, delay), encoders=encoders)
-
-
-def _diverged(record: Record) -> float:
-    """How many times the size of its unit the least error of some output at the end is."""
-    signals, share = record.signals["controlled_output"].signals, 0.0
-    desired, outputs = np.abs(record["desired_output"]), np.abs(record["controlled_output"])
-    force = record["constraint_force"][0]
-    late = np.min(np.abs(record["tracking_error"][-max(2, len(record.time) // 50) :]), axis=0)
-    for unit in {signal.unit for signal in signals}:
-        own = [signal.unit == unit for signal in signals]
-        size = max(np.max(desired[:, own]), np.max(outputs[0, own]), 1.0)
-        if unit.startswith("N"):
-            size = max(size, float(np.max(np.abs(force), initial=0.0)))
-        share = max(share, float(np.max(late[own])) / size)
-    return share
 
 
 def _plan(random: Random) -> Plan:

@@ -1,38 +1,27 @@
-"""Random tasks of the two-link arm: phases, guards, sensors, pushes, payloads, lost packets.
-
-    python tests/campaign/random_tasks.py --count 1000 --seed 0 --out FILE
+"""Random tasks of the two-link arm: phases, guards, sensors, pushes, payloads.
 
 Each has to end done, or by the chosen reaction, or with an error of the library, in a time that its
 phases and retries allow. Without pushes and payloads the force of every touch has to stay below
-the expected peak. Returns 1 if one does not. With `--out` each outcome is a line of that file when
-it is known, and the tasks in the file are not run again.
+the expected peak.
 """
 
 import random
 import re
-import sys
-import warnings
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from campaign.seeds import run_seeds
+from campaign.outcomes import HANG, REFUSED, WRONG, Outcome, checked
 
 from drake_dae import load_scenario
-from drake_dae.errors import DrakeDaeError
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
 
 ENDED = ("done", "held")
-BAD = ("RAW", "HARD", "HANGS")
 REACTIONS = ("hold", "leave")
 DURATIONS = (6.0, 60.0)
 """In s; a task that has not ended in the first time is run for the second."""
-_NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
 TEXT = """
 robot: {{file: package://drake_dae_models/two_link_arm.urdf}}
 constraints:
@@ -136,11 +125,12 @@ def _guards(draw: random.Random, force: float) -> str:
     return f"guards: [{', '.join(draw.sample(found, draw.randrange(3)))}]"
 
 
-def outcome(text: str, is_model: bool, folder: Path) -> str:
-    """How a task ends; "RAW", "HARD" or "HANGS" first where it may not end so."""
+def attempt(seed: int, folder: Path) -> Outcome:
+    """Runs a random task to its end."""
+    text, is_model = random_task(random.Random(seed))
     file = folder / "task.yaml"
     file.write_text(text)
-    try:
+    with checked(f"task {seed}") as outcome:
         for duration in DURATIONS:
             completed, loop = build_completed(load_scenario(file, [f"duration={duration}"]))
             context = start_scenario(completed.scenario, loop)
@@ -148,37 +138,22 @@ def outcome(text: str, is_model: bool, folder: Path) -> str:
             changes = loop.changes(found.record)
             if found.failure is not None or changes[-1].phase in ENDED:
                 break
-    except DrakeDaeError as error:
-        return f"refused: {error}"
-    except Exception as error:
-        return f"RAW: {error!r}"
-    limit = re.search(r"stay below ([0-9.e+]+) N", " ".join(completed.notes))
-    for before, after in pairwise(changes) if limit and is_model else ():
-        record, touch = found.record, after.time
-        air = (record.time > before.time) & (record.time < touch)
-        # A phase that begins while the tool still presses does not touch.
-        is_free = (record["constraint_force"][air, 0] == 0.0).any()
-        if not (after.in_contact > before.in_contact and is_free):
-            continue
-        near = np.abs(record.time - touch - 0.02) < 0.03
-        peak = float(np.max(record["constraint_force"][near, 0], initial=0.0))
-        if peak > float(limit[1]):
-            return f"HARD: {peak:.3g} N, expected below {limit[1]} N"
-    if found.failure is None and changes[-1].phase not in ENDED:
-        return f"HANGS: {changes[-1]}"
-    if found.failure is not None:
-        return f"error: {found.failure}"
-    return f"{changes[-1].phase}: {changes[-1].reason}" if changes else "no phase"
-
-
-def main() -> int:
-    warnings.simplefilter("ignore")
-
-    def ended(seed: int, folder: Path) -> str:
-        return outcome(*random_task(random.Random(seed)), folder)
-
-    return run_seeds(__doc__, ended, BAD, lambda found: _NUMBER.sub("#", found)[:100])
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        limit = re.search(r"stay below ([0-9.e+]+) N", " ".join(completed.notes))
+        for before, after in pairwise(changes) if limit and is_model else ():
+            record, touch = found.record, after.time
+            air = (record.time > before.time) & (record.time < touch)
+            # A phase that begins while the tool still presses does not touch.
+            is_free = (record["constraint_force"][air, 0] == 0.0).any()
+            near = np.abs(record.time - touch - 0.02) < 0.03
+            peak = float(np.max(record["constraint_force"][near, 0], initial=0.0))
+            if after.in_contact > before.in_contact and is_free and peak > float(limit[1]):
+                outcome.kind = WRONG
+                outcome.text = f"{peak:.3g} N, expected below {limit[1]} N"
+                return outcome
+        if found.failure is not None:
+            outcome.kind, outcome.text = REFUSED, str(found.failure)
+        elif changes[-1].phase not in ENDED:
+            outcome.kind, outcome.text = HANG, str(changes[-1])
+        else:
+            outcome.text = changes[-1].phase
+    return outcome

@@ -1,26 +1,26 @@
 """The command: what it prints, what it leaves, and how it ends."""
 
+import json
 import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
-import time
 import warnings
 import webbrowser
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
-from command_line import BARE, QUICK, SHORT, command, error_line, shown_on_a_terminal
+from command_line import BARE, QUICK, command, error_line, shown_on_a_terminal
 from recordings import animation
 
 import drake_dae
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
-from drake_dae.commands import scenarios, simulate
-from drake_dae.commands.folder import FILES, PART
+from drake_dae.commands import runs, scenarios
+from drake_dae.commands.runs import FILES
 from drake_dae.errors import NonMinimumPhaseWarning, ScenarioError
 from drake_dae.pictures import PLOTS
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario, shipped_scenarios
@@ -63,15 +63,6 @@ def test_it_prints_the_summary(demo):
     assert err == ""
 
 
-def test_the_record_is_that_of_the_scenario(demo):
-    folder, _, _ = demo
-    record = Record.load(folder / "record.npz")
-    assert (record.time[0], record.time[-1]) == (0.0, 2.0)
-    np.testing.assert_allclose(
-        record["constraint_force"][:, 0], 20.0 + 5.0 * np.sin(2.0 * record.time), atol=1e-9
-    )
-
-
 def test_the_page_holds_the_animation(demo):
     folder, _, _ = demo
     tracks = animation((folder / "animation.html").read_text())
@@ -99,31 +90,6 @@ def test_the_scenario_as_run_gives_the_same_record(demo, tmp_path):
     np.testing.assert_array_equal(first.time, second.time)
     for name in first.signals:
         np.testing.assert_array_equal(first[name], second[name], err_msg=name)
-
-
-@pytest.mark.parametrize(
-    ("settings", "left"),
-    [
-        (BARE, ["scenario.yaml", "summary.txt"]),
-        (QUICK, ["record.npz", "scenario.yaml", "summary.txt"]),
-    ],
-)
-def test_it_writes_what_is_asked_for(settings, left, tmp_path, capsys):
-    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
-    assert main([*arguments, *settings]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == left
-    capsys.readouterr()
-
-
-@pytest.mark.slow
-def test_without_out_each_run_gets_a_new_folder_below_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    for _ in range(3):
-        assert main(["simulate", "two_link_wall", *SHORT, *BARE]) == 0
-    folders = [path.name for path in (tmp_path / "runs").iterdir()]
-    assert len(folders) == 3
-    assert all(re.fullmatch(r"two_link_wall-\d{8}-\d{6}(-\d)?", name) for name in folders)
-    capsys.readouterr()
 
 
 def test_view_opens_the_animation(demo, monkeypatch, capsys):
@@ -154,51 +120,6 @@ def test_view_says_what_is_missing(demo, tmp_path, capsys):
     assert "animation.html" in error_line(capsys)
 
 
-def test_open_shows_the_animation_at_the_end(tmp_path, monkeypatch, capsys):
-    opened = []
-    monkeypatch.setattr(webbrowser, "open", lambda address: not opened.append(address))
-    short = ["simulate", "two_link_wall", "--set", "duration=0.05", "--set", "write.plots=false"]
-    assert main([*short, "--out", str(tmp_path), "--open"]) == 0
-    assert opened == [(tmp_path / "animation.html").as_uri()]
-    page = (tmp_path / "animation.html").read_text()
-    described = load_scenario(find_scenario("two_link_wall")).description
-    assert f"<title>two_link_wall: {described}</title>" in page
-    capsys.readouterr()
-    assert main([*short, *QUICK, "--out", str(tmp_path), "--open"]) == 1
-    assert error_line(capsys).startswith("error: write.animation: --open ")
-    assert len(opened) == 1
-
-
-@pytest.mark.usefixtures("signals_of_a_shell")
-@pytest.mark.slow
-@pytest.mark.thorough
-def test_ctrl_c_ends_with_130_and_complete_files(tmp_path):
-    """The run would last a minute; it is interrupted as soon as it has begun its record."""
-    process = command(
-        *("simulate", "two_link_wall", "--out", tmp_path / "run"),
-        *("--set", "duration=60", "--set", "integrator.target_realtime_rate=1", "--set", PLOTTED),
-    )
-    assert process.stdout.readline().startswith("two_link_wall: built")
-    limit = time.monotonic() + 60
-    while not (tmp_path / "run" / PART).exists():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < limit
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
-    assert process.returncode == 130, err
-    assert err == ""
-    assert "interrupted" in out
-    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == sorted(FILES)
-    record = Record.load(tmp_path / "run" / "record.npz")
-    assert 0.0 < record.time[-1] < 60.0
-    tracks = animation((tmp_path / "run" / "animation.html").read_text())
-    end = tracks["/contact/wall/force", "position"].times[-1]
-    assert record.time[-1] <= end <= record.time[-1] + 1 / 32
-    for name in PLOTS:
-        assert (tmp_path / "run" / name).read_bytes().endswith(b"IEND\xaeB`\x82")
-
-
 def test_ctrl_c_in_the_middle_of_a_step_keeps_the_record(tmp_path, monkeypatch, capsys):
     """As a second Ctrl-C does, or one while the files are written."""
 
@@ -207,22 +128,11 @@ def test_ctrl_c_in_the_middle_of_a_step_keeps_the_record(tmp_path, monkeypatch, 
         raise KeyboardInterrupt
 
     scenario = find_scenario("two_link_wall")
-    monkeypatch.setattr(simulate, "simulate", stop)
+    monkeypatch.setattr(runs, "simulate", stop)
     assert main(["simulate", "two_link_wall", "--out", str(tmp_path), *QUICK]) == 130
     assert capsys.readouterr().err == "interrupted\n"
     assert Record.load(tmp_path / "record.npz").time[-1] == 0.1
     assert "interrupted" in (tmp_path / "summary.txt").read_text()
-
-
-def test_no_compiler_is_a_warning(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("DRAKE_DAE_CACHE", str(tmp_path / "code"))
-    monkeypatch.setenv("CC", "no-such-compiler")
-    short = ["simulate", "two_link_wall", "--set", "duration=0.05", *BARE]
-    with warnings.catch_warnings():
-        warnings.simplefilter("default")
-        assert main([*short, "--out", str(tmp_path / "run"), "--set=compiled=true"]) == 0
-    (line,) = capsys.readouterr().err.splitlines()  # Once, though for each of the functions.
-    assert line.startswith("warning: no C compiler: CC names 'no-such-compiler'")
 
 
 def test_list(capsys):
@@ -262,15 +172,6 @@ def test_a_printed_command_works_as_printed(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_reader_that_has_enough():
-    """`drake-dae list | head -1`"""
-    with command("list") as process:
-        process.stdout.close()
-        assert process.wait(timeout=30) == 1
-        assert process.stderr.read() == ""
-
-
-@pytest.mark.slow
 def test_meshcat_reports_where_and_asks_drake_for_real_time(tmp_path, capsys):
     arguments = ["simulate", "two_link_wall", "--meshcat", "--out", str(tmp_path), *QUICK]
     assert main([*arguments, "--set", "duration=0.1"]) == 0
@@ -298,7 +199,7 @@ def test_warnings_are_printed_like_errors_without_the_line_of_code(monkeypatch, 
         warnings.warn("two tanks: non-minimum phase", NonMinimumPhaseWarning, stacklevel=1)
         raise ScenarioError(("", "empty"))
 
-    for command_of in (simulate, scenarios):
+    for command_of in (runs, scenarios):
         monkeypatch.setattr(command_of, "find_scenario", warn)
     assert main(["simulate", "two_tanks"]) == 1
     assert capsys.readouterr().err == "warning: two tanks: non-minimum phase\nerror: empty\n"
@@ -324,8 +225,34 @@ def test_a_rollout_leaves_the_files_of_a_run(tmp_path, capsys):
     assert "50 steps" in capsys.readouterr().out
 
 
-def test_a_rollout_that_fails_keeps_its_record(tmp_path, capsys):
-    settings = ["--set", "references.tool.z.amplitudes=[3.0]", "--set", "compiled=false"]
-    assert main(["simulate", "two_link_wall", "--rollout", "--out", str(tmp_path), *settings]) == 1
-    assert "t = 0.38" in capsys.readouterr().err
-    assert 0.3 < Record.load(tmp_path / "record.npz").time[-1] < 0.4
+def test_a_shipped_scenario_is_shown_as_it_is(tmp_path, capsys):
+    """With its comments, and so that what is printed is a scenario anywhere."""
+    assert main(["print", "seven_joint_dome"]) == 0
+    text = capsys.readouterr().out
+    assert text == find_scenario("seven_joint_dome").read_text()
+    (tmp_path / "mine.yaml").write_text(text)
+    assert load_scenario(tmp_path / "mine.yaml") == load_scenario(find_scenario("seven_joint_dome"))
+
+
+def test_where_it_is_and_which_without_a_name(capsys):
+    assert main(["print", "--path"]) == 0
+    assert capsys.readouterr().out.strip() == str(find_scenario(DEFAULT_SCENARIO))
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("two_link_wal", "'two_link_wall'"), ("binary.yaml", "binary.yaml")],
+)
+def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe")
+    assert main(["print", name]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert words in line
+
+
+@pytest.mark.slow
+def test_the_schema_is_printed(capsys):
+    assert main(["schema"]) == 0
+    jsonschema.Draft202012Validator.check_schema(json.loads(capsys.readouterr().out))

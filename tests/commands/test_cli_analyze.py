@@ -9,10 +9,10 @@ from runs import TASKS, each_scenario, run, scenario, some
 from scipy.optimize import brentq
 
 from drake_dae import build_scenario
-from drake_dae.analysis.limits import LimitKind
+from drake_dae.analysis import LimitKind
 from drake_dae.cli import main
 from drake_dae.scenario import judging as module
-from drake_dae.scenario.judging import Feasibility, find_feasibility
+from drake_dae.scenario.judging import find_feasibility
 
 
 def analyze(capsys, *arguments):
@@ -67,24 +67,6 @@ def test_the_motion_is_that_of_a_closed_loop_without_errors(name):
         index = [signal.name for signal in states.signals].index(found.signal.name)
         assert found.largest == pytest.approx(states.values[:, index].max(), abs=1e-3)
         assert found.least == pytest.approx(states.values[:, index].min(), abs=1e-3)
-
-
-@pytest.mark.slow
-def test_the_joint_force_behind_an_actuation():
-    """At rest the springs hold what rigid joints would: the same tau, against the same limits."""
-    still = [
-        "references.tool.z=0.3",
-        "references.wall.force=400",
-        "start.errors={}",
-        "duration=0.1",
-    ]
-    rigid = find_feasibility(scenario("two_link_wall", *still))
-    soft = find_feasibility(scenario("two_link_flexible", *still))
-    assert rigid.of(LimitKind.EFFORT) == ()
-    for one, two in zip(rigid.of(LimitKind.CONTROL), soft.of(LimitKind.EFFORT), strict=True):
-        assert two.largest == pytest.approx(one.largest, rel=1e-9)
-        assert two.high == one.high
-    assert any("joint2" in problem for problem in soft.problems)
 
 
 @pytest.mark.slow
@@ -163,55 +145,6 @@ def test_times_follow_a_reference_that_even_times_would_not_see(periods):
     assert np.quantile(np.diff(times), 0.9) < 0.15
 
 
-@pytest.mark.slow
-def test_times_that_do_not_suffice_are_reported():
-    wanted = lambda t: np.array([np.sin(1e4 * t)])  # noqa: E731
-    times, is_resolved = module.sample_times(wanted, 0.0, 100.0)
-    assert not is_resolved
-    assert times.size == module.MOST_SAMPLES
-    values = np.array([wanted(t)[0] for t in times])
-    assert np.ptp(values) > 1.99
-    analysis = find_feasibility(scenario("two_link_wall", "duration=0.1")).analysis
-    told = Feasibility(analysis, 0.1, is_resolved=False)
-    assert told.to_dict()["resolved"] is False
-
-
-@pytest.mark.slow
-def test_a_peak_between_even_times_is_found(monkeypatch, capsys):
-    """2 + 5 sin 20 pi t over 10 s at 101 even times, all of them at its zeros."""
-    monkeypatch.setattr(module, "SAMPLES", 101)
-    fast = (
-        "references.wall.force.offset=2",
-        "references.wall.force.frequencies=[62.83185307179586]",
-    )
-    arguments = [word for setting in fast for word in ("--set", setting)]
-    code, text = analyze(capsys, "two_link_wall", *arguments, "--set", "duration=10")
-    assert code == 2
-    found = re.search(r"PROBLEM  wall\.force would pull with (\S+) N", text)
-    assert float(found[1]) == pytest.approx(3.0, abs=0.16)
-    found = re.search(r"^wall\.force +N .* left at (\S+) s$", text, re.M)
-    assert float(found[1]) == pytest.approx((np.pi + np.arcsin(0.4)) / (20 * np.pi), abs=0.01)
-
-
-@pytest.mark.slow
-def test_extremes_of_a_constant_have_no_time(capsys):
-    settings = ["--set", "references.wall.force=15", "--set", "duration=2"]
-    _, text = analyze(capsys, "two_link_wall", *settings)
-    row = [line.split() for line in text.splitlines() if line.startswith("wall.force")][-1]
-    assert row == ["wall.force", "N", "15", "15", "pushes", "only"]
-    assert "1001" in text
-
-
-@pytest.mark.slow
-def test_a_pin_may_pull():
-    told = find_feasibility(scenario("five_bar", "references.pin.fx.offset=-15"))
-    assert course(told.of(LimitKind.FORCE), "pin.fx").least == pytest.approx(-20.0, rel=1e-4)
-    assert not any("pull" in problem for problem in told.problems)
-    (wall,) = find_feasibility(scenario("two_link_wall", "duration=0.1")).of(LimitKind.FORCE)
-    assert wall.low == 0.0
-    assert all(pin.low == -np.inf for pin in told.of(LimitKind.FORCE))
-
-
 # How it ends.
 
 
@@ -255,46 +188,12 @@ def test_json(capsys):
     assert found["problems"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["no_such_scenario"], "'no_such_scenario'"),
-        (["two_link_wall", "--set", "duratoin=1"], "duratoin"),
-        (["two_link_wall", "--set", "references.tool.z.offset=7"], "start: "),
-        (["two_link_wall", "--set", "duration=-1"], "duration: "),
-    ],
-)
-def test_errors(arguments, message, capsys):
-    assert main(["analyze", *arguments]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    (line,) = captured.err.splitlines()
-    assert line.startswith("error: ")
-    assert message in line
-
-
 def test_an_error_as_json(capsys):
     assert main(["analyze", "two_link_wall", "--json", "--set", "start.positions.joint2=9"]) == 1
     captured = capsys.readouterr()
     text = "start.positions: joint2 = 9 rad"
     assert json.loads(captured.out)["error"].startswith(text)
     assert captured.err.startswith(f"error: {text}")
-
-
-@pytest.mark.slow
-def test_objects_are_one_line_at_the_prompt():
-    case = scenario("two_link_wall", "duration=0.1")
-    assert repr(find_feasibility(case)) == "Feasibility('two_link_arm': no problem found)"
-    loop, _ = build_scenario(case)
-    assert repr(loop).startswith("ClosedLoop('two_link_arm', logs state, constraint_force, ")
-
-
-@pytest.mark.slow
-def test_states_have_units(capsys):
-    _, text = analyze(capsys, "two_link_wall")
-    assert re.search(
-        r"^B\(x\) is nearest to singular at joint1=\S+ rad, joint2=\S+ rad\.$", text, re.M
-    )
 
 
 @pytest.mark.slow

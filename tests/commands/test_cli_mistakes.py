@@ -1,25 +1,21 @@
 """Mistakes, folders that cannot be written to, runs that fail: one line, and what fits is kept."""
 
-import gc
 import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import BARE, QUICK, SHORT, command, error_line
+from command_line import BARE, SHORT, error_line
 from matplotlib.figure import Figure
 from recordings import animation
 
-import drake_dae
 from drake_dae import Record
 from drake_dae.cli import main
-from drake_dae.commands import simulate
+from drake_dae.commands import runs
 from drake_dae.pictures import PLOTS
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.scene import view
 
 
 @pytest.mark.parametrize("name", ["scenario.yaml", "controls.png"])
@@ -36,7 +32,6 @@ def test_files_of_others_are_never_overwritten(name, tmp_path, capsys):
     [
         ["new", "arm.urdf"],
         ["plot", "one"],
-        ["plot", "one", "--film"],
         ["page", "two_link_wall"],
     ],
     ids=lambda words: "_".join(words),
@@ -66,13 +61,6 @@ def test_a_folder_is_no_device(command, capsys):
     assert "'/dev/null'" in error_line(capsys)
 
 
-def test_a_folder_that_cannot_be_written_to(tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        assert main(["simulate", "two_link_wall", "--out", str(folder), *SHORT, *BARE]) == 1
-        assert f"{folder}" in error_line(capsys)
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -91,13 +79,6 @@ def test_a_mistake_is_one_line_and_leaves_nothing(arguments, line, tmp_path, mon
     assert main(["simulate", *arguments]) == 1
     assert re.match(line, error_line(capsys))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_each_mistake_in_a_scenario_has_its_line(capsys):
-    assert main(["simulate", "two_link_wall", "--set", "duration=0", "--set", "foo=1"]) == 1
-    first, second = capsys.readouterr().err.splitlines()
-    assert first.startswith("error: duration: ")
-    assert second.startswith("error: scenario: ")
 
 
 @pytest.mark.slow
@@ -133,7 +114,7 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
     monkeypatch.setattr(os, "pwrite", write)
     monkeypatch.setattr(np, "savez_compressed", fill)
     monkeypatch.setattr(Figure, "savefig", fill)
-    monkeypatch.setattr(simulate, "make_animation", fill)
+    monkeypatch.setattr(runs, "make_animation", fill)
     arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), "--set", "duration=5"]
     assert main([*arguments, "--set", "write.plots=true"]) == 1
     out, err = capsys.readouterr()
@@ -148,59 +129,6 @@ def test_a_full_disk_keeps_what_fits_and_prints_the_summary(room, tmp_path, monk
     if room:
         record = Record.load(tmp_path / "record.part")
         assert 0.1 < record.time[-1] < 5.0
-
-
-@pytest.mark.slow
-def test_a_terminal_without_letters_of_a_name(tmp_path):
-    out = tmp_path / "größe \N{SNOWMAN}"
-    process = command(
-        *("simulate", "two_link_wall", "--out", out, *SHORT, *BARE),
-        env=os.environ | {"PYTHONIOENCODING": "ascii"},
-    )
-    printed, err = process.communicate(timeout=60)
-    assert process.returncode == 0, err
-    assert r"gr\xf6\xdfe \u2603/: scenario.yaml, summary.txt" in printed
-    assert (out / "summary.txt").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="asks Linux which ports listen")
-def test_no_port_listens_while_a_run_goes_on_that_nobody_watches(tmp_path, monkeypatch, capsys):
-    def listening():
-        """Inodes of the sockets of this process that listen."""
-        gc.collect()  # The systems of an earlier animation hold its server.
-        own = {os.readlink(link) for link in Path("/proc/self/fd").iterdir() if link.exists()}
-        rows = (line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:])
-        return {row[9] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own}
-
-    def watched(*arguments, **options):
-        seen.append(listening())
-        result = drake_dae.simulate(*arguments, **options)
-        seen.append(listening())
-        return result
-
-    seen = [listening()]
-    monkeypatch.setattr(simulate, "simulate", watched)
-    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
-    assert main([*arguments, "--set", "write.plots=false"]) == 0
-    assert (tmp_path / "animation.html").exists()
-    assert seen[1] | seen[2] <= seen[0]  # One of an earlier test may have been closed.
-    assert main([*arguments, *QUICK, "--force", "--meshcat"]) == 0
-    assert len(seen[3] - seen[0]) == 1
-    capsys.readouterr()
-
-
-def test_all_is_there_but_an_animation_that_finds_no_port(tmp_path, monkeypatch, capsys):
-    def full(parameters):
-        raise RuntimeError("Meshcat failed to open a websocket port.")
-
-    monkeypatch.setattr(view, "Meshcat", full)
-    arguments = ["simulate", "two_link_wall", "--out", str(tmp_path), *SHORT]
-    assert main([*arguments, "--set", "write.plots=false"]) == 1
-    reason = "no port for Meshcat: Meshcat failed to open a websocket port."
-    assert error_line(capsys) == f"error: {tmp_path}/animation.html: {reason}"
-    left = ["record.npz", "scenario.yaml", "summary.txt"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == left
 
 
 @pytest.mark.parametrize("rows", [0, 3])

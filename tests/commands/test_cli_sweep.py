@@ -1,9 +1,6 @@
 """`drake-dae sweep`: what it prints and leaves, and what it refuses."""
 
-import re
-
 import pytest
-from command_line import shown_on_a_terminal
 
 from drake_dae.cli import main
 from drake_dae.studies.study import FILES
@@ -35,9 +32,6 @@ def test_it_leaves_its_files_and_prints_the_summary(tmp_path, monkeypatch, capsy
     [
         (["--vary", "start.errors.tool=0.1"], "start.errors: no output 'tool'"),
         (["--vary", "start.error=0.1"], "start: has no key 'error'; did you mean 'errors'"),
-        (["--vary", "duration=[1, a]"], "duration: expected a number, got 'a'"),
-        (["--vary", "duration=[]"], "duration: expected at least one value"),
-        (["--vary", "duration"], "duration: expected KEY=VALUES"),
         (["--vary", "duration=1..2"], "duration: 1..2 needs the number of its values"),
         (["--vary", "duration=1..2", "--random", "0"], "count must be a whole number from 1"),
         (["--vary", "duration=1", "--workers", "0"], "workers must be a whole number from 1"),
@@ -60,23 +54,9 @@ def test_the_files_of_others_are_left_alone(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["runs.csv"]
 
 
-@pytest.mark.parametrize(
-    "options", [[], [*VARY, "--random", "3", "--together"], [*VARY, "--random", "many"]]
-)
+@pytest.mark.parametrize("options", [[], [*VARY, "--random", "3", "--together"]])
 def test_wrong_usage_exits_with_2(options, capsys):
     with pytest.raises(SystemExit) as caught:
         main(["sweep", "two_link_wall", *options])
     assert caught.value.code == 2
     assert "usage: drake-dae sweep" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.thorough
-def test_a_bar_with_the_time_left_on_a_terminal(tmp_path):
-    vary = ["--vary", "start.errors.tool.z=[0, 0.01, 0.02, 3]"]
-    shown = shown_on_a_terminal(
-        ["sweep", "two_link_wall", *SHORT, "--out", tmp_path, "--workers=1", *vary]
-    )
-    steps = shown.rstrip().split("\r")
-    assert re.search(r"  0%\|.*\| 0/4 ", shown)
-    assert re.search(r"100%\|.*\| 4/4 ", steps[-1])

@@ -5,12 +5,12 @@ import signal
 
 import pytest
 
-from drake_dae.files import complete
+from drake_dae.commands.parser import complete
 from drake_dae.running.interruption import end_at_once, ending_signals
 
 
 def test_files_appear_when_they_are_complete(tmp_path):
-    with complete(tmp_path / "new", "one", "two") as place:
+    with complete(tmp_path / "new") as place:
         for name in ("one", "two"):
             (place / name).write_text(name)
             assert not (tmp_path / "new" / name).exists()

@@ -15,9 +15,8 @@ from runs import scenario, some
 
 from drake_dae import Record, simulate
 from drake_dae.cli import main
-from drake_dae.commands.folder import FILES, PART
+from drake_dae.commands.runs import FILES, PART
 from drake_dae.running.interruption import ENDING_SIGNALS
-from drake_dae.running.rollout.stepping.course import RunStepper
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
 
@@ -61,7 +60,7 @@ def interrupted(moments, parent, settings=()):
         (signal, exit code, folder) of each.
     """
     processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["drake_dae.commands.simulate", "matplotlib.figure"])
+    processes.set_forkserver_preload(["drake_dae.commands.runs", "matplotlib.figure"])
     runs = []
     for number, (sent, after) in enumerate(moments):
         folder = parent / f"{sent.name}{number}"
@@ -178,28 +177,6 @@ def test_a_killed_rollout_leaves_its_record_so_far(tmp_path, compiled):
     count = record.time.size - 1  # The end of a run is projected.
     for name in whole.signals:
         np.testing.assert_allclose(record[name][:count], whole[name][:count], 1e-9, 1e-9)
-
-
-@pytest.mark.usefixtures("signals_of_a_shell")
-def test_an_interrupted_rollout_keeps_what_it_has(tmp_path, monkeypatch, capsys):
-    """Ctrl-C after some steps of the integrator: the record goes up to there."""
-    accept = RunStepper.accept
-
-    def and_interrupt(self, *arguments):
-        accept(self, *arguments)
-        if self.steps == 20:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    words = ["simulate", "two_link_wall", "--rollout", "--set=compiled=false", "--set=duration=10"]
-    words += [f"--set={setting}" for setting in BARE]
-    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
-    monkeypatch.setattr(RunStepper, "accept", and_interrupt)
-    assert main([*words, "--out", str(tmp_path / "part")]) == 128 + signal.SIGINT
-    assert "interrupted" in capsys.readouterr().out
-    whole, part = (Record.load(tmp_path / name / "record.npz") for name in ("whole", "part"))
-    assert 1 < part.time.size < whole.time.size
-    for name in whole.signals:
-        np.testing.assert_allclose(part[name], whole[name][: part.time.size], rtol=0.0, atol=1e-12)
 
 
 LOADING = """

@@ -1,31 +1,22 @@
 """More controls than outputs: the control next to a free one in a metric."""
 
-from dataclasses import replace
-
 import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.systems.analysis import Simulator
 
 from drake_dae import (
     DaePlant,
     DaeSystem,
-    NormalForm,
     Parameter,
     SinusoidReference,
-    TrackingController,
     TrackingLaw,
-    ZeroDynamics,
-    dynamic_extension,
     find_structure,
     make_closed_loop,
     poles,
 )
-from drake_dae.dae import Verdict, extend
 from drake_dae.diagrams import LoopSettings
-from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import nearest_solution
 
 BY_U = np.array([[1.0, 0.4, -0.7, 0.2], [0.3, -1.1, 0.5, 0.9], [0.2, 0.6, 1.3, -0.8]])
@@ -144,90 +135,3 @@ def test_outputs_are_as_predicted_and_a_free_control_moves_none_of_them(law):
         records.append(record)
     still, pressed = records
     assert abs(pressed["state"][-1, 1] - still["state"][-1, 1]) > 0.1  # It moves what is free.
-
-
-def spare(free=None) -> DaeSystem:
-    """z'' = u_1 + 2 u_2 is steered, and s'' = -4 s - 0.2 s' + u_1 - u_2 is not."""
-    x = ca.SX.sym("x", 4)
-    h = ca.vertcat(ca.SX(2, 2), ca.SX([[1.0, 2.0], [1.0, -1.0]]))
-    f = ca.vertcat(x[2:], 0.0, -4.0 * x[1] - 0.2 * x[3])
-    chosen = None if free is None else free(x)
-    parts = (ca.SX(4, 0), h, ca.SX(0, 1), x[0], ca.SX(1, 0))
-    metric = np.diag([1.0, 3.0])
-    return DaeSystem(x, f, *parts, control_metric=metric, free_control=chosen)
-
-
-@pytest.mark.slow
-def test_zero_dynamics_are_those_under_the_chosen_control():
-    """By hand: with z = 0 the control is u_0 - B^+ B u_0, where B = (1, 2) and B^+ = (3, 2) / 7 by
-    W = diag(1, 3). For u_0 = (c, 0) that is (4, -2) c / 7, of which s gets 6 c / 7."""
-    system = spare()
-    assert ZeroDynamics(system).dimension == 2
-    found = ZeroDynamics(system).stability()
-    assert found.verdict is Verdict.STABLE
-    assert_allclose(sorted(found.eigenvalues.real), [-0.1, -0.1], atol=1e-9)
-    damped = spare(lambda x: ca.vertcat(-7.0 / 6.0 * x[3], 0.0))
-    found = ZeroDynamics(damped).stability()
-    assert_allclose(sorted(found.eigenvalues.real), [-0.6, -0.6], atol=1e-9)
-    grows = spare(lambda x: ca.vertcat(0.7 * x[3], 0.0))
-    assert ZeroDynamics(grows).stability().verdict is Verdict.UNSTABLE
-
-
-@pytest.mark.equation(27)
-def test_the_realization_moves_as_the_plant(law):
-    """(26), (27) are the rates of the plant's state, in the coordinates."""
-    random, structure = np.random.default_rng(3), law.structure
-    form, plant = NormalForm(law.system, structure=structure), DaePlant(law.system)
-    context = plant.CreateDefaultContext()
-    for _ in range(3):
-        x, u = consistent(law, random), random.uniform(-1.0, 1.0, 4)
-        plant.set_state(context, x)
-        plant.GetInputPort("control").FixValue(context, u)
-        expected = form.jacobian(x) @ plant.EvalTimeDerivatives(context).CopyToVector()
-        found = form.rates(x, u)
-        assert_allclose(found, expected[-found.size :], rtol=1e-9, atol=1e-9)
-
-
-def test_the_controller_has_the_gradients_of_the_choice(law):
-    """By AutoDiffXd and by central differences of 1e-6, so 1e-7."""
-    random = np.random.default_rng(6)
-    controller = TrackingController(law)
-    assert controller.GetOutputPort("control").size() == 4
-    assert controller.GetOutputPort("tracking_error").size() == 2
-    converted = controller.ToAutoDiffXd()
-    context = converted.CreateDefaultContext()
-    x, R = consistent(law, random), random.uniform(-1.0, 1.0, 4)
-    converted.GetInputPort("estimated_state").FixValue(context, InitializeAutoDiff(x))
-    converted.GetInputPort("reference").FixValue(context, R)
-    value = converted.GetOutputPort("control").Eval(context)
-    assert_allclose(ExtractValue(value).ravel(), law.control(x, R), rtol=1e-14)
-    steps = 1e-6 * np.eye(6)
-    expected = [(law.control(x + dx, R) - law.control(x - dx, R)) / 2e-6 for dx in steps]
-    assert_allclose(ExtractGradient(value), np.array(expected).T, rtol=1e-6, atol=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda: find_structure(replace(sled(), control_metric=None, free_control=None)),
-            "control_metric",
-        ),
-        (lambda: sled(control_metric=None), r"free_control.*control_metric"),
-        (lambda: sled(control_metric=np.eye(3)), r"control_metric.*\(3, 3\)"),
-        (lambda: sled(free_control=np.zeros(3)), r"free_control.*\(3, 1\)"),
-        (lambda: find_structure(sled(control_metric=np.diag([1, 1, 0, 1]))), "control_metric"),
-        (lambda: find_structure(sled(control_metric=ROOT)), "control_metric"),
-        (lambda: dynamic_extension(sled()), "control_metric"),
-        (lambda: extend(sled(), ["u0"]), "control_metric"),
-        (
-            lambda: DaeSystem.from_functions(
-                1, f=lambda x: -x, h=lambda x: 1.0, l=lambda x: x, control_metric=np.eye(1)
-            ),
-            "control_metric",
-        ),
-    ],
-)
-def test_refusals(make, message):
-    with pytest.raises(ModelError, match=message):
-        make()

@@ -7,7 +7,7 @@ from problems import system_of
 
 from drake_dae import DaeSystem, find_structure
 from drake_dae.dae import ViolationKind
-from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.errors import AssumptionError
 
 
 def violation(system):
@@ -55,14 +55,6 @@ def test_the_rows_that_follow_are_named_with_their_factors():
     assert "'corner' ~ 3 floor - 1 wall; 'wall again' ~ 1000 wall" in str(found)
 
 
-def test_factors_that_depend_on_the_state_are_reported():
-    """k_2 = (2 + sin q_2) k_1 has the gradient (2 + sin q_2) dk_1 on N*."""
-    found = violation(mass_point(lambda q: [q[0], (2 + ca.sin(q[1])) * q[0]]))
-    assert found.cause is ViolationKind.REDUNDANT
-    assert not found.combinations[0].constant
-    np.testing.assert_allclose(found.combinations[0].factors, 2 + np.sin(found.state[1]), rtol=1e-9)
-
-
 def test_a_singular_configuration_is_one():
     """Of (x, z, y) the gradients (-2x, 1, 0) and (2x + y, 1, x) are equal at the origin alone."""
 
@@ -101,27 +93,3 @@ def test_a_regular_difference_is_not_called_redundant(factor):
     np.testing.assert_allclose(combination.factors, [factor], rtol=1e-9)
     # The difference in its place.
     assert find_structure(hidden(lambda x: [x[0], x[1]])).constraint_degrees == (1, 2)
-
-
-def test_a_singular_mass_matrix_comes_with_its_remedy():
-    """0 = z - x^2 as a row of E x' = f; then lifted: z' = v, k = z - x^2."""
-    with pytest.raises(ModelError, match="z' = v"):
-        find_structure(
-            DaeSystem.from_functions(
-                ["x", "z"],
-                f=lambda s: [s[1], s[1] - s[0] ** 2],
-                h=lambda s: [1, 0],
-                l=lambda s: [s[0]],
-                mass_matrix=np.diag([1.0, 0.0]),
-            )
-        )
-    lifted = DaeSystem.from_functions(
-        ["x", "z"],
-        f=lambda s: [s[1], 0],
-        g=lambda s: [0, 1],
-        h=lambda s: [1, 0],
-        k=lambda s: [s[1] - s[0] ** 2],
-        l=lambda s: [s[0]],
-        m=lambda s: [[0]],
-    )
-    assert find_structure(lifted).constraint_degrees == (1,)

@@ -52,30 +52,6 @@ def test_derivatives_are_those_along_the_constrained_motion(problem):
         np.testing.assert_allclose(one, two, rtol=1e-10, atol=1e-10 * np.abs(two).max())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("problem", some(PROBLEMS, of=3, first=1), indirect=True)
-def test_the_rate_is_that_of_the_elimination(problem):
-    system = problem.system
-    motion, elimination = motion_of(system), find_structure(system).elimination
-    values = TracedFunction(
-        "rates",
-        {"x": system.state, "u": motion.control, "p": system.parameter_symbol},
-        {
-            "rate": motion.expand(motion.rate),
-            "by_hand": elimination.f_star + ca.mtimes(elimination.h_star, motion.control),
-            "matrix": motion.constraint_matrix,
-        },
-    )
-    random = np.random.default_rng(1)
-    state = problem.consistent(random)
-    controls = random.standard_normal(system.num_controls)
-    rate, by_hand, matrix = values(state, controls, system.parameter_values)
-    # A few operations on numbers up to 100.
-    np.testing.assert_allclose(rate, by_hand, rtol=1e-13, atol=1e-13)
-    expected = problem.known(state).constraint_matrix
-    np.testing.assert_allclose(matrix.reshape(expected.shape), expected, rtol=1e-12, atol=1e-12)
-
-
 def with_inertia(arm: DaeSystem, **fields) -> DaeSystem:
     """The two-link arm as E x' = f + g v + h u with E = diag(1, 1, M), as a robot is given."""
     inertia = ca.inv(arm.h[2:, :])
@@ -88,36 +64,6 @@ def with_inertia(arm: DaeSystem, **fields) -> DaeSystem:
         mass_matrix=mass,
         **fields,
     )
-
-
-def test_a_robot_with_a_mass_matrix():
-    problem = PROBLEMS["two_link_arm"]()
-    system = with_inertia(problem.system)
-    explicit = system.explicit
-    assert explicit.explicit is explicit
-    assert system.explicit is explicit
-    numbers = TracedFunction(
-        "fields",
-        {"x": system.state},
-        {
-            "found": ca.horzcat(explicit.f, explicit.g, explicit.h),
-            "by_hand": ca.horzcat(problem.system.f, problem.system.g, problem.system.h),
-        },
-    )
-    structure = find_structure(system)
-    law = TracedFunction(
-        "law", {"x": system.state}, {"a": structure.drift, "b": structure.control_matrix}
-    )
-    random = np.random.default_rng(0)
-    for _ in range(3):
-        state = problem.consistent(random)
-        # The inertia matrix has a condition of 10, its inverse is taken twice.
-        np.testing.assert_allclose(*numbers(state), rtol=1e-12, atol=1e-12)
-        drift, control_matrix = law(state)
-        np.testing.assert_allclose(drift, problem.known(state).drift, rtol=1e-11)
-        np.testing.assert_allclose(
-            control_matrix, problem.known(state).control_matrix, rtol=1e-11, atol=1e-12
-        )
 
 
 def test_the_implicit_form_may_be_given_in_fewer_operations():
@@ -149,30 +95,6 @@ def test_the_implicit_form_may_be_given_in_fewer_operations():
     for wrong in wrongs:
         with pytest.raises(ModelError, match="'implicit'"):
             find_structure(with_inertia(arm, implicit=wrong))
-
-
-def test_the_inverse_holds_no_unknown_whose_slope_cancels():
-    """c (s w) - s (c w) is zero to the Jacobian, and still an expression of w: each wanted value
-    asks so for the other unknown, whichever is solved for first. u is x'' here."""
-    x = ca.SX.sym("x", 4)
-    system = DaeSystem(
-        state=x,
-        f=ca.vertcat(x[2:], 0, 0),
-        g=[],
-        h=ca.vertcat(ca.SX(2, 2), ca.SX.eye(2)),
-        k=[],
-        l=x[:2],
-        m=[],
-        nominal_state=[0.3, 0.2, 0.1, 0.4],
-    )
-    motion = find_structure(system).derivatives
-    c, s, rate = ca.cos(x[0]), ca.sin(x[0]), motion.rate[2:]
-    both = rate + c * (s * rate[[1, 0]]) - s * (c * rate[[1, 0]])
-    assert ca.sparsify(ca.jacobian(both, rate)).nnz() == 2
-    wanted = ca.SX.sym("wanted", 2)
-    found, *_ = motion.inverse(both, wanted)
-    function = TracedFunction("inverse", {"x": x, "wanted": wanted}, {"u": found})
-    np.testing.assert_allclose(function([0.3, 0.2, 0.1, 0.4], [5.0, 7.0])[0], [5.0, 7.0])
 
 
 @pytest.mark.parametrize("angle", [1.0, 0.3, -1e-3, 1e-13, 0.0])

@@ -4,20 +4,15 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems.zero_systems import (
-    GRAVITY,
     MINIMUM_PHASE,
     Array,
-    cart_pendulum,
     derivatives,
     free_arm,
     internal,
     quadruple_tank,
-    spring_masses,
     zero_dynamics,
 )
-from scipy.integrate import solve_ivp
 
-import drake_dae.dae.pinned_motion as module
 from drake_dae.dae import DaeSystem, EndCause
 from drake_dae.errors import NonFiniteError
 
@@ -63,24 +58,6 @@ def test_the_guess_decides_which_solution_is_followed():
     np.testing.assert_allclose(coarse, up[::12], rtol=1e-9, atol=1e-9)
 
 
-def test_a_singular_b_under_running_zero_dynamics():
-    """z' = s u with s' = -1 from 1: s passes 0 at t = 1 s smoothly, u = r'/s does not."""
-    system = DaeSystem.from_functions(
-        ["z", "s"],
-        f=lambda x: [0, -1],
-        h=lambda x: [x[1], 0],
-        l=lambda x: x[0],
-        nominal_state=[0.0, 1.0],
-        name="clock",
-    )
-    times = np.linspace(0.0, 2.1, 8)  # 1 is not among them, and a step may pass it.
-    motion = zero_dynamics(system).motion(derivatives(lambda t: [ca.sin(t)], (1,)), times)
-    assert (motion.ending.cause, motion.ending.matrix) == (EndCause.SINGULAR, "B")
-    assert motion.ending.time == pytest.approx(1.0, abs=1e-6)
-    np.testing.assert_allclose(motion.control_margins, 1.0 - motion.times, atol=1e-12)
-    np.testing.assert_allclose(motion.controls[:, 0], np.cos(motion.times) / (1 - motion.times))
-
-
 @pytest.mark.slow
 def test_unstable_zero_dynamics_end_the_motion_in_growth():
     """s' = s: exp(t) is 1e8 at t = 18.4; s' = s^2 is infinite at t = 1."""
@@ -95,44 +72,6 @@ def test_unstable_zero_dynamics_end_the_motion_in_growth():
     assert fast.ending.cause is EndCause.UNBOUNDED
     assert fast.ending.time == pytest.approx(1.0, abs=1e-5)
     np.testing.assert_allclose(fast.states[:, 1], 1 / (1 - fast.times), rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_a_long_motion_does_not_drift(monkeypatch):
-    """With errors of 1e-3 a step: outputs and rod to round-off, and the angle to a few steps."""
-    monkeypatch.setattr(module, "TOLERANCE", 1e-3)
-    reference = derivatives(lambda t: [0.3 * ca.cos(2.0 * t)], (2,))
-    times = np.linspace(0.0, 200.0, 11)
-    dynamics = zero_dynamics(cart_pendulum(damping=1.0, angle=np.pi))
-    motion = dynamics.motion(reference, times)
-    assert motion.ending is None
-    np.testing.assert_allclose(motion.states[:, 0], 0.3 * np.cos(2.0 * times), atol=1e-11)
-    rod = motion.states[:, 1:3] - motion.states[:, :1] * [1.0, 0.0]
-    np.testing.assert_allclose(np.hypot(*rod.T), 0.7, atol=1e-11)
-    expected = solve_ivp(
-        lambda t, a: [
-            a[1],
-            (GRAVITY * np.sin(a[0]) - reference(t)[2] * np.cos(a[0])) / 0.7 - a[1],
-        ],
-        (0, 200),
-        [np.pi, 0.0],
-        "DOP853",
-        times,
-        rtol=1e-9,
-        atol=1e-10,
-    ).y
-    found = np.pi + np.arctan2(-rod[:, 0], -rod[:, 1])
-    np.testing.assert_allclose(found, expected[0], rtol=0, atol=5e-3)
-
-
-def test_the_work_is_bounded(monkeypatch):
-    monkeypatch.setattr(module, "MOST_STEPS", 50)
-    system = spring_masses(0.0)
-    motion = zero_dynamics(system).motion(
-        derivatives(lambda t: [0], (2,)), [0.0, 1000.0], [0.0, 1.0, 0.0, 0.0]
-    )
-    assert motion.ending.cause is EndCause.TOO_FAST
-    assert 0.0 < motion.ending.time < 1000.0
 
 
 def test_motions_end_where_domain_and_reference_do():
@@ -178,15 +117,3 @@ def test_motions_end_where_domain_and_reference_do():
     assert motion.ending.cause is EndCause.NO_WAY_ON
     assert 0 < motion.times.size < 41
     assert np.min(motion.states) > 0.0
-
-
-def test_a_motion_that_has_no_start_is_empty():
-    dynamics = zero_dynamics(free_arm())
-    motion = dynamics.motion(lambda t: np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]), [0.5, 1.0])
-    assert motion.ending.cause is EndCause.NO_START
-    assert "x = 2, y = 0" in str(motion.ending)
-    assert motion.ending.time == 0.5
-    assert motion.states.shape == (0, 4)
-    assert motion.controls.shape == (0, 2)
-    assert motion.constraint_inputs.shape == (0, 0)
-    assert motion.control_margins.shape == motion.constraint_margins.shape == (0,)

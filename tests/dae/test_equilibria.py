@@ -1,7 +1,5 @@
 """Equilibria of zero dynamics: where they are, which are none, and what is said of those."""
 
-import warnings
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -21,11 +19,9 @@ from problems.zero_systems import (
     zero_dynamics,
 )
 
-from drake_dae import ConstantReference, DaePlant, analyze, make_closed_loop
-from drake_dae.dae import DaeSystem, TrackingLaw, Verdict, ZeroDynamics, find_structure, poles
+from drake_dae.dae import DaeSystem, Verdict, ZeroDynamics
 from drake_dae.errors import (
     InconsistentStateError,
-    NonMinimumPhaseWarning,
 )
 
 
@@ -97,98 +93,6 @@ def test_no_equilibrium_is_reported():
     assert still.verdict is Verdict.UNDECIDED
     np.testing.assert_allclose(still.state, rest, rtol=0, atol=1e-12)
     np.testing.assert_allclose(still.eigenvalues, [0.0, 0.0], atol=1e-12)
-
-
-def slider() -> DaeSystem:
-    """On a floor that pushes with v, and beside it xi' = xi (v - 40); z = (place, v)."""
-    return DaeSystem.from_functions(
-        ["x", "y", "vx", "vy", "xi"],
-        f=lambda s: [s[2], s[3], 0, -9.81, -40 * s[4]],
-        g=lambda s: [0, 0, 0, 1, s[4]],
-        h=lambda s: [[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]],
-        k=lambda s: [s[1]],
-        l=lambda s: [s[0], 0],
-        m=lambda s: [[0], [1]],
-        name="slider",
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("force", "rate"), [(20.0, -20.0), (80.0, 40.0)])
-def test_the_force_that_is_asked_for_decides(force, rate):
-    """The force is met at once, so that no state tells it: the eigenvalue is v - 40."""
-    system = slider()
-    structure = find_structure(system)
-    dynamics = ZeroDynamics(structure.system, structure=structure)
-    outputs = [0.0, force]
-    rest = dynamics.equilibrium(outputs)
-    assert dynamics.eigenvalues(rest, outputs=outputs) == pytest.approx([rate], rel=1e-9)
-    verdict = dynamics.stability(outputs=outputs).verdict
-    assert verdict is (Verdict.UNSTABLE if rate > 0 else Verdict.STABLE)
-    told = analyze(
-        system, reference=lambda t: np.array([0.0, 0.0, 0.0, force]), times=np.linspace(0, 0.1, 5)
-    )
-    assert told.zero_dynamics.verdict is verdict
-    law = TrackingLaw(system, poles(-3.0), structure=structure)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        make_closed_loop(
-            DaePlant(structure.system, structure=structure), law, [ConstantReference(outputs)]
-        )
-    assert [w.category for w in caught] == [NonMinimumPhaseWarning] * (rate > 0)
-
-
-@pytest.mark.parametrize(
-    ("rate", "nominal"),
-    [(lambda x: -(x**2), 0.1), (lambda x: ca.cos(x) - 1, 0.3), (lambda x: 0 * x, 0.2)],
-)
-def test_an_equilibrium_that_is_found_slowly_decides_nothing(rate, nominal):
-    """Its eigenvalue is 0, and Newton's method ends where it is only near 0."""
-    system = DaeSystem.from_functions(
-        ["y", "xi"],
-        f=lambda x: [0, rate(x[1])],
-        h=lambda x: [1, 0],
-        l=lambda x: [x[0]],
-        nominal_state=[0.0, nominal],
-    )
-    assert ZeroDynamics(system).stability().verdict is Verdict.UNDECIDED
-
-
-def test_rest_does_not_depend_on_the_unit_of_time():
-    """An electrostatic actuator with its voltage held: a plate on a spring, modes of 2e4 1/s.
-
-    Place, speed and charge in units of the gap, 0.1 m/s and q. What is left of x' where Newton's
-    method ends is round-off of these, times the rates. At a voltage V the force is
-    e V^2 / (2 (gap - x)^2), so that m s^2 + b s + k - e V^2 / (gap - x)^3 = 0.
-    """
-    mass, damping, stiffness, gap, e, resistance = 1e-9, 1e-6, 1.0, 2e-6, 8.85e-20, 1e3
-    q = np.sqrt(2 * e * stiffness * 0.4 * gap)
-
-    def force(x: ca.SX) -> ca.SX:
-        return (q * x[2]) ** 2 / (2 * e) - 0.1 * damping * x[1] - stiffness * gap * x[0]
-
-    system = DaeSystem.from_functions(
-        3,
-        f=lambda x: [
-            0.1 * x[1] / gap,
-            force(x) / mass / 0.1,
-            -gap * x[2] * (1 - x[0]) / e / resistance,
-        ],
-        h=lambda x: [0, 0, 1 / resistance / q],
-        l=lambda x: [q * gap * x[2] * (1 - x[0]) / e],
-        nominal_state=[0.42, 0.0, 1.0],
-    )
-    stability = ZeroDynamics(
-        find_structure(system, spread=[0.02, 0.01, 0.02]).system,
-        structure=find_structure(system, spread=[0.02, 0.01, 0.02]),
-    ).stability()
-    assert stability.verdict is Verdict.UNSTABLE
-    place, _, charge = stability.state
-    voltage = q * gap * charge * (1 - place) / e
-    softened = stiffness - e * voltage**2 / (gap * (1 - place)) ** 3
-    expected = np.roots([mass, damping, softened])
-    # The place is known to 1e-9 of the gap.
-    np.testing.assert_allclose(np.sort(stability.eigenvalues.real), np.sort(expected), rtol=1e-8)
 
 
 def test_a_clock_among_the_states_is_reported():

@@ -8,7 +8,6 @@ from problems import (
 )
 from problems.extensions import (
     CRANE,
-    extension_of,
     unicycle,
     wheels,
 )
@@ -84,23 +83,3 @@ def test_a_figure_of_eight(make, speed):
     np.testing.assert_allclose(predicted[0], [0.2, -0.1], rtol=1e-15)
     # The integrator keeps 1e-11 a step of numbers of order 1.
     np.testing.assert_allclose(outputs - wanted, predicted, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_load_on_a_crane():
-    """The load moves on an ellipse with the predicted error, by trolley and winch."""
-    extension = extension_of("crane")
-    law = TrackingLaw(extension.system, poles(-3.0), structure=extension.structure)
-    across, up = wave(0.0, 0.3, 1.5, 4), wave(-1.0, 0.1, 1.5, 4, np.pi / 2)
-
-    def reference(t: float) -> np.ndarray:
-        return np.concatenate([across(t), up(t)])
-
-    start = extension.structure.manifold.project(extension.system.nominal_state)
-    times = np.linspace(0.0, 3.0, 10)
-    outputs = original_loop(extension, law, start, reference, times)
-    wanted = np.array([reference(t)[[0, 5]] for t in times])
-    predicted = law.predicted_error(times, start, reference(0.0))
-    assert np.abs(predicted[1:]).max() > 0.05
-    # The integrator keeps 1e-11 a step; the law of order 4 amplifies it.
-    np.testing.assert_allclose(outputs - wanted, predicted, rtol=0, atol=1e-8)

@@ -2,24 +2,12 @@
 
 from collections.abc import Callable
 
-import casadi as ca
 import numpy as np
 import pytest
-from runs import some
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from drake_dae import analyze
-from drake_dae.analysis.report import Finding
 from drake_dae.dae import DaeSystem, StabilityAlong, Verdict, ZeroDynamics
-from drake_dae.errors import ModelError
-from drake_dae.references import (
-    CircleReference,
-    ConstantReference,
-    ExpressionReference,
-    SinusoidReference,
-)
-from drake_dae.references.reference import common_period
 
 Array = np.ndarray
 
@@ -94,27 +82,6 @@ def test_growth_by_a_parameter_that_oscillates():
     assert found.verdict is Verdict.UNSTABLE
     # At rest nothing is wrong.
     assert ZeroDynamics(oscillator(mathieu)).stability().verdict is Verdict.STABLE
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("damping", some([0.5, 0.02]))
-def test_multipliers_of_a_stable_motion(damping):
-    """s'' = -(1 + 0.1 sin 3t) s - d s' + 0.2 sin 3t: multipliers of size exp(-d P / 2)."""
-    system = oscillator(lambda s, w, z: -(1 + 0.1 * z) * s - damping * w + 0.2 * z)
-
-    def reference(t):
-        return np.array([np.sin(3 * t), 3 * np.cos(3 * t)])
-
-    period = 2 * np.pi / 3
-    found = along(system, reference, period)
-
-    def slopes(t):
-        return np.array([[0.0, 1.0], [-(1 + 0.1 * np.sin(3 * t)), -damping]])
-
-    expected = by_size(np.linalg.eigvals(monodromy(slopes, period)))
-    np.testing.assert_allclose(by_size(found.multipliers), expected, rtol=1e-7)
-    np.testing.assert_allclose(np.abs(found.multipliers), np.exp(-damping * period / 2), rtol=1e-7)
-    assert found.verdict is Verdict.STABLE
 
 
 @pytest.mark.slow
@@ -196,95 +163,8 @@ def test_multipliers_with_a_constraint():
     assert found.verdict is Verdict.UNSTABLE
 
 
-def test_a_multiplier_of_a_thousand_is_unstable():
-    """s' = a(t) s with the mean 4.5: the multiplier is exp(4.5 P) = 1195 over P = 1.574 s."""
-    period = np.log(1195.0) / 4.5
-    rate = 2 * np.pi / period
-    system = DaeSystem.from_functions(
-        ["z", "s"],
-        f=lambda x: [0, (4.5 + 3.0 * x[0]) * x[1]],
-        h=lambda x: [1, 0],
-        l=lambda x: x[0],
-        nominal_state=[0.0, 0.01],
-    )
-    found = along(system, sinusoid(rate), period, periods=1.5)
-    np.testing.assert_allclose(found.multipliers, [1195.0], rtol=1e-6)
-    assert found.verdict is Verdict.UNSTABLE
-    # The motion itself ends on the way, since it has grown by 1e8.
-    ended = along(system, sinusoid(rate), period, periods=6)
-    np.testing.assert_allclose(ended.multipliers, [1195.0], rtol=1e-6)
-    told = analyze(system, reference=sinusoid(rate), times=np.linspace(0, period, 9), period=period)
-    assert told.zero_dynamics_along.verdict is Verdict.UNSTABLE
-    assert any("1195" in problem for problem in told.problems)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("rate", "size"), [(3.3, 0.3), (2.0, 0.0)])
-def test_a_limit_cycle_without_the_period_of_the_reference_is_not_called_stable(rate, size):
-    """The oscillator of FitzHugh and Nagumo, weakly driven; near it only its focus repeats.
-
-    The multipliers at the focus, without a drive, are exp(P l) with its eigenvalues l.
-    """
-    system = oscillator(
-        lambda s, w, z: 3.0 * (1 - s**2) * w - s + 0.9 + z,
-        start=(2.0, 0.0),
-    )
-    found = along(system, sinusoid(rate, size), 2 * np.pi / rate, count=241)
-    assert found.verdict is not Verdict.STABLE
-    if found.multipliers.size and not size:
-        slopes = np.array([[0.0, 1.0], [-1.0, 3.0 * (1 - 0.9**2)]])
-        expected = np.exp(2 * np.pi / rate * np.linalg.eigvals(slopes))
-        np.testing.assert_allclose(by_size(found.multipliers), by_size(expected), rtol=1e-5)
-
-
 def test_multipliers_on_the_unit_circle_do_not_decide():
     """s'' = -s + z at rate 2: an oscillator without damping, multipliers exp(+- i pi)."""
     found = along(oscillator(lambda s, w, z: -2.0 * s + z), sinusoid(2.0), np.pi)
     np.testing.assert_allclose(np.abs(found.multipliers), 1.0, rtol=1e-7)
     assert found.verdict is Verdict.UNDECIDED
-
-
-@pytest.mark.parametrize(
-    ("references", "period"),
-    [
-        ([ConstantReference([1.0, 2.0])], 0.0),
-        ([SinusoidReference(0.0, 1.0, 2.0), ConstantReference(1.0)], np.pi),
-        ([CircleReference([0, 0], 1.0, period=-6.0), SinusoidReference(0.0, 1.0, np.pi)], 6.0),
-        ([SinusoidReference(0.0, [1.0, 0.5], [2.0, 3.0])], 2.0 * np.pi),
-        ([SinusoidReference(0.0, [1.0, 0.5], [2.0, np.sqrt(3.0)])], None),
-        ([SinusoidReference(0.0, 1.0, 2.0), ExpressionReference(lambda t: [ca.sin(2 * t)])], None),
-    ],
-)
-def test_the_period_of_references_together(references, period):
-    found = common_period([reference.repeats for reference in references])
-    assert found == (None if period is None else pytest.approx(period, rel=1e-12))
-
-
-def test_arguments_that_do_not_fit_are_refused():
-    dynamics = ZeroDynamics(oscillator(mathieu))
-    motion = dynamics.motion(sinusoid(2.0), [0.0, 1.0])
-    with pytest.raises(ModelError, match=r"reference\(0\)"):
-        dynamics.stability_along(lambda t: np.zeros(3), motion, 1.0)
-    other = DaeSystem.from_functions(2, f=lambda x: [0, x[1]], h=lambda x: [1, 0], l=lambda x: x[0])
-    with pytest.raises(ModelError, match=r"\(2, 3\)"):
-        ZeroDynamics(other).stability_along(sinusoid(2.0), motion, 1.0)
-    for period in (3.0, 0.0, -1.0, np.nan):
-        with pytest.raises(ModelError, match=f"{period:g}"):
-            dynamics.stability_along(sinusoid(2.0), motion, period)
-
-
-@pytest.mark.slow
-def test_analyze_reports_growth_along_a_reference():
-    told = analyze(
-        oscillator(mathieu),
-        reference=sinusoid(2.0),
-        times=np.linspace(0.0, 60.0, 61),
-        period=np.pi,
-    )
-    assert told.zero_dynamics.verdict is Verdict.STABLE
-    assert told.zero_dynamics_along.verdict is Verdict.UNSTABLE
-    assert told.zero_dynamics_finding is Finding.VIOLATED
-    assert len(told.problems) == 1
-    data = told.to_dict()["zero_dynamics_along"]
-    np.testing.assert_allclose(data["multipliers"], [[-1.93398, 0], [-0.48558, 0]], atol=1e-5)
-    assert data["verdict"] == "unstable"

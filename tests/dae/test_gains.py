@@ -29,21 +29,6 @@ def test_the_error_dynamics_have_the_chosen_poles(chosen):
     np.testing.assert_allclose(gains.matrix[0, ::-1], np.poly(chosen)[1:].real, rtol=1e-14)
 
 
-def test_a_star_stands_for_all_other_outputs():
-    gains = poles({"a": -1.0, "*": -2.0})(["a", "met", "b", "c"], [1, 0, 1, 2])
-    np.testing.assert_array_equal(np.diag(gains.matrix[[0, 2, 3]]), [1.0, 2.0, 4.0])
-    assert gains.matrix[3, 3] == 4.0
-
-
-def test_coefficients_stand_lowest_derivative_first():
-    gains = gain_coefficients([6.0, 5.0])(["a", "b"], [2, 2])
-    np.testing.assert_array_equal(gains.matrix, [[6, 5, 0, 0], [0, 0, 6, 5]])
-    # s^2 + 5 s + 6 = (s + 2)(s + 3).
-    np.testing.assert_allclose(sorted_poles(gains.poles), [-3, -3, -2, -2], rtol=1e-14)
-    single = gain_coefficients({"a": [3.0], "c": 4.0})(["a", "b", "c"], [1, 0, 1])
-    np.testing.assert_array_equal(single.matrix, [[3, 0], [0, 0], [0, 4]])
-
-
 LAMBDA_1 = np.array([[30.0, 4.0, 1.0], [-5.0, 25.0, 2.0], [3.0, 1.0, 20.0]])
 LAMBDA_2 = np.array([[11.0, 2.0, 0.0], [1.0, 10.0, -2.0], [0.5, 1.0, 9.0]])
 
@@ -127,38 +112,6 @@ def test_gains_that_are_not_hurwitz_are_refused(what):
     design, degrees = NOT_HURWITZ[what]
     with pytest.raises(GainError, match="poles"):
         design([f"z{i}" for i in range(len(degrees))], degrees)
-
-
-REFUSED = {
-    "too many poles": (poles([-1, -2, -3]), [2], r"\b3\b"),
-    "no poles": (poles([]), [2], r"\b0\b"),
-    "complex poles without partner": (poles([-1 + 1j, -2 - 1j]), [2], r"\ba\b"),
-    "one complex pole": (poles(-1 + 1j), [3], r"\ba\b"),
-    "an odd number of complex poles": (poles([-1 + 1j, -1 - 1j, -1 + 1j]), [3], r"\ba\b"),
-    "too few coefficients": (gain_coefficients([1.0]), [2], "K_i1.*1"),
-    "unknown outputs": (poles({"b": -1.0}), [2], "b.*a"),
-    "no outputs": (gain_coefficients({}), [2], r"\ba\b"),
-    "gains of an output met at once": (poles({"a": -1.0}), [0], "0.*a"),
-    "too many groups": (
-        gain_matrices([1, 2], [3]),
-        [2],
-        "1.*2",
-    ),
-    "a group too few": (gain_matrices(), [2], r"\[2\].*1.*0"),
-    "a matrix too few": (gain_matrices([1.0]), [2], "2.*1"),
-    "a wrong matrix": (
-        gain_matrices([np.eye(2), 1.0]),
-        [2],
-        r"\(2, 2\).*\(1, 1\)",
-    ),
-}
-
-
-@pytest.mark.parametrize("what", REFUSED)
-def test_wrong_designs_are_refused_by_name(what):
-    design, degrees, message = REFUSED[what]
-    with pytest.raises(GainError, match=message):
-        design(["a"], degrees)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from runs import roll, run_scenario, scenario
+from runs import roll, scenario
 from scipy.linalg import expm
 
 from drake_dae import DaeSystem, TrackingLaw, poles
@@ -82,33 +82,6 @@ def test_damping_of_several_joints_at_once_is_a_matrix():
     wanted = -(POLE**2) * position + 2.0 * POLE * speed
     inertia = INERTIA * np.eye(2) + LATENCY * damping
     np.testing.assert_allclose(control, inertia @ wanted + damping @ speed, rtol=1e-12)
-
-
-LATE = "sampling={period: 0.001, delay: 0.001}"
-DAMPED = "robot.known_forces=[!JointFriction {joints: [joint1, joint2], viscous: 1000}]"
-
-
-def off_prediction(*settings):
-    """The law, and how far a run that starts 2 cm off its path leaves its predicted error."""
-    start = "start.errors={tool.z: 0.02}"
-    loop, _, record = run_scenario(scenario("two_link_wall", start, "duration=1.5", *settings))
-    difference = record["tracking_error"] - loop.predicted_error(record)
-    return loop.controller.law, np.abs(difference[:, 0]).max()
-
-
-@pytest.mark.slow
-def test_a_sampled_scenario_knows_the_latency_of_its_law(monkeypatch):
-    """Two links of 0.1 kg m^2 with 1000 N m s: off the prediction as without damping.
-
-    A law without the latency leaves it by more than five times as much.
-    """
-    law, undamped = off_prediction(LATE)
-    assert law.latency == pytest.approx(0.0015)
-    assert law.damped_structure is law.structure
-    _, late = off_prediction(LATE, DAMPED)
-    assert late < 2.0 * undamped
-    monkeypatch.setattr("drake_dae.scenario.build.latency_of", lambda *_: 0.0)
-    assert off_prediction(LATE, DAMPED)[1] > 5.0 * late
 
 
 @pytest.mark.slow

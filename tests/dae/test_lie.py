@@ -1,13 +1,12 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.dae.derivatives import lie_derivative, lie_derivative_along
+from drake_dae.dae.derivatives import lie_derivative
 
 N = 4
 X = ca.SX.sym("x", N)
 
 # Functions of order one evaluated near zero: a few roundings of numbers of order 10.
-ROUND_OFF = 1e-12
 
 
 def numbers(expression: ca.SX, state: np.ndarray) -> np.ndarray:
@@ -33,28 +32,6 @@ def cases():
         yield functions, fields, random.uniform(-1.0, 1.0, N), random.normal(size=2)
 
 
-def equal(left: ca.SX, right: ca.SX, state: np.ndarray, tolerance: float = ROUND_OFF) -> None:
-    one, two = numbers(left, state), numbers(right, state)
-    assert one.shape == two.shape
-    np.testing.assert_allclose(one, two, rtol=tolerance, atol=tolerance)
-
-
-def test_repeated_derivatives_by_hand():
-    # A pendulum x0'' = -sin x0 with k = x0^2: k' = 2 x0 x1, k'' = 2 x1^2 - 2 x0 sin x0, ...
-    field = ca.vertcat(X[1], -ca.sin(X[0]), 0, 0)
-    a, b = X[0], X[1]
-    by_hand = [
-        a**2,
-        2 * a * b,
-        2 * b**2 - 2 * a * ca.sin(a),
-        -6 * b * ca.sin(a) - 2 * a * b * ca.cos(a),
-    ]
-    found = X[0] ** 2
-    for wanted in by_hand:
-        equal(found, wanted, np.array([0.7, -1.3, 0.0, 0.0]))
-        found = lie_derivative(found, field, X)
-
-
 def test_against_finite_differences():
     step = 1e-5
     for (k, _), (f, g, _), state, _ in cases():
@@ -76,12 +53,3 @@ def test_against_finite_differences():
         np.testing.assert_allclose(
             numbers(lie_bracket(f, g, X), state), bracket, rtol=1e-6, atol=1e-6
         )
-
-
-def test_along_several_fields_at_once():
-    for (k, el), fields, state, _ in cases():
-        found = lie_derivative_along(ca.vertcat(k, el), ca.horzcat(*fields), X)
-        one_by_one = ca.vertcat(
-            *[ca.horzcat(*[lie_derivative(e, field, X) for field in fields]) for e in (k, el)]
-        )
-        equal(found, one_by_one, state)

@@ -160,26 +160,3 @@ def check_identity(found: Linearization, degrees: tuple[int, ...]) -> None:
         )
         response = found.minimal.response(s) @ powers
         np.testing.assert_allclose(response, np.eye(len(degrees)), rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("gain", [0.0, 1.5])
-def test_a_loop_with_measured_force(gain):
-    """The force that is measured depends on the control at once; the tracking stays exact."""
-    robot = arm("two_link")
-    tracking = TrackingLaw(
-        robot.model.dae,
-        poles(-4.0),
-        structure=robot.structure,
-        measured_force=True,
-        force_gain=gain,
-    )
-    reference = np.zeros(tracking.layout.reference_size)
-    start = tracking.error_coordinates(robot.structure.states[0], reference)
-    reference[tracking.layout.chained] = start
-    reference[tracking.layout.lowest[tracking.layout.direct]] = 9.0
-    found = linearize_loop(tracking, reference)
-    check_identity(found, tracking.degrees)
-    measured = tracking.control(found.state, reference, measured_force=found.constraint_input)
-    np.testing.assert_allclose(found.control, measured, rtol=1e-9, atol=1e-9)
-    # And as a descriptor form, with the force among the unknowns.
-    assert found.descriptor.A.shape[0] == robot.model.dae.num_states + 1

@@ -3,14 +3,10 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from problems import PROBLEMS, Problem, double_integrator, pendulum, system_of
-from runs import scenario
+from problems import PROBLEMS, Problem, pendulum, system_of
 
-from drake_dae import build_scenario
 from drake_dae.dae import DaeSystem, Manifold, Signal, find_constraint_structure, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import newton, shortest_steps
-from drake_dae.trace.round_off import are_dependent
 
 CONSTRAINED = [name for name, make in PROBLEMS.items() if make().constraint_degrees]
 
@@ -61,29 +57,6 @@ def test_residual_and_dimension_are_those_found_by_hand(problem):
 
 
 @pytest.mark.slow
-def test_steps_taken_at_once_are_those_of_newtons_method(problem):
-    """What a simulation calls, against Newton's method with the factors of LAPACK."""
-    random = np.random.default_rng(4)
-    manifold = problem.structure.manifold
-    parameters, scale = problem.system.parameter_values, problem.system.scale
-    for size in (1e-14, 1e-11, 1e-8, 1e-5, 1e-2):
-        start = problem.consistent(random)
-        start = start + size * random.standard_normal(start.size)
-        found, converged = newton(
-            start / scale,
-            lambda z: shortest_steps(
-                manifold.gradients(scale * z) * scale, lambda z: manifold.residual(scale * z)
-            ),
-        )
-        assert converged
-        # Two factorizations, each to round-off of numbers of order 1.
-        state = manifold.projected(start.copy(), parameters)
-        np.testing.assert_allclose(state, scale * found, rtol=1e-14, atol=1e-14)
-        again = manifold.projected(state, parameters)
-        np.testing.assert_allclose(again, state, rtol=0, atol=1e-15 * np.linalg.norm(state))
-
-
-@pytest.mark.slow
 def test_projection_reaches_the_manifold_to_round_off(problem):
     manifold = problem.structure.manifold
     random = np.random.default_rng(1)
@@ -120,14 +93,6 @@ def test_redundant_constraints_still_have_a_projection(k):
     np.testing.assert_allclose(manifold.residual(state), 0.0, atol=1e-14)
 
 
-def test_more_residual_than_floating_point_can_resolve_is_no_failure():
-    # In picometers: the residual of the nearest doubles is up to 1e12 * 1e-16.
-    manifold = manifold_of(lambda x: 1e12 * (x[0] ** 2 + x[1] ** 2 - 2.0))
-    for angle in np.linspace(0.1, 1.5, 12):
-        state = manifold.project([1.5 * np.cos(angle), 1.5 * np.sin(angle)])
-        assert np.hypot(*state) == pytest.approx(np.sqrt(2.0), abs=1e-15)
-
-
 def test_failures_say_what_is_left_and_why():
     with pytest.raises(InconsistentStateError, match="y0 = 1") as caught:
         manifold_of(lambda x: x[0] ** 2 + 1).project([0.3, 0.0])
@@ -141,45 +106,6 @@ def test_failures_say_what_is_left_and_why():
     # The gradient vanishes at the centre of the circle.
     with pytest.raises(InconsistentStateError, match="y0 = -4"):
         circle(radius=2.0).project([0.0, 0.0])
-
-
-@pytest.mark.parametrize(
-    ("gradients", "expected"),
-    [
-        ([[1, 0, 0], [0, 1, 0]], False),
-        ([[1, 1, 0], [2, 2, 0]], True),
-        ([[1, 1, 0], [1, 1, 1e-11]], True),
-        ([[1, 1, 0], [1, 1, 1e-6]], False),
-        # Lengths are units.
-        ([[1e-9, 0, 0], [0, 1e9, 0]], False),
-        ([[1, 0, 0], [0, 0, 0]], True),
-        ([[1, 0], [0, 1], [1, -1]], True),
-        ([[1, np.inf, 0], [0, 1, 0]], True),
-    ],
-)
-def test_dependent_gradients(gradients, expected):
-    assert are_dependent(np.array(gradients, dtype=float)) is expected
-
-
-def test_a_constraint_that_no_state_changes_is_never_met():
-    """Newton's step is zero there, which is not the same as being on N*."""
-    held = replace(double_integrator(), k=1, g=[0, 1], m=[0])
-    manifold = Manifold(held, [[held.k]])
-    assert not manifold.is_consistent([0.0, 0.0])
-    with pytest.raises(InconsistentStateError):
-        manifold.project([0.0, 0.0])
-
-
-@pytest.mark.parametrize("length", [1e-9, 1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9])
-def test_projection_does_not_depend_on_the_unit_of_length(length):
-    """A circle in metres, or in any other unit, from starts off it by 10%: to round-off of it."""
-    manifold = circle(radius=length)
-    for angle in np.linspace(0.1, 6.2, 20):
-        point = length * np.array([np.cos(angle), np.sin(angle)])
-        state = manifold.project(1.1 * point)
-        np.testing.assert_allclose(np.hypot(*state), length, rtol=1e-15)
-        # The nearest one, which is on the same ray.
-        np.testing.assert_allclose(state, point, rtol=0, atol=1e-14 * length)
 
 
 def test_a_given_start_is_settled_level_by_level():
@@ -201,27 +127,6 @@ def test_a_given_start_is_settled_level_by_level():
     )
     assert np.abs(manifold.project(wrong)[:2] - wrong[:2]).max() > 1e-10
     assert np.max(np.abs(manifold.residual(found))) < 1e-13
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["two_arms", "four_bar"])
-def test_the_gradient_in_fewer_operations_is_the_gradient(name):
-    """Also off the manifold. Two arms have less than half of the operations."""
-    loop, _ = build_scenario(scenario(name))
-    manifold = loop.plant.structure.manifold
-    short, whole = manifold.short_gradient, manifold.gradient
-    assert short is not whole
-    state, system = manifold.system.state, manifold.system
-    inputs = [state, system.parameter_symbol]
-    functions = [ca.Function("C", inputs, [ca.cse(each)]) for each in (short, whole)]
-    counts = [each.n_instructions() for each in functions]
-    assert counts[0] < {"two_arms": 0.5, "four_bar": 1.0}[name] * counts[1]
-    random = np.random.default_rng(2)
-    for _ in range(5):
-        x = system.nominal_state + 0.3 * random.standard_normal(system.num_states)
-        found, wanted = (each(x, system.parameter_values).full() for each in functions)
-        # Sums of some ten products of order 1.
-        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-13)
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-15, 1e-9, 1e-6])
@@ -288,25 +193,3 @@ def test_states_that_are_fixed_keep_their_values_or_it_says_so():
         manifold.settle([0.3, 0.0, 0.0, 0.0], fixed=["x", "y"])
     with pytest.raises(ModelError, match="'z'"):
         manifold.settle([0.3, 0.0, 0.0, 0.0], fixed=["z"])
-
-
-def test_a_start_half_a_turn_off_is_tried_again():
-    """2 tan(x / 2) is zero at 0, and has a pole at half a turn, where Newton's step is short."""
-    x, v = ca.SX.sym("x", 2), ca.SX.sym("v", 2)
-    system = DaeSystem(
-        name="weld",
-        state=ca.vertcat(x, v),
-        f=ca.vertcat(v, 0, 0),
-        g=ca.vertcat(0, 0, 1, 0),
-        h=ca.SX(4, 0),
-        k=2 * ca.tan(x[0] / 2),
-        l=ca.SX(0, 1),
-        m=ca.SX(0, 1),
-        nominal_state=np.zeros(4),
-    )
-    manifold = find_constraint_structure(system).manifold
-    start = [np.pi - 1e-9, 0.5, 0.0, 0.0]
-    assert not manifold.is_consistent(start)
-    found = manifold.settle(start)
-    np.testing.assert_allclose(np.cos(found[0]), 1.0, atol=1e-12)
-    assert manifold.is_consistent(found)

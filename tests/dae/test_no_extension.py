@@ -73,17 +73,3 @@ def test_at_rest_another_nominal_control_is_asked_for(make, count):
     assert f'nominal_control={{"{name}": 1.0}}' in str(error)
     assert count in str(error)
     assert error.state[make().num_states] == 0.0
-
-
-def test_a_rank_that_changes_from_state_to_state():
-    """B = [[1, 0, 0], [1, 0, 0], [1, x3^60, 0]] has rank 2 or, to the eye, 1 around x3 = 1."""
-    system = DaeSystem.from_functions(
-        4,
-        f=lambda x: [0, 0, 0, 0],
-        h=lambda x: [[1, 0, 0], [1, 0, 0], [1, x[3] ** 60, 0], [0, 0, 1]],
-        l=lambda x: x[:3],
-        nominal_state=[0, 0, 0, 1],
-    )
-    error = violation(system, spread=0.1)
-    assert "2 to 1" in str(error)
-    assert 0.5 < error.state[3] < 1.0

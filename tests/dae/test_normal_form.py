@@ -14,7 +14,6 @@ from two_arms import two_arms
 
 from drake_dae.dae import DaeSystem, NormalForm, Structure, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.newton import NewtonModel, newton
 
 ROBOTS = {
     "two_link": lambda: arm("two_link").structure,
@@ -213,51 +212,6 @@ def test_completions_that_do_not_complete_are_refused(completion, message):
         NormalForm(structure.system, completion(system.state), structure=structure)
 
 
-def outputs_of_a_state(outputs, nominal_state):
-    """x' = u and z = l(x): zeta is l(x), and there is nothing else."""
-    size = len(nominal_state)
-    return NormalForm(
-        DaeSystem.from_functions(
-            size,
-            f=lambda x: size * [0],
-            h=lambda x: np.eye(size),
-            l=outputs,
-            nominal_state=nominal_state,
-        )
-    )
-
-
-@pytest.mark.parametrize(
-    ("outputs", "guess", "x"),
-    [
-        (lambda x: x[0] / (1 + x[0] ** 2), [0.9], [0.0]),
-        (lambda x: x[0] / (1 + x[0] ** 2), [-0.85], [0.0]),
-        (lambda x: x[0] / (1 + x[0] ** 2) ** 0.75, [1.3], [0.0]),
-        (lambda x: [x[0] / (1 + x[0] ** 2), x[1] + 0.1 * x[0]], [0.9, 0.0], [0.0, 0.5]),
-    ],
-    ids=["fold", "from below", "slow", "two states"],
-)
-def test_continuation_arrives_where_newtons_method_alone_does_not(outputs, guess, x):
-    """The guess is near a fold, where l(x) is flat: one Newton step leads far beyond the state.
-
-    Out there l(x) decays, so every further step leads farther away, by more than its own length, on
-    any processor. On the straight way through l(x) each state is near the one before.
-    """
-    normal_form = outputs_of_a_state(outputs, x)
-    coordinates = normal_form.coordinates(x)
-
-    def linearize(state):
-        inverse = np.linalg.inv(normal_form.jacobian(state))
-        return NewtonModel(
-            lambda z: inverse @ (coordinates - normal_form.coordinates(z)), is_regular=True
-        )
-
-    found, converged = newton(np.array(guess), linearize)
-    assert not converged
-    assert np.max(np.abs(found)) > 5.0
-    np.testing.assert_allclose(normal_form.state(coordinates, guess), x, rtol=0, atol=1e-14)
-
-
 def test_coordinates_out_of_reach_are_named():
     normal_form = form("pendulum")
     with pytest.raises(InconsistentStateError) as info:
@@ -266,40 +220,3 @@ def test_coordinates_out_of_reach_are_named():
     # Two links of 1 m reach at most sqrt(4 - 1.2^2) = 1.6 m high on the wall.
     with pytest.raises(InconsistentStateError, match=r"tool\.z.*1\.7"):
         form("two_link").state([0.0, 0.0, 1.7, 0.0])
-
-
-def test_wrong_inputs():
-    normal_form = form("pendulum")
-    with pytest.raises(ModelError, match="coordinates"):
-        normal_form.state([0.0, 0.0, 0.5])
-    with pytest.raises(ModelError, match="coordinates"):
-        normal_form.state([0.0, 0.0, np.nan, 0.0])
-    with pytest.raises(ModelError, match="state"):
-        normal_form.state([0.0, 0.0, 0.5, 0.0], [1.0, 2.0])
-    with pytest.raises(ModelError, match="state"):
-        normal_form.coordinates([0.0, 0.0, 0.5])
-    logarithm = DaeSystem.from_functions(
-        1, f=lambda x: 0, h=lambda x: 1, l=lambda x: ca.log(x), nominal_state=[1.0]
-    )
-    with pytest.raises(ModelError, match=r"\[-1\.\]"):
-        NormalForm(logarithm).state([0.0], [-1.0])
-
-
-def leaning() -> DaeSystem:
-    """A cart on a rail that a constraint force holds at y = 0, in coordinates that mix them."""
-    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
-
-    def height(x: ca.SX) -> ca.SX:
-        return ca.sinh(3 * x[0]) + 0.3 * ca.sin(x[0]) * x[1]
-
-    return DaeSystem.from_functions(
-        4,
-        f=lambda x: [x[2], x[3], -x[0] - 0.2 * x[2], -x[1]],
-        g=lambda x: [0, 0, *turn[:, 0]],
-        h=lambda x: [0, 0, *turn[:, 1]],
-        k=height,
-        l=lambda x: [ca.sin(x[1])],
-        m=lambda x: [0],
-        nominal_state=[0.02, 0.4, 0.0, 0.1],
-        name="leaning",
-    )

@@ -21,7 +21,6 @@ from pydrake.multibody.tree import (
 
 from drake_dae import (
     CoincidentPoints,
-    DaePlant,
     DaeSystem,
     RobotModel,
     RobotPlant,
@@ -29,31 +28,6 @@ from drake_dae import (
     share_forces,
 )
 from drake_dae.errors import ModelError
-
-LOAD = np.array([9.81 * 4.0, -0.3, 0.2])
-"""What the legs of the table bear: weight and moments."""
-
-
-def forces_of(system):
-    plant = DaePlant(system)
-    context = plant.CreateDefaultContext()
-    plant.GetInputPort("control").FixValue(context, [0.0])
-    return plant.GetOutputPort("constraint_force").Eval(context)
-
-
-def test_compliances_share_as_springs_do():
-    """Legs of stiffness k_i under the same load, by their statics alone: K d = load, f_i = k_i d_i.
-
-    Only ratios matter.
-    """
-    stiffness = np.array([1e3, 2e3, 5e2, 4e3])
-    jacobian = np.array([[1.0, *place] for place in TABLE])
-    sinking = np.linalg.solve(jacobian.T * stiffness @ jacobian, LOAD)
-    names = [f"v{i}" for i in range(4)]
-    for unit in (1.0, 1e3):
-        compliances = dict(zip(names, unit / stiffness, strict=True))
-        found = forces_of(share_forces(plate(TABLE), compliances=compliances))
-        assert_allclose(found, stiffness * (jacobian @ sinking), rtol=1e-13)
 
 
 def test_what_is_not_determined_is_no_output():
@@ -80,18 +54,6 @@ def test_what_is_not_determined_is_no_output():
         m=lambda x: [[0, 1, 0]],
     )
     assert share_forces(apart).sharing.undetermined == ("v0", "v2")
-
-
-def test_what_makes_no_sense_is_refused():
-    with pytest.raises(ModelError, match="'leg1'"):
-        share_forces(plate(TABLE), compliances={"leg1": 2.0})
-    for value in (0.0, -1.0):
-        with pytest.raises(ModelError, match="'v1'"):
-            share_forces(plate(TABLE), compliances={"v1": value})
-    with pytest.raises(ModelError, match="'leg0', 'leg1'"):
-        share_forces(plate(TABLE), ["leg0", "leg1"])
-    with pytest.raises(ModelError, match="'leg9'"):
-        share_forces(plate(TABLE), ["leg9"])
 
 
 def test_constraints_that_move_apart_are_not_redundant():
@@ -220,19 +182,3 @@ def test_forces_of_a_robot_are_those_of_least_squares(compliant):
             if "crank" in s.name
         }
         assert_allclose(np.concatenate([on_cranks["pin1"], on_cranks["pin2"]]), found, rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_the_motion_is_that_without_redundant_constraints():
-    model = cranks()
-    plain = drop_constraints(
-        RobotModel.from_multibody(platform(), pins(), [], 0.8 * PARALLEL, forces=[]).dae
-    )
-    shared, dropped = RobotPlant(model), DaePlant(plain)
-    state = [*(1.1 * PARALLEL), *(2.0 * PARALLEL)]
-    rates = []
-    for plant in (shared, dropped):
-        context = plant.CreateDefaultContext()
-        plant.set_state(context, state)
-        rates.append(plant.EvalTimeDerivatives(context).CopyToVector())
-    assert_allclose(rates[0], rates[1], rtol=1e-12, atol=1e-12)

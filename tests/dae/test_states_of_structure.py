@@ -11,7 +11,7 @@ from problems import (
 )
 from problems.found import violation
 
-from drake_dae.analysis.analyze import analyze
+from drake_dae.analysis import analyze
 from drake_dae.dae import DaeSystem, find_constraint_structure, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError
 
@@ -30,47 +30,6 @@ def test_a_constraint_that_cannot_be_met(k):
                 m=lambda x: 0,
             )
         )
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"f": lambda x: [ca.sqrt(x[0] - 1), 0]}, r"\bf\b"),
-        ({"h": lambda x: [0, 1 / x[0]]}, r"\bh\b"),
-        ({"f": lambda x: [x[1], ca.log(x[0])], "l": lambda x: 1 / x[1]}, r"\bf, l\b"),
-        # Finite, but with an infinite derivative.
-        ({"l": lambda x: ca.sqrt(x[0])}, r"x = \[0., 0.\]"),
-    ],
-)
-def test_functions_that_are_not_finite_at_the_nominal_state(fields, message):
-    with pytest.raises(ModelError, match=message):
-        find_structure(double_integrator(**fields))
-
-
-def test_samples_outside_the_domain_are_left_out():
-    """A tank x' = u - sqrt(x) near empty: about a third of the states drawn are below zero."""
-    tank = system_of(1, f=lambda x: -ca.sqrt(x), h=lambda x: 1, l=lambda x: x, nominal_state=[0.05])
-    structure = find_structure(tank, spread=0.1)
-    assert structure.output_degrees == (1,)
-    assert 1 < len(structure.states) < 13
-    assert structure.states.min() > 0.0
-
-
-def test_branches_of_the_manifold_are_no_singularity():
-    """x0^2 = 1 from around 0 ends at both 1 and -1, where A has opposite signs, with no way."""
-    structure = find_structure(
-        system_of(
-            2,
-            f=lambda x: [0, 0],
-            g=lambda x: [1, 0],
-            h=lambda x: [0, 1],
-            k=lambda x: x[0] ** 2 - 1,
-            l=lambda x: x[1],
-            m=lambda x: 0,
-        )
-    )
-    assert {-1.0, 1.0} == set(structure.states[:, 0])
-    assert structure.constraint_degrees == (1,)
 
 
 def test_constraints_alone_decide_how_a_system_moves():

@@ -9,9 +9,8 @@ import pytest
 from problems import PROBLEMS, in_other_units
 from runs import some
 
-from drake_dae.analysis.analyze import analyze
-from drake_dae.dae import DaeSystem, drop_constraints, find_structure
-from drake_dae.errors import ModelError
+from drake_dae.analysis import analyze
+from drake_dae.dae import DaeSystem
 
 # From nanometres to giga-units, all states alike or each in a unit of its own.
 ALIKE = (-9.0, -6.0, -3.0, -1.0, 1.0, 3.0, 6.0, 9.0)
@@ -63,41 +62,3 @@ def test_twenty_four_systems_of_units_have_one_answer(name):
         assert found == expected
         # The held outputs are those at a nominal state that sizes, known to 1e-6, helped to find.
         np.testing.assert_allclose(values, known, rtol=1e-5, atol=1e-7)
-
-
-def test_a_scale_that_is_not_given_is_that_of_the_nominal_state_or_one():
-    system = DaeSystem.from_functions(
-        3,
-        f=lambda x: [x[1], 0, -x[2]],
-        h=lambda x: [0, 1, 0],
-        l=lambda x: x[0],
-        nominal_state=[0.0, -300.0, 1e-5],
-    )
-    np.testing.assert_array_equal(system.scale, [1.0, 300.0, 1.0])
-
-
-@pytest.mark.parametrize("scale", [[1.0], [1.0, 0.0], [1.0, -2.0], [1.0, np.nan], "one"])
-def test_a_scale_that_is_none_is_refused(scale):
-    with pytest.raises(ModelError, match="state_scale"):
-        DaeSystem.from_functions(
-            2, f=lambda x: x, h=lambda x: [0, 1], l=lambda x: x[0], state_scale=scale
-        )
-
-
-@pytest.mark.slow
-def test_redundant_constraints_are_left_out_in_any_units():
-    """A bead on a wire that two equal rods hold: one follows from the other, whatever the units."""
-    system = DaeSystem.from_functions(
-        4,
-        f=lambda x: [x[2], x[3], 0, -9.81],
-        g=lambda x: [[0, 0], [0, 0], [x[0], 3 * x[0]], [x[1], 3 * x[1]]],
-        h=lambda x: [0, 0, 1, 0],
-        k=lambda x: [x[0] ** 2 + x[1] ** 2 - 1, 3 * (x[0] ** 2 + x[1] ** 2 - 1)],
-        l=lambda x: x[0],
-        m=lambda x: [[0, 0]],
-        nominal_state=[0.6, -0.8, 0.0, 0.0],
-    )
-    for _, other in other_units(system):
-        kept = drop_constraints(other)
-        assert kept.num_constraints == 1
-        assert find_structure(kept).constraint_degrees == (2,)

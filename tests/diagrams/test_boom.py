@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from runs import run_scenario, scenario
 
 from drake_dae import build_scenario
@@ -82,37 +81,6 @@ def test_limits_of_the_actuator_are_reported_before_it_runs():
     assert not find_feasibility(scenario(NAME, "duration=6")).problems
     weak = find_feasibility(scenario(NAME, "constraints.0.effort_limit=200", "duration=6"))
     assert any("actuator.motor" in problem for problem in weak.problems)
-
-
-def test_its_damping_is_a_parameter_of_plant_and_law():
-    loop, root = build_scenario(scenario(NAME, "plant.parameters={actuator.damping: [100.0]}"))
-    for block, value in ((loop.plant, 100.0), (loop.controller, 40.0)):
-        context = block.GetMyContextFromRoot(root)
-        assert block.get_parameter(context, "actuator.damping") == [value]
-
-
-def test_its_loop_state_has_gradients():
-    """By AutoDiffXd: dL/dq of the length L is what the motor's force makes of it, its column."""
-    loop, root = build_scenario(scenario(NAME))
-    plant = loop.plant
-    state = plant.state(plant.GetMyContextFromRoot(root))
-    converted = plant.ToAutoDiffXd()
-    context = converted.CreateDefaultContext()
-    context.SetContinuousState(InitializeAutoDiff(state).ravel())
-    gradient = ExtractGradient(converted.GetOutputPort("loop_state").Eval(context))
-    dae = plant.dae
-    motors = plant.model.loop_joints.motors
-    column = ca.Function("B", [dae.state, dae.parameter_symbol], [motors])
-    expected = column(state, dae.parameter_values).full().ravel()
-    assert_allclose(gradient[0, :3], expected, atol=1e-12)
-    assert_allclose(gradient[1, 3:], expected, atol=1e-12)
-
-
-def test_without_a_motor_nothing_drives_it():
-    with pytest.raises(ScenarioError, match="driven"):
-        build_scenario(
-            scenario(NAME, "constraints.0.motor=false", "constraints.0.effort_limit=null")
-        )
 
 
 def test_stages_do_not_reach_a_motor_in_a_loop():

@@ -1,9 +1,8 @@
 """The shipped cart that presses on a wall, against Newton's and Euler's equations by hand."""
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
-from runs import run_scenario, scenario
+from runs import scenario
 
 from drake_dae import build_scenario
 
@@ -104,35 +103,3 @@ def test_the_law_and_what_wall_and_ground_do_are_those_of_newton_and_euler():
         rates = plant.EvalTimeDerivatives(context).CopyToVector()[6:]
         spins = (faster - TRACK * turned) / RADIUS, (faster + TRACK * turned) / RADIUS
         assert_allclose(rates[2:], [turned, *spins, seconds[1]], atol=1e-11)
-
-
-@pytest.mark.slow
-def test_its_error_is_the_predicted_one_and_the_wheels_do_not_slip():
-    """The accuracy of 1e-8 in a step leaves some 1e-8; the force has no dynamics of its own.
-
-    It starts 0.17 rad off the wall's direction, and the rod, as it goes in and out, turns it less.
-    """
-    loop, _, record = run_scenario(scenario(NAME, "duration=6"))
-    off = np.abs(record["tracking_error"] - loop.predicted_error(record))
-    assert np.max(off[:, :2]) < 2e-7
-    assert np.max(off[:, 2]) < 1e-11
-    assert_allclose(record["tracking_error"][0], [-0.05, 0.03, 0.0], atol=1e-12)
-    # Of wall and wheels, before each projection.
-    assert np.max(np.abs(record["constraint_residual"])) < 1e-9
-    assert np.min(record["constraint_force"][:, 0]) > 19.9
-    assert np.all(np.abs(record["control"]) < loop.plant.model.links.effort_limits)
-    assert 0.15 < record["state"][0, 2] == np.max(np.abs(record["state"][:, 2]))
-
-
-@pytest.mark.slow
-def test_its_heading_is_that_of_a_trailer():
-    """With a rod that stays as it is, tan(a / 2) = tan(a_0 / 2) exp(-(x - x_0) / 0.3 m) of the tip.
-
-    It follows from heading' = -sin(heading) x' / REACH; the integrator leaves 1e-8.
-    """
-    chosen = scenario(NAME, "duration=6", "references.rod=0.4", "start.errors={}")
-    _, _, record = run_scenario(chosen)
-    heading, x = record["state"][:, 2], record["controlled_output"][:, 0]
-    wanted = np.tan(heading[0] / 2) * np.exp(-(x - x[0]) / REACH)
-    assert_allclose(np.tan(heading / 2), wanted, atol=1e-8)
-    assert wanted[-1] < 1e-3 * wanted[0]

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from pydrake.multibody.tree import JacobianWrtVariable
-from recordings import animation
-from runs import run_scenario, scenario, some
+from runs import run_scenario, scenario
 
-from drake_dae import build_scenario, make_animation
+from drake_dae import build_scenario
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.model import scenario_model
 
@@ -144,46 +143,6 @@ def test_forces_and_squeezes_of_the_fingers_are_those_of_drake():
             assert squeeze == pytest.approx(wanted, abs=1e-9)
 
 
-@pytest.mark.slow
-def test_a_squeeze_moves_nothing():
-    """Other squeezes at one state: other forces, in the null space, and the same acceleration."""
-    loop, _, record = run("three_fingers", *FINE)
-    law, reference = loop.controller.law, record["reference"][50].copy()
-    solved, pose, _, _ = fingers(record, 50)
-    before = solved(law.control(record["state"][50], reference))
-    reference[-3:] += [0.7, -0.3, 0.4]
-    after = solved(law.control(record["state"][50], reference))
-    assert_allclose(after[0], before[0], atol=1e-8)  # Of up to 10 rad/s^2.
-    change = after[1] - before[1]
-    assert np.max(np.abs(change)) > 0.2
-    assert_allclose(grasp_map(pose)[0] @ change, 0.0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_the_puck_goes_where_it_shall_with_the_error_by_hand():
-    """An accuracy of 1e-11 in each of some 150 steps."""
-    chosen = scenario("three_fingers", *FINE)
-    _, _, record = run("three_fingers", *FINE)
-    references = list(chosen.references.values())
-    for index in range(6):
-        error = record["tracking_error"][:, index]
-        assert_allclose(error, at_rest(record, references[index], index, 2), atol=1e-9)
-    assert np.abs(record["tracking_error"][0, :6]).max() > 0.09
-
-
-def test_fingers_press_and_could_hold_by_friction():
-    """Each presses along the inward normal, with a ratio of tangential force below 0.7."""
-    _, _, record = run("three_fingers", *FINE)
-    for step in range(len(record.time)):
-        _, pose, _, _ = fingers(record, step)
-        force = record["constraint_force"][step].reshape(3, 3)
-        inward = -grasp_map(pose)[1] / 0.035
-        normal = np.sum(force * inward, axis=1)
-        across = np.linalg.norm(force - normal[:, None] * inward, axis=1)
-        assert np.all(normal > 1.0)
-        assert np.all(across < 0.7 * normal)
-
-
 # A biped with flexible joints: 4 joints, 3 positions of the trunk, 4 forces, 1 of them internal.
 
 
@@ -203,27 +162,6 @@ def test_forces_of_the_biped_are_those_of_drake():
         assert_allclose(record["constraint_force"][step], found, atol=1e-9)
         assert_allclose(record["controlled_output"][step, 3], (found[2] - found[3]) / 2, atol=1e-9)
         assert_allclose(jacobian @ v, 0.0, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_the_biped_follows_with_the_error_by_hand():
-    """Degrees 4, 4, 4 and 2; steps of 4 ms leave less than 1e-9."""
-    loop, _, record = run("biped", "duration=2")
-    assert loop.controller.law.degrees == (4, 4, 4, 2)
-    references = list(scenario("biped").references.values())
-    for index, degree in enumerate((4, 4, 4, 2)):
-        error = record["tracking_error"][:, index]
-        assert_allclose(error, at_rest(record, references[index], index, degree), atol=1e-9)
-
-
-@pytest.mark.slow
-def test_feet_press_the_floor_and_could_stand_by_friction():
-    _, _, record = run("biped")
-    normal, across = np.split(record["constraint_force"], 2, axis=1)
-    assert np.min(normal) > 50.0
-    assert np.max(np.abs(across) / normal) < 0.5
-    # The weight goes from one foot to the other.
-    assert np.ptp(normal[:, 0] / normal.sum(axis=1)) > 0.3
 
 
 # Two arms with a free box: 14 joints, 6 positions of the box and 2 elbows, 12 forces, 6 internal.
@@ -268,31 +206,6 @@ def test_two_arms_carry_a_free_box_with_the_error_by_hand():
         wanted = at_rest(record, references[index], index, 2, rate=4.0)
         assert_allclose(error, wanted, atol=1e-9)
     assert_allclose(record["tracking_error"][:, 8:], 0.0, atol=1e-9)  # Met at once.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "body"),
-    some(
-        [
-            ("three_fingers", "object"),
-            ("biped", "trunk"),
-            pytest.param("two_arms_free_box", "object", marks=pytest.mark.thorough),
-        ]
-    ),
-)
-def test_what_is_free_moves_in_the_animation(name, body):
-    loop, context, record = run_scenario(scenario(name, "duration=0.5"))
-    found = animation(make_animation(loop, record, context))
-    (path,) = {path for path, what in found if path.endswith(f"/{body}")}
-    place = found[path, "position"]
-    plant = loop.plant.model.links.plant
-    own, frame = plant.CreateDefaultContext(), plant.GetFrameByName(body)
-    for time, value in zip(place.times, place.values, strict=True):
-        state = [np.interp(time, record.time, column) for column in record["state"].T]
-        plant.SetPositions(own, state[: plant.num_positions()])
-        wanted = frame.CalcPoseInWorld(own).translation()
-        assert_allclose(value, wanted, atol=1e-3)  # Between steps.
 
 
 # What does not fit.

@@ -5,7 +5,6 @@ import warnings
 
 import numpy as np
 import pytest
-from meshes import obj_of_grid
 from runs import run_scenario, scenario
 
 from drake_dae import load_scenario
@@ -13,10 +12,8 @@ from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import complete_scenario
 from drake_dae.scenario.judging import judge_run
-from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.scenario import save_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.trace.functions import TracedFunction
 
 SHORT = ["duration=0.3", "integrator.max_step_size=0.005", "integrator.use_error_control=false"]
 CYLINDER = "constraints.0.surface=!Cylinder {point: [1.7, 0, 0.3], axis: [0, 1, 0], radius: 0.5}"
@@ -43,38 +40,6 @@ def test_a_formula_runs_as_the_built_in_surface():
     ]
     for name in ("state", "control", "constraint_force", "tracking_error"):
         np.testing.assert_allclose(records[0][name], records[1][name], rtol=1e-9, atol=1e-9)
-
-
-def test_the_number_of_a_formula_is_one_of_the_model():
-    """It may move: the law knows its derivatives, and the tool is where the cylinder has grown."""
-    model = scenario_model(scenario("two_link_wall", FORMULA))
-    assert "wall.r" in [parameter.name for parameter in model.dae.parameters]
-    moving = "exogenous.wall.r=[!Sinusoids {offset: 0.5, amplitudes: [0.02], frequencies: [3]}]"
-    loop, _, record = run_scenario(scenario("two_link_wall", FORMULA, moving, *SHORT))
-    predicted = loop.predicted_error(record)
-    assert np.max(np.abs(predicted[:, 0])) > 0.01
-    np.testing.assert_allclose(record["tracking_error"], predicted, rtol=0, atol=1e-8)
-    links = loop.plant.model.links
-    tip = TracedFunction("tip", {"q": links.q}, {"p": links.position("tool")})
-    center = np.array([1.7, 0.0, 0.3])
-    radius = [np.linalg.norm(tip(state[:2])[0] - center) for state in record["state"]]
-    grown = 0.5 + 0.02 * np.sin(3.0 * record.time)
-    np.testing.assert_allclose(radius, grown, rtol=0, atol=1e-8)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["two_link_wall", "two_link_flexible"])
-def test_a_height_map_is_held_as_predicted(name, tmp_path):
-    """Four derivatives of the map behind springs; the tool follows the bump, not the wall."""
-    bump(tmp_path)
-    file = json.dumps(str(tmp_path / "bump.csv"))
-    surface = f"constraints.0.surface=!MeasuredSurface {{file: {file}, {PLACE}}}"
-    loop, _, record = run_scenario(scenario(name, surface, *SHORT))
-    predicted = loop.predicted_error(record)
-    # Behind springs the integrator's own error, 1e-5 N, is amplified.
-    np.testing.assert_allclose(record["tracking_error"], predicted, rtol=0, atol=2e-4)
-    assert np.max(np.abs(predicted)) > 0.01
-    assert np.max(np.abs(record["constraint_residual"])) < 1e-7
 
 
 def test_files_are_beside_the_scenario_and_what_smoothing_costs_is_in_the_summary(
@@ -115,14 +80,6 @@ def test_where_the_robot_leaves_the_data_is_reported(tmp_path):
     _, told = judge_run(case, loop, context, record).notes
     assert "wall: the robot is beyond the edge of the data by up to 1" in told
     assert "1 mm, first at 0 s; there the surface continues as a plane" in told
-
-
-def test_a_mesh_in_a_scenario(tmp_path):
-    side = np.linspace(-0.4, 0.4, 41)
-    bell = 0.05 * np.exp(-8.0 * (side**2 + side[:, None] ** 2))
-    file = json.dumps(str(obj_of_grid(tmp_path / "bell.obj", side, side, bell)))
-    mesh = f"constraints.0.surface=!MeasuredSurface {{file: {file}, point: [1.2, 0, 0]}}"
-    assert scenario("two_link_wall", mesh).constraints[0].surface.fit.largest < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,10 @@ from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 from runs import run_scenario, same_records, scenario
 
 from drake_dae import (
-    NormalForm,
     Record,
-    ZeroDynamics,
-    build_scenario,
     load_scenario,
-    poles,
     simulate,
 )
-from drake_dae.arrays import listed
 from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError
@@ -88,39 +83,6 @@ def test_signals_belong_together(run):
         np.testing.assert_allclose(record["tracking_error"][row], error, atol=1e-12)
     difference = record["controlled_output"] - record["desired_output"]
     np.testing.assert_array_equal(record["tracking_error"], difference)
-
-
-def test_rows_before_a_change_of_parameters_keep_the_old_ones():
-    """Only the state is logged: gains and masses are those that the blocks had at each moment."""
-    loop, context = build_scenario(scenario("two_link_wall"))
-    config = scenario("two_link_wall").integrator
-    own, law = (
-        block.GetMyMutableContextFromRoot(context) for block in (loop.plant, loop.controller)
-    )
-    simulate(loop.diagram, context, 0.2, config)
-    replays = [context.Clone()]
-    name = loop.plant.dae.parameters[0].name
-    loop.plant.set_parameter(own, name, 1.01 * loop.plant.get_parameter(own, name))
-    loop.controller.set_gains(law, poles(-6.0))
-    config.start_time = context.get_time()
-    simulate(loop.diagram, context, 0.1, config)
-    replays.append(context.Clone())
-    record = loop.record(context)
-    assert np.sum(record.time > 0.2) > 3
-    for row, time in enumerate(record.time):
-        # The run goes on at 0.2 s, and logs what it begins with.
-        replay = replays[int(time >= 0.2)]
-        replay.SetTime(time)
-        loop.plant.set_state(loop.plant.GetMyContextFromRoot(replay), record["state"][row])
-        for signal in ("control", "constraint_force"):
-            value = loop.diagram.GetOutputPort(signal).Eval(replay)
-            np.testing.assert_array_equal(record[signal][row], value)
-    # What is asked for later is the same, whatever was changed since.
-    loop.controller.set_gains(law, poles(-2.0))
-    same_records(loop.record(context), record)
-    later = loop.record(context, 0.2)
-    np.testing.assert_array_equal(later.time, record.time[record.time > 0.2])
-    np.testing.assert_array_equal(later["control"], record["control"][record.time > 0.2])
 
 
 def test_the_last_row_is_after_the_projection(run):
@@ -212,13 +174,6 @@ def test_of_a_run_that_failed_while_it_was_logged(good):
         Record.from_log(log, {"second": signals["second"]}, context)
 
 
-def test_of_nothing():
-    loop, context = build_scenario(load_scenario(find_scenario("two_link_wall")))
-    record = loop.record(context)
-    assert record.time.size == 0
-    assert record["tracking_error"].shape == (0, 2)
-
-
 # For other tools, and to look at.
 
 
@@ -259,31 +214,3 @@ def test_what_a_notebook_shows():
     page = record._repr_html_()
     assert "<td>state</td><td>2</td><td>q [rad], ß,&#x27;</td>" in page
     assert repr(Record(np.zeros(0), {})) == "Record(empty, signals=[])"
-
-
-def test_one_line_says_names_and_sizes(run):
-    """The hidden words of a notebook: what the last line of a cell shows."""
-    loop, _, _ = run
-    plant, controller = loop.plant, loop.controller
-    outputs = "outputs=[tool.z, wall.force]"
-    assert repr(plant.model) == (
-        f"RobotModel('two_link_arm', positions=2, constraints=[wall], {outputs})"
-    )
-    assert repr(controller.law) == f"TrackingLaw('two_link_arm', {outputs}, degrees=[2, 0])"
-    assert repr(plant).startswith("RobotPlant('two_link_arm', inputs=[control (2)]")
-    assert "constraint_force (1)" in repr(plant)
-    assert "inputs=[estimated_state (4), reference (4)" in repr(controller)
-    assert repr(loop.reference) == (
-        "ReferenceGenerator('reference', inputs=[], outputs=[reference (4)])"
-    )
-    assert repr(scenario("two_link_wall")) == (
-        f"Scenario('{scenario('two_link_wall').description}', robot='two_link_arm.urdf', "
-        "constraints=[wall], duration=10 s)"
-    )
-    structure = controller.law.structure
-    zero = ZeroDynamics(plant.dae, structure=structure)
-    assert repr(zero) == "ZeroDynamics('two_link_arm', dimension=0)"
-    form = NormalForm(plant.dae, structure=structure)
-    names = "[wall.distance, wall.distance', tool.z, tool.z']"
-    assert repr(form) == f"NormalForm('two_link_arm', coordinates={names})"
-    assert listed("abcdefghij", 3) == "[a, b, c, ... 7 more]"

@@ -5,7 +5,7 @@ import pytest
 from runs import run_scenario, scenario
 
 from drake_dae import build_scenario, load_scenario
-from drake_dae.analysis.limits import LimitKind
+from drake_dae.analysis import LimitKind
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.shipped import find_scenario

@@ -8,10 +8,9 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
 from drake_dae import build_scenario, rollout
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.errors import ScenarioError
 from drake_dae.running import start_values
 from drake_dae.scenario.model import scenario_model
-from drake_dae.systems import DisturbanceForce
 
 W = 25.0
 STILL = (
@@ -69,15 +68,6 @@ def test_a_disturbance_leaves_the_error_of_statics(plant):
     assert_allclose(record["tracking_error"][-1, 0], expected, rtol=2e-2)
 
 
-@pytest.mark.slow
-@PLANTS
-def test_payload_that_nobody_knows_pulls_with_its_weight(plant):
-    payload = "plant.payloads=[{frame: tool, mass: 0.5}]"
-    _, _, record = run_scenario(two_link(*plant, payload))
-    # Its inertia adds 0.5 J^T J to M, which changes A_h in the plant; at rest the law's counts.
-    assert_allclose(record["tracking_error"][-1, 0], left_behind([0.0, -0.5 * 9.81]), rtol=2e-2)
-
-
 def test_payload_that_is_known_is_no_error():
     """The law of `robot.payloads` has them: what is left is the accuracy of the integrator."""
     found = two_link("robot.payloads=[{frame: tool, mass: 0.5}]")
@@ -117,15 +107,6 @@ def test_surface_may_be_tilted():
     force = record["contact_force"][-1]
     normal = RollPitchYaw(turned).ToRotationMatrix() @ [-1.0, 0.0, 0.0]
     assert_allclose(force / np.linalg.norm(force), normal, atol=1e-9)
-
-
-def test_a_disturbance_grows_and_fades_smoothly():
-    push = DisturbanceForce("tool", (0.0, 0.0, 10.0), 1.0, 2.0, 0.2)
-    rows = push.reference.derivatives([0, 0, 0])
-    for time, share in ((0.0, 0.0), (1.05, 3 / 16 - 2 / 64), (1.1, 0.5), (1.5, 1.0), (2.1, 0.5)):
-        assert_allclose(rows(time), [0.0, 0.0, 10.0 * share], atol=1e-12)
-    assert rows(9.0)[2] == 0.0
-    assert DisturbanceForce("tool", (1.0, 0.0, 0.0)).reference.derivatives([0, 0, 0])(1e6)[0] == 1.0
 
 
 @pytest.mark.slow
@@ -177,8 +158,3 @@ def test_rollouts_have_what_the_law_does_not_know(unknown):
     found = rollout(loop, *start_values(loop, context), [0.0, 0.1, 0.2])[0].record
     _, _, record = run_scenario(two_link(*settings))
     assert_allclose(found["state"][-1], record["state"][-1], atol=1e-6)
-
-
-def test_a_disturbance_that_ends_before_it_begins_is_refused():
-    with pytest.raises(ModelError, match="end_time"):
-        DisturbanceForce("tool", (1.0, 0.0, 0.0), 2.0, 1.0)

@@ -11,21 +11,14 @@ from numpy.testing import assert_allclose
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RpyFloatingJoint, SpatialInertia
-from scipy.optimize import brentq
 
 from drake_dae import (
-    CoincidentPoints,
     DaePlant,
     DaeSystem,
-    FixedDistance,
-    JointCoupler,
     LinkExpressions,
     Plane,
-    PointOnSurface,
     RobotModel,
     RobotPlant,
-    Signal,
-    Sphere,
     simulate,
 )
 from drake_dae.robots import Blade, RollingBall
@@ -58,65 +51,6 @@ def point(mass):
     q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
     H = ca.vertcat(0, 0, mass * G)
     return LinkExpressions(q, v, mass * ca.SX.eye(3), H, {"point": q}, actuation_matrix=NOTHING)
-
-
-def force_at(model, state):
-    """The constraint forces at a state."""
-    plant = RobotPlant(model)
-    context = plant.CreateDefaultContext()
-    plant.set_state(context, state)
-    return plant.GetOutputPort("constraint_force").Eval(context)
-
-
-def opening(model, state, until):
-    """Where the first constraint force vanishes: its place in the list, and the state there."""
-    plant = RobotPlant(model)
-
-    def reached(time):
-        context = plant.CreateDefaultContext()
-        plant.set_state(context, state)
-        if time:
-            simulate(plant, context, time, error_controlled(1e-11))
-        return context
-
-    def least(time):
-        return plant.GetOutputPort("constraint_force").Eval(reached(time)).min()
-
-    context = reached(brentq(least, 0.0, until, xtol=1e-12))
-    force = plant.GetOutputPort("constraint_force").Eval(context)
-    return int(np.argmin(force)), plant.state(context)
-
-
-@pytest.mark.slow
-def test_a_ladder_leaves_a_smooth_wall_at_two_thirds_of_its_sine():
-    """sin a = 2/3 sin a_0, whatever its length and mass; a window of 1e-12 s leaves 1e-9.
-
-    S. B. Cahn and B. E. Nadgorny, A Guide to Physics Problems, part 1, "Sliding Ladder".
-    """
-    mass, half, start = 3.0, 1.7, 1.1
-    wall = PointOnSurface("body", Plane((0, 0, 0), (1, 0, 0)), (half, 0, 0), "wall")
-    floor = PointOnSurface("body", Plane((0, 0, 0), (0, 0, 1)), (-half, 0, 0), "floor")
-    q = [half * np.cos(start), half * np.sin(start), np.pi - start]
-    links = flat(mass, mass * half**2 / 3)
-    model = RobotModel(links, [wall, floor], [], q, "ladder", forces=[])
-    who, state = opening(model, [*q, 0, 0, 0], 1.2)
-    assert who == 0  # The wall.
-    assert_allclose(np.sin(state[2]), 2 / 3 * np.sin(start), rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_a_particle_leaves_a_smooth_sphere_where_the_cosine_is_two_thirds():
-    """cos t = 2/3 from rest at the top; from the top at a speed v, v^2 / (3 g r) more.
-
-    BYJU'S, "A particle slides on the surface of a fixed smooth sphere".
-    """
-    radius, speed = 0.8, 0.05
-    ball = PointOnSurface("point", Sphere((0, 0, 0), radius, (1, 0, 0)), name="ball")
-    q = [0.0, 0.0, radius]
-    model = RobotModel(point(0.7), [ball], [], q, "particle", forces=[])
-    _, state = opening(model, [*q, 0.0, speed, 0.0], 2.0)
-    wanted = 2 / 3 + speed**2 / (3 * G * radius)
-    assert_allclose(state[2] / radius, wanted, rtol=1e-8)
 
 
 @pytest.mark.slow
@@ -207,67 +141,3 @@ def test_chaplygins_sleigh_comes_out_of_its_turn_as_a_hyperbolic_tangent():
     force = plant.GetOutputPort("constraint_force").Eval(context)
     speed, slowing = energy * np.tanh(way), -ahead / gyration * energy * np.tanh(way) * rate
     assert_allclose(force, mass * (speed * rate + ahead * slowing), atol=1e-9)
-
-
-def test_atwoods_string_pulls_with_twice_the_harmonic_share_of_the_weights():
-    """T = 2 m_1 m_2 g / (m_1 + m_2), at any speed.
-
-    Wikipedia, "Atwood machine": m_1 g - T = m_1 a, T - m_2 g = m_2 a.
-    """
-    first, second = 2.0, 3.5
-    q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
-    links = LinkExpressions(
-        q,
-        v,
-        ca.diag(ca.SX([first, second])),
-        ca.vertcat(first * G, second * G),
-        actuation_matrix=np.zeros((2, 0)),
-        position_signals=(Signal("one", "m"), Signal("other", "m")),
-    )
-    string = JointCoupler("other", "one", -1.0, unit="m", name="string")
-    model = RobotModel(links, [string], [], [0, 0], "atwood", forces=[])
-    tension = 2 * first * second * G / (first + second)
-    assert_allclose(force_at(model, [0.2, -0.2, 1.3, -1.3]), [tension], rtol=1e-14)
-
-
-@pytest.mark.parametrize("angle", [1.3, 0.6, -0.2])
-def test_a_stick_that_swings_down_pulls_its_hinge_as_printed(angle):
-    """Along the stick M g (5 cos t - 3 cos t_0) / 2, across it M g sin t / 4, from rest at t_0.
-
-    SolutionInn, "A uniform stick of length L and mass M is hinged at one end".
-    """
-    mass, length, released = 1.7, 1.1, 1.4
-    hinge = CoincidentPoints("world", (0, 0, 0), "body", (0, 0, 0), "xz", "hinge")
-    links = flat(mass, mass * length**2 / 12, length / 2)
-    model = RobotModel(links, [hinge], [], [0, 0, angle - np.pi / 2], "stick", forces=[])
-    rate = np.sqrt(3 * G / length * (np.cos(angle) - np.cos(released)))
-    force = force_at(model, [0, 0, angle - np.pi / 2, 0, 0, rate])
-    # Toward the hinge, and toward larger angles.
-    inward, across = [-np.sin(angle), np.cos(angle)], [np.cos(angle), np.sin(angle)]
-    along = mass * G * (5 * np.cos(angle) - 3 * np.cos(released)) / 2
-    assert_allclose(np.dot(inward, force), along, rtol=1e-13)
-    assert_allclose(np.dot(across, force), mass * G * np.sin(angle) / 4, rtol=1e-13)
-
-
-def test_a_conical_pendulum_pulls_with_its_weight_by_the_cosine_and_comes_round():
-    """T = m g / cos t, and the period 2 pi sqrt(L cos t / g).
-
-    NoteTube, "Conical pendulum"; sookshmas.com, "Conical Pendulum".
-    """
-    mass, length, tilt = 0.4, 1.5, 0.7
-    string = FixedDistance("world", (0, 0, 0), "point", (0, 0, 0), length, "string")
-    q = [length * np.sin(tilt), 0.0, -length * np.cos(tilt)]
-    model = RobotModel(point(mass), [string], [], q, "conical pendulum", forces=[])
-    plant = RobotPlant(model)
-    rate = np.sqrt(G / (length * np.cos(tilt)))
-    context = plant.CreateDefaultContext()
-    start = np.array([*q, 0.0, rate * q[0], 0.0])
-    plant.set_state(context, start)
-    for share in (0.5, 0.5):
-        config = error_controlled(1e-12)
-        config.start_time = context.get_time()
-        simulate(plant, context, share * 2 * np.pi / rate, config)
-        start[[0, 4]] *= -1.0
-        assert_allclose(plant.state(context), start, atol=1e-9)
-        force = plant.GetOutputPort("constraint_force").Eval(context)
-        assert_allclose(force, [-mass * G / np.cos(tilt)], rtol=1e-10)

@@ -45,7 +45,7 @@ def test_the_first_scenario_runs_as_printed(tmp_path, capsys):
 
 
 def test_it_is_read_to_its_end():
-    assert len(README.splitlines()) <= 150
+    assert len(README.splitlines()) <= 110
 
 
 def test_named_files_exist():

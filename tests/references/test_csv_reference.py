@@ -103,18 +103,3 @@ def test_what_is_wrong_with_a_file(text, message, tmp_path):
         file.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ReferenceSignalError, match=message):
         CsvReference(str(file), ["y"], "t").derivatives([0])
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"columns": []}, "columns"),
-        ({"smoothing": -1.0}, r"smoothing.*-1"),
-        ({"order": 1}, r"order.*2.*12"),
-        ({"smoothing": 1e-7}, r"smoothing.*1e-07"),
-    ],
-)
-def test_refusals(changes, message, tmp_path):
-    given = {"file": str(wave(tmp_path)), "columns": ["y"], "time": "t", **changes}
-    with pytest.raises(ReferenceSignalError, match=message):
-        CsvReference(**given).derivatives([0])

@@ -77,24 +77,6 @@ def test_a_line_takes_as_long_as_by_hand():
     np.testing.assert_allclose(quarter[1::2], [0.06, 0.08], atol=1e-15)
 
 
-def test_circles_stay_on_a_circle():
-    path = MEMBERS["turns"]
-    points = course(path)[:, :, 0] - [0.5, 0.1]
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.1, rtol=1e-14)
-    angle = np.unwrap(np.arctan2(points[:, 1], points[:, 0]))
-    assert angle[0] == pytest.approx(0.4)
-    assert angle[-1] - angle[0] == pytest.approx(-3 * np.pi)
-
-
-def test_a_circle_with_a_period_goes_on():
-    function = CircleReference([1.0, 2.0], 0.5, period=-4.0, phase=0.3).derivatives([1, 2])
-    for time in (-3.0, 0.0, 1.7, 40.0):
-        angle, rate = 0.3 - np.pi / 2 * time, -np.pi / 2
-        cos, sin = 0.5 * np.cos(angle), 0.5 * np.sin(angle)
-        expected = [1 + cos, -rate * sin, 2 + sin, rate * cos, -(rate**2) * sin]
-        np.testing.assert_allclose(function(time), expected, rtol=0, atol=1e-13)
-
-
 @pytest.mark.parametrize("name", ["outward", "inward"])
 def test_turns_of_a_spiral_are_a_pitch_apart(name):
     path = MEMBERS[name]

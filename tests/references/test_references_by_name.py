@@ -48,13 +48,6 @@ def test_rows_apart_keep_their_derivatives():
         np.testing.assert_allclose(values, [3.375, 6.75, 9.0, 7.0, 0.0, 2.25, 3.0], rtol=1e-13)
 
 
-def test_what_stands_together_stays_one():
-    pair = ConstantReference([1.0, 2.0])
-    found = references_by_name({"c": 3.0, "b, a": pair, "d, e": pair}, list("abcde"), [0] * 5)
-    assert found[-1] is pair
-    assert [reference.size for reference in found] == [1, 1, 1, 2]
-
-
 @pytest.mark.parametrize(
     ("references", "message"),
     [

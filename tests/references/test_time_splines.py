@@ -6,16 +6,9 @@ import pytest
 from runs import both
 from scipy.interpolate import BSpline
 
-from drake_dae import PolylineReference
-from drake_dae.errors import ReferenceSignalError
-from drake_dae.references import PathLimits
 from drake_dae.references.polynomials import UNROLLED, PiecewisePolynomials
 from drake_dae.references.splines import TimeSpline, basis_pieces
 from drake_dae.trace.functions import TracedFunction
-
-LIMITS = PathLimits(0.2, 2.0, 40.0)
-POINTS = [[0.0, 0.0], [0.2, 0.0], [0.2, 0.1], [0.05, 0.1], [0.15, 0.1]]  # It turns back at the end.
-PATH = PolylineReference(POINTS, LIMITS, 0.02, start_time=0.5, order=3)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 5, 8])
@@ -41,21 +34,6 @@ def test_a_spline_is_that_of_another_source():
         np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12)
 
 
-def test_off_the_corners_it_is_on_the_edges():
-    function = PATH.derivatives([0, 0])
-    times = 0.5 + np.linspace(-0.1, PATH.spline.duration + 0.1, 4001)
-    points = np.array([function(t) for t in times])
-    np.testing.assert_allclose(points[[0, -1]], [POINTS[0], POINTS[-1]], atol=1e-15)
-    corners = np.array(POINTS)
-    near = np.linalg.norm(points[:, None] - corners, axis=2).min(axis=1) < 0.02
-    x, y = points[~near].T
-    on_edge = (np.abs(y) < 1e-14) | (np.abs(x - 0.2) < 1e-14) | (np.abs(y - 0.1) < 1e-14)
-    assert on_edge.all()
-    # No point of a right angle is as far from it as half of where the rounding begins.
-    distance = np.linalg.norm(points[:, None] - corners[1:3], axis=2).min(axis=0)
-    assert np.all((distance > 1e-3) & (distance < 0.01))
-
-
 @both
 def test_many_polynomials_are_looked_up(compiled):
     """At breaks, beside them, between them and far away; beside a break it is the right piece.
@@ -76,18 +54,3 @@ def test_many_polynomials_are_looked_up(compiled):
         np.testing.assert_allclose(found, pieces.at(np.array([moment]))[0], rtol=0.0, atol=1e-14)
     assert function.is_machine_code == compiled
     assert function.num_operations < 100
-
-
-@pytest.mark.parametrize(
-    ("points", "corner", "message"),
-    [
-        ([[0.0, 0.0]], 0.1, r"\(1, 2\)"),
-        ([[0.0], [1.0], [1.0]], 0.1, "1 and 2"),
-        ([[0.0], [1.0]], 0.0, r"corner.*0"),
-        ([[0.0], [1.0]], 1e-6, r"corner.*1e-06"),
-        ([[0.0], [1.0, 2.0]], 0.1, "points"),
-    ],
-)
-def test_refusals(points, corner, message):
-    with pytest.raises(ReferenceSignalError, match=message):
-        PolylineReference(points, LIMITS, corner)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from drake_dae import PointToPointReference, WaypointsReference
-from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import PathLimits
 
 POINTS = [[0.0, 0.0], [0.2, 0.1], [0.3, -0.1], [0.5, 0.0]]
@@ -36,15 +35,6 @@ def test_between_two_points_it_is_the_move_from_rest_to_rest(order):
         )
 
 
-def test_it_is_smoother_than_it_must_be():
-    """Twice `order` derivatives are continuous: no other one has the least integral."""
-    pieces = WaypointsReference(POINTS, TIMES, order=3).pieces([6, 6])
-    inner = np.array(TIMES[1:-1])
-    np.testing.assert_allclose(
-        pieces.at(inner - 1e-9), pieces.at(inner + 1e-9), rtol=1e-5, atol=1e-5
-    )
-
-
 @pytest.mark.parametrize("limits", [LIMITS, PathLimits(2.0, 0.5), PathLimits(2.0, 9.0, 1.0)])
 def test_limits_are_kept_and_one_is_reached(limits):
     path = WaypointsReference(POINTS, limits=limits, order=3)
@@ -55,19 +45,3 @@ def test_limits_are_kept_and_one_is_reached(limits):
     share = np.linalg.norm(found, axis=1).max(axis=0) / limits.values
     assert np.all(share <= 1.0)
     assert share.max() > 0.99
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"times": None}, "times"),
-        ({"limits": LIMITS}, "limits"),
-        ({"times": [0.0, 1.0]}, r"times.*\(4,\)"),
-        ({"times": [0.0, 1.0, 1.0, 2.0]}, "times"),
-        ({"order": 7}, r"order.*7"),
-        ({"points": [[0.0]] * 4}, "points 0 and 1"),
-    ],
-)
-def test_refusals(changes, message):
-    with pytest.raises(ReferenceSignalError, match=message):
-        WaypointsReference(**{"points": POINTS, "times": TIMES, **changes})

@@ -133,19 +133,3 @@ class Pressed(ForceOutput):
 def test_what_makes_no_sense_is_refused(make, message):
     with pytest.raises(ModelError, match=message):
         make()
-
-
-def test_at_rest_all_forces_follow_from_the_outputs():
-    """Three fingers at rest: the forces on the puck carry it, and their squeezes are as given.
-
-    Newton's method leaves 1e-10 of forces of 2 N.
-    """
-    model = robot()
-    guess = np.tile([0.0, -0.205, 1.228], 3)
-    q = model.configuration([0, 0, 0.15, 0, 0, 0], [*guess, 0, 0, 0, 0, 0, 0.15])
-    forces = model.rest_forces(q, [2.0, 2.1, 2.2]).reshape(3, 3)
-    np.testing.assert_allclose(forces.sum(axis=0), [0.0, 0.0, 0.2 * 9.81], atol=1e-9)
-    corners = np.array([[1.0, 0.0], [-0.5, np.sqrt(0.75)], [-0.5, -np.sqrt(0.75)]])
-    for (i, j), wanted in {(0, 1): 2.0, (1, 2): 2.1, (2, 0): 2.2}.items():
-        along = (corners[j] - corners[i]) / np.sqrt(3.0)
-        assert along @ (forces[i] - forces[j])[:2] / 2 == pytest.approx(wanted, abs=1e-9)

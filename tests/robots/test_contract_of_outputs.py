@@ -90,20 +90,6 @@ def test_what_is_unknown_is_named(output, message):
         output.expression(arm("seven_joint").model.links)
 
 
-@pytest.mark.parametrize(
-    ("axis", "components", "message"),
-    [
-        ("q", "", "axis"),
-        ("xy", "", "'xy'"),
-        ("z", "xz", "'xz'"),
-        ("z", "xx", "'xx'"),
-    ],
-)
-def test_a_tilt_has_one_axis_and_components_across_it(axis, components, message):
-    with pytest.raises(ModelError, match=message):
-        TiltFromNormal(WALL, axis, components)
-
-
 def test_a_tilt_is_the_sine_of_the_angle_to_the_normal():
     """The tool turned by joint7 and joint6, against the pose of MultibodyPlant."""
     model = arm("seven_joint").model

@@ -7,8 +7,8 @@ from arms import arm, numbers, parse
 from numpy.testing import assert_allclose
 from pydrake.systems.analysis import Simulator
 
-from drake_dae import CompliantPlant, JointFriction, RobotModel, build_scenario, load_scenario
-from drake_dae.errors import ModelError, ScenarioError
+from drake_dae import CompliantPlant, JointFriction, RobotModel
+from drake_dae.errors import ModelError
 from drake_dae.systems import PointMaterial
 
 COULOMB, VISCOUS, SLOW = np.array([3.0, 0.5]), np.array([0.2, 0.1]), 0.01
@@ -85,10 +85,3 @@ def test_friction_that_makes_no_sense_is_refused(joints, more, message):
             [1.2, -1.6],
             known_forces=[JointFriction(joints, **more)],
         )
-
-
-@pytest.mark.slow
-def test_drakes_own_plant_refuses_it_and_says_which_takes_it():
-    settings = ["robot.known_forces=[!JointFriction {joints: [joint1], coulomb: 1}]"]
-    with pytest.raises(ScenarioError, match="!CompliantContact"):
-        build_scenario(load_scenario("wall_point_contact", settings))

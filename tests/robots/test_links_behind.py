@@ -105,17 +105,6 @@ def test_other_shapes_are_as_deep_as_their_lowest_point(shape, lowest):
     assert (one.link, one.depth) == ("link1", pytest.approx(lowest(q[0] + q[1]) - 0.03, rel=1e-9))
 
 
-def test_a_mesh_is_as_deep_as_its_lowest_vertex(tmp_path):
-    corners = [f"v {x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.05, 0.05) for z in (-0.06, 0.06)]
-    faces = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
-    file = tmp_path / "box.obj"
-    file.write_text("\n".join([*corners, *(f"f {face}" for face in faces)]) + "\n")
-    q = bent(0.03)
-    lowest = 0.1 * abs(np.sin(q[0] + q[1])) + 0.06 * np.cos(q[0] + q[1])
-    (one,) = behind(chain(TABLE, f'<mesh filename="file://{file}"/>'), q)
-    assert one.depth == pytest.approx(lowest - 0.03, rel=1e-6)
-
-
 @pytest.mark.parametrize(
     "surface",
     [
@@ -128,20 +117,6 @@ def test_surfaces_that_bend_are_as_deep_as_they_are_far(surface):
     (one,) = behind(chain(surface), q)
     off = np.linalg.norm(ends(q)[1] - [0.9, 0.0, -0.4])
     assert (one.link, one.depth) == ("link1", pytest.approx(0.45 + RADIUS - off, rel=1e-9))
-
-
-def test_a_link_without_shape_is_its_origin():
-    """The third link begins where the second ends."""
-    plant = MultibodyPlant(0.0)
-    Parser(plant).AddModelsFromString(urdf('<sphere radius="1"/>'), "urdf")
-    plant.Finalize()
-    contact = [PointOnSurface("tip", TABLE, name="wall")]
-    model = RobotModel.from_multibody(
-        plant, contact, [JointPositions(["joint1", "joint2", "joint3"])]
-    )
-    assert behind(model, bent(0.02)) == ()
-    (one,) = behind(model, bent(-0.1))
-    assert (one.link, one.depth) == ("link2", pytest.approx(0.1, rel=1e-9))
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from arms import arm, consistent_states, numbers, parse
+from arms import arm, consistent_states, numbers
 
 from drake_dae import (
     AxisCoordinates,
@@ -69,17 +69,6 @@ def test_textbook_arm_is_the_urdf_arm():
             )
 
 
-def test_structure_of_both_arms():
-    """Section 3.1: r = 2, mu = (2, ..., 2) and force outputs met at once, index 3, no xi."""
-    for name, count in (("two_link", 1), ("seven_joint", 6)):
-        found = arm(name).structure
-        assert found.constraint_degrees == (2,)
-        assert found.output_degrees == (2,) * count + (0,)
-        assert found.index == 3
-        assert found.zero_dynamics_dimension == 0
-        assert found.manifold.dimension == 2 * count
-
-
 def test_names_and_units():
     dae = arm("seven_joint").model.dae
     assert [s.name for s in dae.output_signals] == [
@@ -96,12 +85,6 @@ def test_names_and_units():
         Signal("wall.distance", "m"),
         Signal("wall.distance'", "m/s"),
     )
-
-
-def test_masses_and_surface_are_parameters():
-    names = [p.name for p in arm("two_link").model.dae.parameters]
-    assert "link1.mass" in names
-    assert "wall.position" in names
 
 
 def test_surface_coordinates_and_expressions():
@@ -144,20 +127,6 @@ def test_configuration_inverts_the_outputs(name):
         nominal = model.dae.nominal_state[: q.size]
         found = model.configuration(wanted, nominal)
         np.testing.assert_allclose(numbers(name, found, v).outputs, wanted, atol=1e-10)
-
-
-@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
-def test_configuration_is_that_to_which_the_guess_leads_in_small_steps(name):
-    """Newton's method, whatever its steps, does not go over to another elbow; to round-off."""
-    model = arm(name).model
-    for state in consistent_states(name, 3, seed=9):
-        q = state[: state.size // 2]
-        wanted, nominal = numbers(name, q, 0.0 * q).outputs, model.dae.nominal_state[: q.size]
-        begin, followed = numbers(name, nominal, 0.0 * q).outputs, nominal
-        for share in np.linspace(0.0, 1.0, 60):
-            followed = model.configuration(begin + share * (wanted - begin), followed)
-        found = model.configuration(wanted, nominal)
-        np.testing.assert_allclose(found, followed, rtol=0.0, atol=1e-12)
 
 
 def test_configuration_out_of_reach_is_refused():
@@ -219,29 +188,3 @@ def test_two_motors_on_one_joint_share_its_torque_by_their_weights():
 def test_refusals(make, message):
     with pytest.raises(ModelError, match=message):
         make()
-
-
-def test_two_constraints_with_one_name_are_refused():
-    other = PointOnSurface("tool", Plane((0, 0, 0.2), (0, 0, 1)), name="wall")
-    with pytest.raises(ModelError, match=r"wall\.position"):
-        RobotModel(textbook_links(), [WALL, other], [], [1.2, -1.6])
-
-
-def test_unknown_frame_of_a_plant_names_what_is_near():
-    with pytest.raises(ModelError, match="tool"):
-        RobotModel.from_multibody(
-            parse("two_link_arm"),
-            [PointOnSurface("tol", WALL.surface)],
-            [PointCoordinates("tool", "z")],
-        )
-
-
-def test_two_points_of_one_frame_need_names():
-    outputs = [PointCoordinates("tool", "y"), PointCoordinates("tool", "y", (0, 0, 0.1), "heel")]
-    signals = [s.name for output in outputs for s in output.signals(arm("two_link").model.links)]
-    assert signals == ["tool.y", "heel.y"]
-
-
-def test_shapes_of_a_configuration_are_checked():
-    with pytest.raises(ModelError, match="outputs"):
-        textbook().configuration([0.1, 0.2], [1.2, -1.6])

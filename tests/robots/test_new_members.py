@@ -5,30 +5,21 @@ Most of them the package does not know: each of these is one class in `members`.
 
 import casadi as ca
 import numpy as np
-import pytest
 import scipy.integrate
 from arms import arm, consistent_states, fixed_step, parse
-from members import Saddle, TorqueLag
+from members import TorqueLag
 
 from drake_dae import (
-    AxisCoordinates,
-    ConstantReference,
     FixedDistance,
     FlexibleJoints,
     JointPositions,
     LinkExpressions,
     PointCoordinates,
-    PointOnSurface,
     RobotModel,
     RobotPlant,
-    SinusoidReference,
-    TrackingLaw,
     find_structure,
-    make_closed_loop,
-    poles,
     simulate,
 )
-from drake_dae.trace.functions import TracedFunction
 
 GRAVITY = 9.81
 
@@ -48,21 +39,6 @@ def run(plant, state, duration, step=1e-3):
     plant.set_state(context, state)
     simulate(plant, context, duration, fixed_step(step))
     return plant.state(context), plant.GetOutputPort("constraint_force").Eval(context)
-
-
-def follow(model, state, references, duration=1.0, step=2e-3):
-    """The record of a closed loop with double poles at -4."""
-    law = TrackingLaw(model.dae, poles(-4.0))
-    loop = make_closed_loop(RobotPlant(model, structure=law.structure), law, references)
-    context = loop.diagram.CreateDefaultContext()
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    loop.plant.set_consistent_state(own, state)
-    simulate(loop.diagram, context, duration, fixed_step(step))
-    return loop.record(context)
-
-
-def double_pole(error, rate, t):
-    return (error + (rate + 4.0 * error) * t) * np.exp(-4.0 * t)
 
 
 # A constraint on positions: two points at a fixed distance.
@@ -95,23 +71,6 @@ def test_a_bob_on_a_rod_is_a_pendulum():
     np.testing.assert_allclose(thrust, -pull, rtol=1e-10)
 
 
-def test_an_arm_on_a_rod_tracks_motion_and_thrust():
-    """e(t) of double poles at -4, and the thrust at once; RK5 at 2 ms leaves 1e-12."""
-    rod = FixedDistance("world", (1.6, 0.0, 0.0), "tool", (0.0, 0.0, 0.0), 0.7)
-    outputs = [PointCoordinates("tool", "z")]
-    model = RobotModel.from_multibody(parse("two_link_arm"), [rod], outputs, [1.2, -1.6])
-    q = model.configuration([0.3], [1.2, -1.6])
-    tip = TracedFunction("tip", {"q": model.links.q}, {"p": model.links.position("tool")})(q)[0]
-    assert np.linalg.norm(tip - [1.6, 0.0, 0.0]) == pytest.approx(0.7, abs=1e-12)
-    wanted = [SinusoidReference(0.35, 0.05, 2.0), SinusoidReference(30.0, 10.0, 3.0)]
-    record = follow(model, [*q, 0.0, 0.0], wanted)
-    error = double_pole(-0.05, -0.1, record.time)
-    np.testing.assert_allclose(record["tracking_error"][:, 0], error, atol=1e-10)
-    thrust = 30.0 + 10.0 * np.sin(3.0 * record.time)
-    np.testing.assert_allclose(record["constraint_force"][:, 0], thrust, rtol=1e-10)
-    assert np.max(np.abs(record["constraint_residual"])) < 1e-10
-
-
 # A reaction of its own: friction.
 
 
@@ -119,39 +78,6 @@ def test_an_arm_on_a_rod_tracks_motion_and_thrust():
 
 
 # A surface.
-
-
-@pytest.mark.slow
-def test_a_tool_stays_on_a_saddle():
-    """z = 0.5 (x^2 - y^2) above its middle all along, and the normal force is the desired one."""
-    contact = PointOnSurface("tool", Saddle((0.5, 0.0, 0.45), 0.5), name="saddle")
-    outputs = [
-        PointCoordinates("tool", "xy"),
-        AxisCoordinates("tool", "z", "xy"),
-        JointPositions(["joint3", "joint7"]),
-    ]
-    nominal = [0.0, -0.2583, 0.0, -1.5038, 0.0, -1.3795, 0.0]
-    plant = parse("seven_joint_arm")
-    model = RobotModel.from_multibody(plant, [contact], outputs, nominal)
-    assert find_structure(model.dae).output_degrees == (2,) * 6 + (0,)
-    q = model.configuration([0.55, 0.05, 0.0, 0.0, 0.0, 0.0], nominal)
-    wanted = [
-        SinusoidReference(0.5, 0.1, 2.0),
-        SinusoidReference(0.05, 0.1, 2.0),
-        ConstantReference([0.0] * 4),
-        SinusoidReference(20.0, 5.0, 2.0),
-    ]
-    record = follow(model, [*q, *np.zeros(7)], wanted, step=4e-3)
-    context = plant.CreateDefaultContext()
-    tool = plant.GetFrameByName("tool")
-    for state in record["state"][::20]:
-        plant.SetPositions(context, state[:7])
-        x, y, z = tool.CalcPoseInWorld(context).translation() - [0.5, 0.0, 0.45]
-        assert z == pytest.approx(0.5 * (x**2 - y**2), abs=1e-8)
-    error = double_pole(0.05, -0.2, record.time)
-    np.testing.assert_allclose(record["tracking_error"][:, 0], error, atol=1e-8)
-    force = 20.0 + 5.0 * np.sin(2.0 * record.time)
-    np.testing.assert_allclose(record["constraint_force"][:, 0], force, rtol=1e-9)
 
 
 # A stage.

@@ -3,24 +3,19 @@
 A continuous MultibodyPlant knows no constraints; what it lacks are the wrenches of the port.
 """
 
-import re
-
 import numpy as np
 import pytest
-from arms import arm, parse
-from grippers import gripper, parsed
+from arms import parse
 from members import FrictionalPoint
 from numpy.testing import assert_allclose
 from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import JacobianWrtVariable
 from two_arms import two_arms
 
 from drake_dae import (
     AxisNormalToSurface,
     FixedDistance,
-    FlexibleJoints,
     JointPositions,
     Plane,
     PointCoordinates,
@@ -53,32 +48,6 @@ def accelerations(plant, q, v, u, wrenches, frames):
 
 def frames_of(block):
     return [signal.name.split(".")[1] for signal in block.wrench_signals[::6]]
-
-
-def test_wrenches_of_a_coupler_are_what_drake_lacks():
-    """A continuous MultibodyPlant, which knows no coupler, moves as the robot does when the
-    wrenches of the port act on it; 1e-9 on accelerations of up to 1e2 is round-off."""
-    plant = parsed(gripper())
-    free = MultibodyPlant(0.0)
-    Parser(free).AddModelsFromString(re.sub("<mimic.*?/>", "", gripper()), "urdf")
-    free.Finalize()
-    model = RobotModel.from_multibody(plant, [], [JointPositions(["arm"])])
-    block = RobotPlant(model)
-    context = block.CreateDefaultContext()
-    random = np.random.default_rng(0)
-    for _ in range(3):
-        arm, left, arm_rate, rate = random.uniform(-0.5, 0.5, 4)
-        q = np.array([arm, left, 0.05 - 0.7 * left])
-        v = np.array([arm_rate, rate, -0.7 * rate])
-        u = random.uniform(-20.0, 20.0, 2)
-        block.set_state(context, [*q, *v])
-        block.GetInputPort("control").FixValue(context, u)
-        wrenches = block.GetOutputPort("constraint_wrenches").Eval(context)
-        ours = block.EvalTimeDerivatives(context).CopyToVector()[3:]
-        drake = accelerations(free, q, v, u, wrenches, frames_of(block))
-        np.testing.assert_allclose(ours, drake, rtol=1e-9, atol=1e-9)
-        assert ours[2] == pytest.approx(-0.7 * ours[1], abs=1e-10)
-        assert abs(drake - accelerations(free, q, v, u, np.zeros(0), [])).max() > 1.0
 
 
 def wall():
@@ -139,41 +108,6 @@ def test_a_plant_that_feels_the_wrenches_moves_as_the_robot(make):
         drake = accelerations(plant, q, v, u, wrenches, frames_of(block))
         np.testing.assert_allclose(ours, drake, rtol=1e-8, atol=1e-8)
         assert np.abs(wrenches).max() > 1.0
-
-
-def test_wrenches_follow_state_control_and_parameters():
-    """No cached value is stale: a wall elsewhere turns the world's wrench about its origin."""
-    plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
-    context = plant.CreateDefaultContext()
-    port = plant.GetOutputPort("constraint_wrenches")
-    seen = []
-    for control, mass in (([0.0, 0.0], 6.0), ([5.0, 0.0], 6.0), ([5.0, 0.0], 7.0)):
-        plant.GetInputPort("control").FixValue(context, control)
-        plant.set_parameter(context, "link2.mass", mass)
-        force = plant.GetOutputPort("constraint_force").Eval(context)[0]
-        tool, world = port.Eval(context).reshape(2, 6)
-        np.testing.assert_allclose(tool, [0, 0, 0, -force, 0, 0], atol=1e-12)
-        np.testing.assert_allclose(world[3:], [force, 0, 0], atol=1e-12)
-        seen.append(force)
-    assert len(set(seen)) == 3
-    assert [str(signal.name) for signal in plant.wrench_signals[3:7]] == [
-        "wall.tool.fx",
-        "wall.tool.fy",
-        "wall.tool.fz",
-        "wall.world.mx",
-    ]
-
-
-def test_behind_springs_wrenches_need_no_control():
-    """lambda is then a function of the state, and so are they."""
-    outputs = [PointCoordinates("tool", "z")]
-    model = RobotModel.from_multibody(
-        parse("two_link_arm"), [wall()], outputs, [1.2, -1.6], "arm", [FlexibleJoints(8e3, 1.0)]
-    )
-    plant = RobotPlant(model)
-    port = plant.GetOutputPort("constraint_wrenches")
-    assert not plant.HasDirectFeedthrough(0, port.get_index())
-    assert port.Eval(plant.CreateDefaultContext()).shape == (12,)
 
 
 @pytest.mark.parametrize("make", [rubbing_arm, sphere_arm], ids=["friction", "sphere"])

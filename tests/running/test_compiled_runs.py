@@ -13,8 +13,8 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 from pydrake.systems.framework import DiagramBuilder
 from runs import first_quick, scenario, some
 
-from drake_dae import DaePlant, DaeSystem, RobotPlant, build_scenario, simulate
-from drake_dae.errors import NonFiniteError, SimulationError
+from drake_dae import DaePlant, DaeSystem, build_scenario, simulate
+from drake_dae.errors import NonFiniteError
 from drake_dae.running import compiled_run
 from drake_dae.running import simulate as simulation
 from drake_dae.running.compiled_run import CompiledRun
@@ -148,24 +148,6 @@ def test_a_fixed_value_at_a_connected_port_counts(short_runs):
     assert CompiledRun.of(loop.diagram, context, *given) is None
 
 
-def test_a_plant_without_a_log_moves_as_well(short_runs):
-    """Nothing reads its state; 0.1 s of a fall, as wired."""
-    chosen, loop, _ = loop_of("ideal contact")
-    builder = DiagramBuilder()
-    plant = builder.AddSystem(RobotPlant(loop.plant.model, structure=loop.plant.structure))
-    diagram = builder.Build()
-    ends = []
-    for see in (None, lambda now: None):
-        context = diagram.CreateDefaultContext()
-        own = plant.GetMyMutableContextFromRoot(context)
-        plant.GetInputPort("control").FixValue(own, np.zeros(7))
-        start = plant.state(own)
-        simulate(diagram, context, 0.1, chosen.integrator, after_step=see)
-        ends.append(plant.state(own))
-        assert np.abs(ends[-1] - start).max() > 1e-2
-    assert_allclose(*ends, rtol=0, atol=1e-9)
-
-
 def test_a_trial_out_of_the_domain_does_not_end_it(short_runs):
     """x' = 1000 (1 - x^2 sqrt(x)): long steps try an x without a root, and are made shorter."""
     functions = {"f": lambda x: 1000.0 - 1000.0 * x**2 * ca.sqrt(x), "h": lambda x: 1}
@@ -191,14 +173,6 @@ def test_a_trial_out_of_the_domain_does_not_end_it(short_runs):
     assert (caught.value.time, *caught.value.state) == (0.0, 2.0)
 
 
-def test_each_step_is_seen_where_that_is_asked_for(short_runs):
-    chosen, loop, context = built("observer and integrals")
-    times = []
-    see = lambda now: times.append(now.get_time())  # noqa: E731
-    simulate(loop.diagram, context, 0.01, chosen.integrator, after_step=see)
-    assert_allclose(times[:10], 1e-3 * np.arange(1, 11), rtol=1e-12)
-
-
 def test_drake_goes_on_from_samples_that_fail(short_runs, monkeypatch):
     """So a failure is that of Drake's Simulator; here it finds a step after all."""
     chosen, loop, context = built("observer and integrals")
@@ -220,16 +194,6 @@ def test_drake_goes_on_from_samples_that_fail(short_runs, monkeypatch):
     found, right = loop.record(context), loop.record(expected)
     assert_array_equal(found.time, right.time)
     assert_allclose(found["state"], right["state"], rtol=0, atol=1e-9)
-
-
-def test_a_step_that_fails_has_its_time_and_reason(short_runs):
-    """As without the call for a sample: the block that fails says so."""
-    chosen, loop, context = built("observer and integrals")
-    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    state[7:] = 1e9  # rad/s
-    loop.set_state(context, state)
-    with pytest.raises(SimulationError, match="t = 0"):
-        simulate(loop.diagram, context, 0.06, chosen.integrator)
 
 
 def test_a_signal_ends_it_and_keeps_what_it_recorded(short_runs):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drake_dae import Record, Signal
-from drake_dae.analysis.limits import LimitKind, SignalRange
+from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
 from drake_dae.running.judgement import FindingKind, Outcome, judge, late_rms
 from drake_dae.systems.control.contract import PhaseChange
@@ -76,12 +76,6 @@ def test_far_from_the_path_is_bad_though_it_is_as_predicted():
     assert "a reason" in first.cause
 
 
-def test_an_error_that_comes_back_is_bad():
-    found = judged(run(np.where((TIMES > 7.0) & (TIMES < 7.5), 0.01, 0.0)))
-    assert found.outcome is Outcome.BAD
-    assert re.search(r"tool\.y .*7\.5 s .*0\.01 m", str(found))
-
-
 def test_an_output_that_is_late_as_predicted_is_compared_where_it_is_at_its_reference():
     """0.2 exp(-0.8 t) is within 2 mm from 5.76 s on, and 3.7 mm in the middle of the run."""
     late = 0.2 * np.exp(-0.8 * TIMES)
@@ -100,20 +94,6 @@ def test_a_run_that_is_too_short_is_undecided():
     # A prediction that is left, or one that decays, is no such excuse.
     assert judged(run(0.08), record["tracking_error"]).outcome is Outcome.BAD
     assert judged(record).outcome is Outcome.BAD
-
-
-def test_what_is_predicted_late_may_be_late():
-    """0.05 e^(-0.45 t) is within 2 mm at 7.15 s."""
-    record = run(decaying(0.45))
-    assert judged(record, record["tracking_error"]).outcome is Outcome.GOOD
-    assert judged(record).outcome is Outcome.BAD
-
-
-def test_the_users_tolerances_come_first():
-    record = run(1e-4)
-    assert judged(record).outcome is Outcome.GOOD
-    assert judged(record, tolerances={"tool.y": 5e-5}).outcome is Outcome.BAD
-    assert judged(record, tolerances={"tool.y": 2e-4}).outcome is Outcome.GOOD
 
 
 def test_round_off_of_a_constant_reference_is_no_motion():
@@ -171,12 +151,6 @@ def test_a_limit_that_is_left_is_bad_with_its_numbers():
     signals = {**compliant.signals, "contact_force": Recorded(np.zeros((1001, 1)), (WALL,))}
     found = judged(Record(TIMES, signals), ranges=[force_range(-0.5)])
     assert found.outcome is Outcome.GOOD
-
-
-def test_an_early_end_is_bad():
-    found = judged(run(), ended="singular there")
-    assert found.outcome is Outcome.BAD
-    assert re.match(r"BAD: .*10 s: singular there$", str(found))
 
 
 def change(time, phase, place, reason, failed=False):

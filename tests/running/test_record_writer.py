@@ -1,7 +1,6 @@
 """The record on disk while a run goes on."""
 
 import errno
-import json
 import os
 
 import numpy as np
@@ -78,24 +77,6 @@ def test_wherever_the_file_ends(chosen, tmp_path):
         path.write_bytes(data[:end])
         with pytest.raises(ModelError, match=r"run.part"):
             Record.load(path)
-
-
-def test_numpy_and_json_read_it(chosen, tmp_path):
-    path = tmp_path / "run.part"
-    record = run(chosen, path)
-    head, data = path.read_bytes().split(b"\n", 1)
-    signals = json.loads(head)["signals"]
-    values = np.frombuffer(data, "<f8").reshape(record.time.size, -1)
-    np.testing.assert_array_equal(values[:, 0], record.time)
-    np.testing.assert_array_equal(values[:, 1 : 1 + len(signals["state"])], record["state"])
-    assert signals["control"] == [["joint1_motor", "N m"], ["joint2_motor", "N m"]]
-
-
-def test_a_short_run_makes_no_file_before_its_end(chosen, tmp_path):
-    def look(writer, loop, context):
-        assert not writer.path.exists()
-
-    run(chosen, tmp_path / "run.part", look)
 
 
 @pytest.mark.parametrize("link", [False, True])

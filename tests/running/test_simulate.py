@@ -6,13 +6,11 @@ import signal
 import sys
 import threading
 
-import casadi as ca
 import numpy as np
 import pytest
-from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
+from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
-from pydrake.trajectories import PiecewisePolynomial
 from runs import scenario
 
 from drake_dae import DaePlant, DaeSystem, build_scenario, load_scenario
@@ -112,16 +110,6 @@ def test_settings_are_checked(settings, message):
         simulate(diagram, context, 1.0, SimulatorConfig(use_error_control=True, **settings))
 
 
-def test_every_other_scheme_passes():
-    for scheme in set(GetIntegrationSchemes()) - {"cenic"}:
-        check_config(SimulatorConfig(integration_scheme=scheme, use_error_control=False))
-
-
-def test_drakes_settings_are_taken_where_none_are_given():
-    diagram, context, _ = ramp()
-    assert simulate(diagram, context, 1.0).simulated_time == pytest.approx(1.0)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_link_wall", "two_link_measured_force"])
 def test_a_second_run_of_a_context_is_a_record_of_its_own(name):
@@ -140,14 +128,6 @@ def test_a_second_run_of_a_context_is_a_record_of_its_own(name):
     both = loop.record(context)
     assert (both.time[0], both.time[-1]) == (0.0, pytest.approx(0.2))
     np.testing.assert_array_equal(both["state"][: len(second.time) - 1], second["state"][:-1])
-
-
-def test_after_each_step():
-    times = []
-    diagram, context, _ = ramp()
-    simulate(diagram, context, 1.0, fixed(), after_step=lambda c: times.append(c.get_time()))
-    # And after the events that were due at the end.
-    np.testing.assert_array_equal(times, [*np.arange(1, 9) / 8, 1.0])
 
 
 # Interruption, by a real signal.
@@ -174,19 +154,6 @@ def test_a_signal_ends_the_run_after_its_step(number):
     logged = logger.FindLog(context).data()[0]
     np.testing.assert_allclose(logged, [*np.arange(6) / 8, 0.625], atol=1e-14)
     assert signal.getsignal(number) is before
-
-
-def test_under_nohup_a_terminal_that_is_closed_ends_nothing():
-    def close():
-        os.kill(os.getpid(), signal.SIGHUP)
-
-    diagram, context, _ = ramp(0.5, close)
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        assert simulate(diagram, context, 1.0, fixed()).interrupted is None
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.usefixtures("signals_of_a_shell")
@@ -220,68 +187,9 @@ def test_runs_outside_of_the_main_thread():
 # Failure.
 
 
-def test_an_exception_keeps_the_log():
-    def fail():
-        raise ZeroDivisionError("in the middle")
-
-    diagram, context, logger = ramp(0.5, fail)
-    with pytest.raises(ZeroDivisionError, match="in the middle"):
-        simulate(diagram, context, 2.0, fixed())
-    np.testing.assert_array_equal(logger.FindLog(context).sample_times(), np.arange(5) / 8)
-
-
-def test_what_drake_says_gets_time_and_state():
-    def fail():
-        PiecewisePolynomial().value(0.0)  # Drake refuses an empty one.
-
-    with pytest.raises(RuntimeError):
-        fail()
-    diagram, context, _ = ramp(0.5, fail)
-    with pytest.raises(SimulationError, match=r"t = 0\.5\d* s, .*\[") as caught:
-        simulate(diagram, context, 2.0, fixed())
-    assert 0.5 <= caught.value.time <= 0.625
-    # The state is that of the stage at which it failed.
-    np.testing.assert_allclose(caught.value.state, caught.value.time, atol=0.1)
-    assert isinstance(caught.value.__cause__, RuntimeError)
-
-
 def two_link(*settings):
     scenario = load_scenario(find_scenario("two_link_wall"), settings)
     return *build_scenario(scenario), scenario
-
-
-def test_a_projection_that_fails_gets_time_and_state():
-    """A circle, as the zero of a function that is flat where a step of 1 s at 50 m/s leads."""
-
-    def gradient(p):
-        return 8 * ca.sumsqr(p) ** 3 / (1 + ca.sumsqr(p) ** 4) ** 2 * p
-
-    system = DaeSystem.from_functions(
-        ["x", "y", "vx", "vy"],
-        f=lambda s: [s[2], s[3], 0, 0],
-        g=lambda s: ca.vertcat(0, 0, gradient(s[:2])),
-        h=lambda s: [0, 0, 0, 1],
-        k=lambda s: [0.5 - 1 / (1 + ca.sumsqr(s[:2]) ** 4)],
-        l=lambda s: [s[1]],
-        m=lambda s: [[0]],
-        nominal_state=[1, 0, 0, 1],
-        name="flat",
-    )
-    builder = DiagramBuilder()
-    plant = builder.AddSystem(DaePlant(system))
-    control = builder.AddSystem(ConstantVectorSource([0.0]))
-    builder.Connect(control.get_output_port(), plant.get_input_port())
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    plant.set_state(plant.GetMyMutableContextFromRoot(context), [1.0, 0.0, 0.0, 50.0])
-    config = SimulatorConfig(
-        integration_scheme="explicit_euler", max_step_size=1.0, use_error_control=False
-    )
-    with pytest.raises(SimulationError, match=r"steps of 1 s .* 50 1/s.*t = 1 s, .*y0") as caught:
-        simulate(diagram, context, 3.0, config)
-    assert caught.value.time == 1.0
-    # Newton's law with v = 0: a straight line.
-    np.testing.assert_allclose(caught.value.state[:2], [1.0, 50.0], rtol=1e-12)
 
 
 def test_a_start_off_the_manifold_is_refused():
@@ -309,27 +217,6 @@ def test_a_bar_on_a_terminal(monkeypatch):
     assert last.startswith("100%|")
     assert "2.00/2.00 s" in last
     assert last.endswith(" x real time")
-
-
-def test_the_bar_shows_where_a_run_failed(monkeypatch):
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(module, "BAR_PERIOD", 0.0)
-
-    def fail():
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        simulate(*ramp(1.0, fail)[:2], 2.0, fixed(), progress=True)
-    assert "1.00/2.00 s" in terminal.getvalue().split("\r")[-1]
-    assert terminal.getvalue().endswith("\n")
-
-
-def test_no_bar_unless_asked_for(monkeypatch):
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    simulate(*ramp()[:2], 2.0, fixed())
-    assert terminal.getvalue() == ""
 
 
 def test_lines_where_there_is_no_terminal(monkeypatch, capsys):

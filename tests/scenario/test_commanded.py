@@ -69,17 +69,6 @@ def test_errors_stay_as_predicted_whatever_is_commanded(name):
     assert np.abs(found["constraint_residual"]).max() <= 1e-6
 
 
-@pytest.mark.slow
-def test_a_push_that_the_law_does_not_know_moves_the_tool():
-    built = build_commanded(scenario("two_link_wall"))
-    context = built.context.Clone()
-    upwards = "two_link_arm.push.two_link_arm::link2.force[2]"
-    set_inputs(built.loop, context, {upwards: 15.0})
-    pushed = run(built.loop, context, 0.5, FIXED)
-    plain = run(built.loop, built.context.Clone(), 0.5, FIXED)
-    assert pushed["controlled_output"][-1, 0] > plain["controlled_output"][-1, 0] + 0.01
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_every_shipped_scenario_is_commanded(name):

@@ -7,16 +7,11 @@ import numpy as np
 import pytest
 from arms import numbers
 from numpy.testing import assert_allclose
-from runs import scenario
 
-from drake_dae import Record, build_scenario, load_scenario, sweep
+from drake_dae import Record, build_scenario, load_scenario
 from drake_dae.cli import main
 from drake_dae.diagrams.record import phase_spans
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.rolled import roll_scenario
-from drake_dae.scenario.start import start_scenario
-from drake_dae.studies import make_variations
 
 # At rest 20 mm before the wall, which gives way.
 SHORT = """
@@ -78,14 +73,6 @@ def told(file, tmp_path, capsys, *settings):
     return code, found, (tmp_path / "run" / "summary.txt").read_text()
 
 
-def rolled(found):
-    """The rollout of a scenario, and its changes of phases."""
-    completed, loop = build_completed(found)
-    context = start_scenario(completed.scenario, loop)
-    result = roll_scenario(completed.scenario, loop, context)
-    return result, loop.changes(result.record)
-
-
 @pytest.mark.slow
 def test_a_way_that_was_chosen_for_failure_is_a_good_end(file, tmp_path, capsys):
     """The guard has it at 9 N; pressing to 10 N takes 0.1 s. The record is read again."""
@@ -111,28 +98,6 @@ def test_a_task_that_is_given_up_fails_the_check(file, tmp_path, capsys):
     story = " ".join(text.split("\n\n")[0].split())
     assert re.match("BAD: .*: Press .*9 N", story)
     assert found["phases"][-1]["force"] <= 0.5
-
-
-@pytest.mark.slow
-def test_a_task_that_leaves_as_chosen_for_success_is_good(file, tmp_path, capsys):
-    phases = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 5, on_success: leave}]"
-    code, found, text = told(file, tmp_path, capsys, phases, "duration=2")
-    assert (code, found["outcome"]) == (0, "good")
-    assert [one["phase"] for one in found["phases"]] == ["Approach", "Press", "leave", "held"]
-    assert text.startswith("GOOD: ")
-
-
-@pytest.mark.slow
-@pytest.mark.thorough
-def test_a_sweep_varies_a_guard(file, tmp_path):
-    """Each run is that of its scenario alone; 9 N of 10 N are too few."""
-    key = "task.phases.1.guards.0.above"
-    chosen = load_scenario(file, ["task.phases.1.tolerance=3", "duration=0.46"])
-    variations = make_variations({key: [9.0, 40.0]})
-    study = sweep(chosen, variations, tmp_path / "runs.db", workers=1, rollout=True)
-    held, pressed = study.values("largest wall.force [N]")
-    assert 9.0 < held < 9.5
-    assert_allclose(pressed, 10.0, atol=0.1)
 
 
 @pytest.mark.parametrize(
@@ -182,40 +147,3 @@ def test_the_shipped_task_tells_its_story(tmp_path, capsys):
     limit = float(text.split("A touch at 0.03 m/s is expected to stay below ")[1].split(" N")[0])
     # The expectation is made where the law has the wall, 8 mm before.
     assert_allclose(limit, expected, rtol=0.02)
-
-
-def test_the_hardest_touch_is_told_with_its_phase():
-    phases = (
-        "task.phases=[!Approach {name: feel, speed: 0.02, until: [{of: force, above: 30}]}, "
-        "!Press {force: 15}, !Release {}, !Retreat {distance: 0.01}, !Approach {speed: 0.03}]"
-    )
-    completed, _ = build_completed(scenario("wall_guarded", phases, "task.signals={}"))
-    (note,) = [one for one in completed.notes if "A touch" in one]
-    # 30 + 13 + 4 N, and 0.5 + 19.6 + 6 N.
-    assert "A touch by feel at 0.02 m/s is expected to stay below 47" in note
-
-
-@pytest.mark.slow
-def test_a_bias_that_feels_like_a_touch_is_told_with_its_remedy(file, tmp_path, capsys):
-    """3 N of bias end a move that feels for 2 N, in the air; with the bias found it touches."""
-    biased = "sensors.force={sample_period: 0.001, bias: 3}"
-    settings = (biased, TOLERANT)
-    _, _, text = told(file, tmp_path, capsys, *settings)
-    assert "task.tare_time" in text
-    code, found, text = told(file, tmp_path, capsys, *settings, "task.tare_time=0.1")
-    assert (code, found["phases"][-1]["phase"]) == (0, "done")
-    assert "feels like a touch" not in text
-
-
-def test_a_drift_of_the_sensor_is_felt_as_a_touch_in_the_air(file):
-    """The bias is found within 0.1 s; from then on 10 N/s reach the 2 N of the move in 0.2 s."""
-    settings = (
-        "sensors.force={sample_period: 0.001, drift: 10}",
-        "task.tare_time=0.1",
-        "task.phases.0.speed=0.01",
-    )
-    found = rolled(load_scenario(file, list(settings)))
-    (touch,) = [change.time for change in found[1] if change.phase == "Press"]
-    # The mean of the drift while the bias is found is that of its middle.
-    assert touch == pytest.approx(0.05 + 2.0 / 10.0, abs=0.02)
-    assert not found[0].record["constraint_force"][found[0].record.time < touch].any()

@@ -1,6 +1,5 @@
 """`drake-dae new`: a scenario for a robot of which only the file is known."""
 
-import os
 import re
 import subprocess
 import sys
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from runs import run_scenario
-from vendors import binary_stl, joint, link, mobile_arm, robot, write_panda
+from vendors import joint, link, mobile_arm, robot, write_panda
 
 from drake_dae import load_scenario, new_scenario
 from drake_dae.cli import main
@@ -157,20 +156,6 @@ def test_a_planar_arm_works_with_the_far_end_of_its_last_link(count, is_drawn, t
 
 
 @pytest.mark.slow
-def test_its_text_may_be_saved_anywhere_unless_a_folder_is_named(tmp_path, monkeypatch):
-    """In a folder below the working directory, too, where a relative name would be another file."""
-    monkeypatch.chdir(tmp_path)
-    Path("arm.urdf").write_text(arm(2))
-    Path("below").mkdir()
-    for folder, saved in ((None, "below/task.yaml"), ("", "task.yaml")):
-        _, text = new_scenario("arm.urdf", folder=folder)
-        assert ("file: arm.urdf" in text) == (folder is not None)
-        Path(saved).write_text(text)
-        file = load_scenario(saved).robot.file
-        assert os.path.realpath(file) == os.path.realpath("arm.urdf")
-
-
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::drake_dae.errors.RobotFileWarning")
 def test_only_what_must_be_left_out_is(tmp_path):
     friction = arm(2).replace("</joint>", '<dynamics friction="1"/></joint>', 1)
@@ -183,21 +168,6 @@ def test_only_what_must_be_left_out_is(tmp_path):
     ):
         (tmp_path / "arm.urdf").write_text(text)
         assert new_scenario(str(tmp_path / "arm.urdf"))[0].robot.leave_out == wanted
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["", "above"])
-def test_a_package_without_package_xml_is_the_folder_beside_the_file(where, tmp_path):
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "link.stl").write_bytes(binary_stl())
-    home = tmp_path / where
-    home.mkdir(exist_ok=True)
-    text = arm(2).replace(
-        '<box size="0.04 0.04 0.4"/>', '<mesh filename="package://parts/link.stl"/>'
-    )
-    (home / "arm.urdf").write_text(text)
-    found = new_scenario(str(home / "arm.urdf"))[0]
-    assert found.robot.packages == {"parts": str(tmp_path / "parts")}
 
 
 LOOP = """<sdf version="1.9"><model name="loop"><link name="a"/><link name="b"/><link name="c"/>

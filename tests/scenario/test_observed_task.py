@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pydrake.systems.analysis import Simulator
 from runs import run_scenario, some
 
-from drake_dae import Approach, Press, Record, Task, build_scenario, load_scenario, sweep
+from drake_dae import Record, build_scenario, load_scenario
 from drake_dae.cli import main
-from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.studies import make_variations
+from drake_dae.errors import ScenarioError
 
 # At rest 20 mm before the wall, whose friction the law takes for zero.
 OBSERVED = """
@@ -90,47 +88,6 @@ def test_an_observer_makes_a_task_robust_to_friction(file, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "settings",
-    some(
-        [
-            [],
-            [
-                # With the seeds 0 and 2 the first friction after the touch amplifies round-off.
-                "sensors.encoders={position_noise: 1.0e-5, velocity_noise: 0.01, seed: 1}",
-                "estimator={rate: 60, state_rate: 200, identify: [wall.friction]}",
-            ],
-            ["saturation=true", "plant.payloads=[{frame: tool, mass: 0.5}]"],
-            [
-                BIASED,
-                "sensors.force.noise_deviation=0",
-                "task.tare_time=0.0001",
-                "plant.friction=0",  # Or it sticks, with an error of the force.
-            ],
-            [
-                BIASED,
-                "task.tare_time=0.1",
-                "sensors.encoders={position_noise: 1.0e-5}",
-                "estimator={rate: 60, state_rate: 200, identify: [wall.friction]}",
-            ],
-        ],
-        of=3,
-        first=1,
-    ),
-    ids=["observer", "estimator", "limits and a payload", "one sample", "bias and estimator"],
-)
-def test_a_rollout_is_drakes_run(file, tmp_path, settings):
-    """To 1e-9 rad: single steps agree to round-off, which the loop does not amplify here."""
-    found = rolled(file, tmp_path, "duration=0.6", *settings)
-    _, _, wanted = run_scenario(load_scenario(file, ["duration=0.6", *settings]))
-    assert_allclose(found.time, wanted.time[: found.time.size], rtol=0, atol=1e-12)
-    rows = found.time.size
-    assert_allclose(found["state"], wanted["state"][:rows], rtol=0, atol=1e-9)
-    assert np.array_equal(found["phase"], wanted["phase"][:rows])
-    assert found["phase"][-1, 2] == 1.0  # It moves.
-
-
-@pytest.mark.slow
 def test_a_disturbance_is_seen_whether_the_contact_is_open_or_closed(file, tmp_path):
     """A payload of 0.5 kg at rest: the generalized force J^T m g, by the virtual work of a mass at
     the tool of a planar arm with links of 1 m."""
@@ -147,18 +104,6 @@ def test_a_disturbance_is_seen_whether_the_contact_is_open_or_closed(file, tmp_p
         assert_allclose(np.abs(seen), np.abs(weight), rtol=0.02)
 
 
-def test_the_low_pass_leaves_a_sixth_of_the_force_that_counts():
-    """White noise of 0.3 N after y += g (F - y), by its sums over 200,000 samples: 2 %."""
-    task = Task([Approach(0.05), Press(10.0)], contact_force=0.5, force_noise=0.3)
-    noise = 0.3 * np.random.default_rng(1).standard_normal(200_000)
-    felt, last = np.empty_like(noise), 0.0
-    for k, force in enumerate(noise):
-        last += task.force_gain * (force - last)
-        felt[k] = last
-    assert_allclose(np.std(felt[1000:]), 0.5 / 6.0, rtol=0.02)
-    assert Task([Approach(0.05), Press(10.0)]).force_gain == 1.0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", some([1, 2, 3]))
 def test_noise_is_no_touch(file, tmp_path, seed):
@@ -166,19 +111,6 @@ def test_noise_is_no_touch(file, tmp_path, seed):
     settings = [f"sensors.force.seed={seed}", "duration=0.4"]
     _, distance = touched(rolled(file, tmp_path, *settings))
     assert abs(distance) < 1e-3
-
-
-@pytest.mark.slow
-def test_a_study_varies_the_noise_that_a_task_knows(file, tmp_path):
-    """Each run is that of its scenario alone: its low-pass is that of its own noise."""
-    name = "sensors.force.noise_deviation"
-    chosen = load_scenario(file, ["duration=0.4"])
-    variations = make_variations({name: [0.1, 0.3]})
-    study = sweep(chosen, variations, tmp_path / "runs.db", workers=1, rollout=True)
-    for k, noise in enumerate((0.1, 0.3)):
-        alone = rolled(file, tmp_path, "duration=0.4", f"{name}={noise}")
-        largest = np.max(np.abs(alone["tracking_error"][:, 1]))
-        assert_allclose(study.values("largest error of wall.force [N]")[k], largest, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -192,30 +124,6 @@ def test_a_bias_is_found_before_the_touch(file, tmp_path):
     assert abs(touched(found)[1]) < 1e-3
     errors = found["tracking_error"][found.time > 1.0, 1]
     assert abs(np.mean(errors)) < 0.15
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "settings",
-    [(), ("sensors.encoders={position_noise: 1.0e-5}", "estimator={rate: 60, state_rate: 200}")],
-    ids=["observer", "estimator"],
-)
-def test_an_observer_takes_the_force_without_its_bias(file, tmp_path, settings):
-    """1 N of bias would be seen as a disturbance of 1 N m and more, with arms of 1 m. 0.2: what
-    100 samples of 0.3 N leave of the bias, and the mean of the noise since."""
-    still = ["plant.friction=0", "estimator={rate: 60}", "duration=1.5", "task.tare_time=0.1"]
-    only = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
-    found = rolled(file, tmp_path, BIASED, *still, only, *settings)
-    seen = np.mean(found["disturbance"][found.time > 1.0], axis=0)
-    assert np.max(np.abs(seen)) < 0.2
-
-
-@pytest.mark.slow
-def test_no_phase_ends_before_the_bias_is_found(file, tmp_path):
-    phases = "task.phases=[!Dwell {duration: 0.02}, !Approach {speed: 0.1, over: 0.1}]"
-    for tare_time, ends in ((0.0, 0.02), (0.1, 0.1)):
-        settings = [phases, f"task.tare_time={tare_time}", "duration=0.2"]
-        assert_allclose(touched(rolled(file, tmp_path, *settings))[0], ends, atol=2.1e-3)
 
 
 @pytest.mark.slow
@@ -237,51 +145,6 @@ def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys, rol
     assert found["phase"][found.time < 0.8][-1, 2] == 1.0  # It is done.
     assert np.all(found["constraint_force"][found.time > 1.0] == 0.0)
     assert np.max(np.abs(found["state"][-1, 2:])) < 0.05
-
-
-@pytest.mark.slow
-def test_integrals_of_a_task_wait_for_limited_drives(file):
-    """By the input port of the controller; before the touch they wait for the other law."""
-    chosen = load_scenario(file, ["estimator=null", "law.integral=[tool.z, wall.force]"])
-    loop, context = build_scenario(chosen)
-    own, found = loop.controller.GetMyMutableContextFromRoot(context), []
-    simulator = Simulator(loop.diagram, context)
-    for end, is_limited in ((0.2, 0.0), (0.6, 0.0), (0.7, 1.0), (0.8, 0.0)):
-        loop.controller.GetInputPort("hold").FixValue(own, [is_limited])
-        simulator.AdvanceTo(end)
-        found.append(loop.controller.GetOutputPort("integral").Eval(own).copy())
-    assert not found[0].any()
-    assert found[1].all()
-    assert_allclose(found[2], found[1], rtol=0, atol=0)
-    assert (found[3] != found[2]).all()
-
-
-@pytest.mark.slow
-def test_a_release_ends_though_a_bias_hides_that_the_contact_is_open(file, tmp_path):
-    """Formerly the law in contact drew the arm away until it diverged."""
-    phases = "task.phases=[!Press {force: 10, over: 0.1, tolerance: 3}, !Release {if_late: hold}]"
-    weak = "law.constraint_damping={all: [-25]}"  # Or it goes slowly.
-    found = rolled(file, tmp_path, BIASED, phases, weak, "duration=4")
-    assert found["phase"][-1, 2] == 1.0
-    assert 0.02 < found["distance"][-1, 0] < 0.05
-    assert np.max(np.abs(found["state"][-1, 2:])) < 0.02
-
-
-def test_a_sensor_begins_with_its_bias(file):
-    """The first sample counts for the mean."""
-    loop, context = build_scenario(load_scenario(file, [BIASED]))
-    own = loop.sensor.GetMyContextFromRoot(context)
-    (measured,) = loop.sensor.GetOutputPort("measured_force").Eval(own)
-    assert_allclose(measured, 1.0, atol=1e-12)
-
-
-def test_a_start_in_contact_is_on_the_wall_of_the_plant(file):
-    """The law has a disturbance besides, and takes the wall to be 50 mm nearer."""
-    moved = ["plant.parameters={wall.position: [1.25, 0, 0]}", "task.phases=[!Press {force: 10}]"]
-    loop, context = build_scenario(load_scenario(file, moved))
-    own = loop.plant.GetMyContextFromRoot(context)
-    gap = loop.plant.GetOutputPort("constraint_residual").Eval(own)[0]
-    assert abs(gap) < 1e-9
 
 
 @pytest.mark.slow
@@ -311,21 +174,6 @@ def test_gains_of_a_task_are_advised(file, tmp_path, capsys):
     assert 0.3 * peak < np.max(found["constraint_force"][found.time < 1.0]) < peak
 
 
-def test_parameters_of_another_system_are_taken_by_name(file):
-    """The law's model has a disturbance and its derivatives, the plant's a payload."""
-    payload = "plant.payloads=[{frame: tool, mass: 0.5}]"
-    loop, _ = build_scenario(load_scenario(file, [payload]))
-    own, law = loop.plant.dae, loop.controller.law.system
-    names = {p.name for p in law.parameters} & {p.name for p in own.parameters}
-    assert len(names) < min(len(law.parameters), len(own.parameters))
-    values = np.vstack([own.parameter_values, 2.0 * own.parameter_values])
-    found = law.parameters_of(own, values)
-    for name in names:
-        wanted = values[:, own.parameter_slice(name)]
-        assert_allclose(found[:, law.parameter_slice(name)], wanted, rtol=0, atol=0)
-    assert not found[:, law.parameter_slice("disturbance")].any()
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -351,8 +199,3 @@ def test_what_does_not_fit_is_said(file, change, message):
         ]
     with pytest.raises(ScenarioError, match=message):
         build_scenario(load_scenario(file, settings))
-
-
-def test_a_task_that_begins_in_contact_finds_no_bias():
-    with pytest.raises(ModelError, match="tare_time"):
-        Task([Press(10.0)], tare_time=0.1)

@@ -102,18 +102,13 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("constraints.0={frame: tool}", ["constraints.0: ", "'surface'"]),
         # Settings.
         ("duration", ["--set duration: "]),
-        ("", ["--set : "]),
-        ("=1", ["--set =1: "]),
         ("start..errors=1", ["--set start..errors=1: "]),
         ("duration=[1", ["duration: ", "line 1: "]),
-        ("duration=1: 2", ["duration: ", "line 1: ", "'1'"]),
         ("duration=1\nfoo: 2", ["duration: ", "line 2: "]),
-        ("constraints.2=1", ["constraints: ", "'2'", "0"]),
         # Types.
         ("duration=abc", ["duration: ", "'abc'"]),
         # The robot's file.
         ("robot.file=no.urdf", ["robot.file: ", "/no.urdf"]),
-        ("robot.file=package://x/y.urdf", ["robot.file: ", "'x'"]),
         (
             f"robot.file={find_scenario('two_link_wall')}",
             ["robot.file: ", "two_link_wall.yaml", ".urdf"],
@@ -150,10 +145,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         # Outputs.
         ("outputs.0.axes=xz", ["outputs: ", "1", "2", "(tool.x, tool.z)"]),
         ("outputs.0.axes=x", ["outputs: ", "(5)", "'tool.x'"]),
-        ("outputs.0.axes=zz", ["outputs.0: ", "'zz'"]),
-        ("outputs.0.frame=tol", ["outputs.0: ", "'tol'", "'tool'"]),
         ("outputs.0=!JointPositions {joints: [joint9]}", ["outputs.0: ", "'joint9'", "joint1"]),
-        ("outputs.0=!SurfaceCoordinates {constraint: wal}", ["outputs.0: ", "'wal'", "'wall'?"]),
         (
             "plant.parameters={wall.position: [[1, 0, 0]]}",
             ["plant.parameters.wall.position: ", "[[1, 0, 0]"],
@@ -161,18 +153,13 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         # Gains.
         ("law.gains.all=[1]", ["gains: ", "Hurwitz"]),
         ("law.gains.all=[-1, -2, -3]", ["gains: ", "'tool.z'", "3"]),
-        ("law.gains.outputs={tool.z: [-1]}", ["gains: ", "'all'", "'outputs'"]),
         ("law.gains=!Poles {outputs: {tool.q: [-1]}}", ["gains: ", "tool.q"]),
-        ("law.gains=!Coefficients {all: [16]}", ["gains: ", "'tool.z'", "2", "1"]),
         ("law.gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),
-        ("law.gains=!Matrices {groups: [[[[1, 0], [1]], [[1]]]]}", ["gains: groups: "]),
         # References.
         ("references={}", ["references: ", "tool.z", "wall.force"]),
-        ("references={tool: 1}", ["references: ", "wall.force"]),
         ("references={tool.z: a}", ["references.tool.z: ", "!C"]),
         ("references.wall.forc=1", ["references.wall.forc: ", "'wall.force'"]),
         ("references.tool=1", ["references: ", "'tool.z'", "'tool'"]),
-        ("references.tool.z, =1", ["references.tool.z, : ", "''"]),
         (
             "references.tool.z=!Constant {values: [1, 2, 3]}",
             ["references.tool.z: ", "3", "1", "tool.z"],
@@ -181,8 +168,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             "references={'wall.force, tool.z': !Constant {values: [1]}}",
             ["references.wall.force, tool.z: ", "1", "2", "wall.force", "tool.z"],
         ),
-        ("references.wall.force=!Constant {values: []}", ["references.wall.force: "]),
-        (f"{SINES} {{offset: 1, amplitudes: [1], frequencies: [1, 2]}}", ["frequencies", "2"]),
         (
             f"{SINES} {{offset: 1, amplitudes: [1, 2], frequencies: [1, 2], phases: [0]}}",
             ["references.wall.force: ", "amplitudes", "phases"],
@@ -191,24 +176,18 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             f"{SINES} {{offset: 1, amplitudes: [], frequencies: []}}",
             ["wall.force: "],
         ),
-        (f"{MOVE} {{start: [1, 2], end: [1], end_time: 1}}", ["start", "2", "1"]),
         (f"{MOVE} {{start: [1], end: [2], end_time: 0}}", ["references.tool.z: ", "end_time", "0"]),
         (f"{MOVE} {{start: [1], end: [2], end_time: 1, order: 1}}", ["tool.z: ", "order=2"]),
         # Actuation and force.
-        ("actuation=[!FlexibleJoints {stiffness: []}]", ["actuation.0.stiffness: "]),
         (
             "actuation=[!FlexibleJoints {stiffness: [1, 2, 3], inertia: [1]}]",
             ["actuation.0: ", "stiffness"],
         ),
         (f"{SPRINGS} abc}}]", ["actuation.0.stiffness: ", "'abc'"]),
-        (f"{SPRINGS} .inf}}]", ["actuation.0.stiffness: "]),
-        (f"{SPRINGS} [1, [2]]}}]", ["actuation.0.stiffness: ", "[2]"]),
         (f"{SPRINGS} [[1, 0], [0]]}}]", ["actuation.0.stiffness: ", "[[1, 0]", "[0]"]),
-        (f"{SPRINGS} [[1, 2], [3, 9]]}}]", ["actuation.0: ", "stiffness"]),
         (f"{SPRINGS} [[1, 2], [2, 1]]}}]", ["actuation.0: ", "-1"]),
         (f"{SPRINGS} [[1, 0, 0], [0, 1, 0]]}}]", ["actuation.0: ", "(2,)", "(2, 2)"]),
         ("sensors.force=!MeasuredForce", ["sensors.force: ", "!MeasuredForce", "{}"]),
-        ("sensors.force=!MeasuredForce {}", ["sensors.force: ", "!MeasuredForce"]),
         ("sensors.force={gain: 1}", ["sensors.force: ", "'gain'", "bias"]),
         (
             "sensors.force={time_constant: 1, seed: -1}",
@@ -228,16 +207,11 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("duration=0", ["duration: ", "positive", "0"]),
         ("integrator.integration_scheme=runge_kuta5", ["integrator: ", "'runge_kutta5'"]),
         ("integrator.integration_scheme=runge_kutta2", ["integrator: ", "use_error_control"]),
-        ("integrator.accuracy=0", ["integrator: ", "accuracy", "0"]),
     ],
 )
 def test_refused_with_key_value_and_remedy(settings, words):
     message = refusal(*([settings] if isinstance(settings, str) else settings))
     assert [word for word in words if word not in message] == [], message
-
-
-def test_only_a_scalar_in_place_of_text_is_advised_to_go_in_quotes():
-    assert refusal("constraints.0.frame=[a]") == "constraints.0.frame: expected text, got ['a']"
 
 
 def test_all_problems_are_reported_at_once():

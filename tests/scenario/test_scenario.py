@@ -1,6 +1,5 @@
 """What a scenario file says is what the library makes of it."""
 
-from copy import deepcopy
 from dataclasses import fields
 
 import numpy as np
@@ -42,7 +41,6 @@ from drake_dae.scenario import parts as written
 from drake_dae.scenario.robot_file.robot import Pose, Robot
 from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario
-from drake_dae.trace.functions import TracedFunction
 
 
 def test_every_form_reads_back_equal(tmp_path):
@@ -122,14 +120,6 @@ def test_every_form_reads_back_equal(tmp_path):
         assert getattr(copy.integrator, key) == getattr(scenario.integrator, key)
 
 
-def test_defaults_are_those_of_the_dataclasses(tmp_path):
-    scenario = load_scenario(lever(tmp_path))
-    assert scenario.write == forms.Write(record=True, plots=False, animation=True)
-    assert scenario.integrator.integration_scheme == "runge_kutta5"
-    assert scenario.integrator.use_error_control
-    assert scenario.law.gains is None
-
-
 def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
     path = lever(tmp_path / "robots")
     (tmp_path / "scenarios").mkdir()
@@ -139,12 +129,6 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
     scenario = load_scenario(away)
     assert scenario.robot.file == str((tmp_path / "robots" / "lever.urdf").resolve())
     assert run(scenario)[1].time[-1] == 0.1
-
-
-def test_packages_of_a_robot(tmp_path):
-    path = lever(tmp_path / "robots")
-    settings = ["robot.file=package://mine/lever.urdf", "robot.packages.mine=."]
-    assert build_scenario(load_scenario(path, settings))[0].plant.dae.name == "lever"
 
 
 @pytest.mark.parametrize(
@@ -184,93 +168,6 @@ def test_settings_reach_names_with_dots_in_lists():
     assert phase.references == {"tool.z": 0.4}
 
 
-def test_later_settings_see_earlier_ones():
-    change = ["constraints.0.surface=!Sphere {center: [0, 0, 0], radius: 1}"]
-    change.append("constraints.0.surface.radius=2")
-    assert two_link(*change).constraints[0].surface == Sphere((0, 0, 0), 2.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("form", "surface"),
-    [
-        ("!Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}", Plane((1.2, 0, 0), (-1, 0, 0))),
-        (
-            "!Sphere {center: [1.4, 0, 0.3], radius: 0.3, axis: [0, 1, 0]}",
-            Sphere((1.4, 0, 0.3), 0.3, (0, 1, 0)),
-        ),
-        (
-            "!Cylinder {point: [1, 0, 0.3], axis: [0, 1, 0], radius: 0.4, inside: true}",
-            Cylinder((1, 0, 0.3), (0, 1, 0), 0.4, True),
-        ),
-        (
-            "!Ellipsoid {center: [1.5, 0, 0.3], semi_axes: [0.4, 0.5, 0.6]}",
-            Ellipsoid((1.5, 0, 0.3), (0.4, 0.5, 0.6)),
-        ),
-        (
-            "!Torus {center: [1.6, 0, 0.3], axis: [0, 1, 0], major_radius: 0.4, minor_radius: 0.1}",
-            Torus((1.6, 0, 0.3), (0, 1, 0), 0.4, 0.1),
-        ),
-    ],
-)
-def test_surfaces(form, surface):
-    still = "references={tool.z: 0.3, wall.force: 20}"
-    scenario = two_link(f"constraints.0.surface={form}", still, "duration=0.2")
-    loop, record, distance = run(scenario)
-    assert loop.plant.model.constraints[0].surface == surface
-    # The accuracy is 1e-8 in a step.
-    assert np.max(distance) < 1e-6
-    np.testing.assert_allclose(record["constraint_force"], 20.0, atol=1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("form", "poles"),
-    [
-        ("!Poles {all: [-3, -5]}", [-5, -3]),
-        ("!Poles {outputs: {tool.z: [-2]}}", [-2, -2]),
-        ("!Coefficients {all: [25, 6]}", [-3 - 4j, -3 + 4j]),
-        ("!Coefficients {outputs: {tool.z: [15, 8]}}", [-5, -3]),
-        ("!Matrices {groups: [[[[15]], [[8]]]]}", [-5, -3]),
-    ],
-)
-def test_gains(form, poles):
-    loop, _ = build_scenario(two_link(f"law.gains={form}"))
-    # A double pole is found to the root of the round-off.
-    found = np.sort_complex(loop.controller.law.gains.poles)
-    np.testing.assert_allclose(found, poles, atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("form", "signal"),
-    [
-        ("!Constant {values: [0.4]}", ConstantReference([0.4])),
-        (
-            "!Sinusoids {offset: 0.3, amplitudes: [0.1, 0.2], frequencies: [1, 2]}",
-            SinusoidReference(0.3, [0.1, 0.2], [1, 2]),
-        ),
-        (
-            "!Sinusoids {offset: 0.3, amplitudes: [0.1], frequencies: [1], phases: [0.5]}",
-            SinusoidReference(0.3, [0.1], [1], [0.5]),
-        ),
-        (
-            "!PointToPoint {start: [0.2], end: [0.4], start_time: 0.5, end_time: 2, order: 3}",
-            PointToPointReference([0.2], [0.4], 0.5, 2, 3),
-        ),
-        (
-            "!PointToPoint {start: [0.2], end: [0.4], end_time: 2}",
-            PointToPointReference([0.2], [0.4], 0, 2),
-        ),
-    ],
-)
-def test_references(form, signal):
-    loop, _ = build_scenario(two_link(f"references.tool.z={form}"))
-    truth = signal.derivatives([2])
-    for time in (0.0, 0.7, 1.3):
-        np.testing.assert_allclose(loop.reference.reference(time)[:3], truth(time), atol=1e-15)
-
-
 def test_outputs():
     """The outputs of seven_joint_wall in other words."""
     settings = [
@@ -298,22 +195,6 @@ def test_a_run_begins_at_its_start_time_with_the_errors_there():
     assert np.max(distance) < 1e-6
 
 
-def test_a_start_is_at_rest():
-    loop, context = build_scenario(two_link("integrator.start_time=3"))
-    assert context.get_time() == 3.0
-    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    np.testing.assert_array_equal(state[2:], 0.0)
-
-
-def test_build_leaves_the_scenario_alone():
-    scenario = two_link(
-        "references.tool.z={_tag: '!Sinusoids', offset: 0.3, amplitudes: [0.1], frequencies: [1]}"
-    )
-    before = deepcopy(scenario)
-    build_scenario(scenario)
-    assert scenario == before
-
-
 @pytest.mark.slow
 def test_weld():
     """The shipped scenario is the model of tests/support/two_arms.py."""
@@ -333,81 +214,3 @@ def test_weld():
         ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
     )
     assert plain.constraints[0] == written.WeldedFramesForm("left::tool", "right::tool", Pose())
-
-
-def test_coincident_points():
-    loop, context = build_scenario(load_scenario(find_scenario("five_bar")))
-    (pin,) = loop.plant.model.constraints
-    assert pin == CoincidentPoints("left2", (0.5, 0, 0), "right2", (0.5, 0, 0), "xz", "pin")
-    # The ends meet, by Drake's kinematics.
-    plant = loop.plant.model.links.plant
-    own = plant.CreateDefaultContext()
-    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    plant.SetPositions(own, state[:4])
-    left, right = (
-        plant.GetFrameByName(f"{side}2").CalcPoseInWorld(own) @ np.array([0.5, 0.0, 0.0])
-        for side in ("left", "right")
-    )
-    np.testing.assert_allclose(left, right, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(left, [0.12 - 0.04, 0.0, 0.55 + 0.03], rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("form", "stage"),
-    [
-        ("!FlexibleJoints {stiffness: 8e3, inertia: 1}", FlexibleJoints(8e3, 1.0)),
-        ("!FlexibleJoints {stiffness: [8e3], inertia: [1]}", FlexibleJoints(8e3, 1.0)),
-        (
-            "!FlexibleJoints {stiffness: [8e3, 6e3], inertia: [[1, 0.1], [0.1, 2]], damping: 3}",
-            FlexibleJoints([8e3, 6e3], [[1.0, 0.1], [0.1, 2.0]], 3.0),
-        ),
-        (
-            "!FlexibleJoints {stiffness: [[8e3, 5e2], [5e2, 6e3]], inertia: 1}",
-            FlexibleJoints([[8e3, 5e2], [5e2, 6e3]], 1.0),
-        ),
-        (
-            "!DcMotors {torque_constant: [0.5, 0.4], inductance: 0.01, resistance: 1}",
-            DcMotors([0.5, 0.4], 0.01, 1.0),
-        ),
-        (
-            "!ElectrohydraulicServos {stiffness: 1e6, leakage: [[2e-6, 1e-6], [1e-6, 3e-6]], "
-            "geometry: [[0.05, 0.01], [0, 0.04]]}",
-            ElectrohydraulicServos(1e6, [[2e-6, 1e-6], [1e-6, 3e-6]], [[0.05, 0.01], [0, 0.04]]),
-        ),
-    ],
-)
-def test_stages(form, stage):
-    """Numbers, diagonals and full matrices reach the equations: x' is that of the stage in Python.
-
-    The rows of G = [[0.05, 0.01], [0, 0.04]] and its columns differ, so that a transposed matrix
-    would show.
-    """
-    loop, context = build_scenario(two_link(f"actuation=[{form}]"))
-    model = loop.plant.model
-    rebuilt = type(model)(model.links, model.constraints, model.outputs, actuation=[stage])
-    assert [p.name for p in rebuilt.dae.parameters] == [p.name for p in model.dae.parameters]
-    np.testing.assert_array_equal(rebuilt.dae.parameter_values, model.dae.parameter_values)
-    state = loop.plant.state(loop.plant.GetMyContextFromRoot(context))
-    state = state + 0.1 * np.random.default_rng(0).standard_normal(state.size)
-    rates = []
-    for dae in (model.dae, rebuilt.dae):
-        inputs = [dae.state, dae.parameter_symbol]
-        function = TracedFunction("f", dict(zip("xp", inputs, strict=True)), {"f": dae.f})
-        rates.append(function(state, dae.parameter_values)[0])
-    np.testing.assert_array_equal(*rates)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("gain", "matrix"),
-    [
-        ("2", 2.0 * np.eye(2)),
-        ("[2]", 2.0 * np.eye(2)),
-        ("[[2, 0.5], [0.5, 3]]", [[2, 0.5], [0.5, 3]]),
-    ],
-)
-def test_force_gain(gain, matrix):
-    settings = ["sensors.force.time_constant=0.01", f"law.force_gain={gain}"]
-    loop, _ = build_scenario(load_scenario(find_scenario("five_bar"), settings))
-    np.testing.assert_array_equal(loop.controller.law.measured_force.gain, matrix)

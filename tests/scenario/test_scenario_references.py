@@ -1,9 +1,7 @@
 """References in scenarios: each kind as a file says it, what is refused, and a run behind them."""
 
-import jsonschema
-import numpy as np
 import pytest
-from runs import run_scenario, scenario, scenario_validator, untagged
+from runs import scenario
 
 from drake_dae import (
     CircleReference,
@@ -16,7 +14,7 @@ from drake_dae import (
 )
 from drake_dae.errors import ScenarioError
 from drake_dae.references import PathLimits, SpiralReference
-from drake_dae.scenario.scenario import save_scenario, scenario_data
+from drake_dae.scenario.scenario import save_scenario
 from drake_dae.scenario.shipped import find_scenario
 
 GENTLE = "limits: {speed: 0.2, acceleration: 1}"
@@ -51,15 +49,6 @@ def test_a_form_is_its_reference_and_is_written_as_such(form, tmp_path):
     assert chosen.references == {"tool": FORMS[form]}
     save_scenario(chosen, tmp_path / "copy.yaml")
     assert load_scenario(tmp_path / "copy.yaml").references == chosen.references
-
-
-def test_the_schema_knows_all():
-    forms = ", ".join(f"'{place}': {form}" for place, form in enumerate([*FORMS, "2.0"]))
-    data = scenario_data(scenario("two_link_wall", f"references={{{forms}}}"))
-    scenario_validator().validate(untagged(data))
-    data["references"]["0"]["limit"] = {}
-    with pytest.raises(jsonschema.ValidationError):
-        scenario_validator().validate(untagged(data))
 
 
 def refusal(form):
@@ -111,26 +100,6 @@ def test_what_is_wrong_is_reported_with_its_key(form, message):
     found = refusal(form)
     assert found.startswith("references.tool.z")
     assert message in found
-
-
-@pytest.mark.slow
-def test_a_robot_follows_the_reference_of_a_file(tmp_path):
-    """The file lies beside the scenario. The law's model is exact: accuracy 1e-8 leaves 1e-7."""
-    times = np.arange(0.0, 1.01, 0.05)
-    lines = [f"{t},{0.3 + 0.1 * np.sin(2 * t)},{20 + 5 * t}" for t in times]
-    (tmp_path / "way.csv").write_text("\n".join(["time,z,push", *lines]))
-    text = find_scenario("two_link_wall").read_text()
-    before, after = text.split("references:")[0], text[text.index("start:") :]
-    form = "{'tool.z, wall.force': !Csv {file: way.csv, columns: [z, push]}}"
-    (tmp_path / "own.yaml").write_text(f"{before}references: {form}\n{after}")
-    chosen = load_scenario(tmp_path / "own.yaml", ["duration=1", "start.errors={}"])
-    assert chosen.references["tool.z, wall.force"].file == str(tmp_path / "way.csv")
-    loop, _, record = run_scenario(chosen)
-    predicted = loop.predicted_error(record)
-    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-6)
-    middle = (record.time > 0.2) & (record.time < 0.8)
-    wanted = 0.3 + 0.1 * np.sin(2 * record.time[middle])
-    np.testing.assert_allclose(record["desired_output"][middle, 0], wanted, atol=5e-4)
 
 
 def test_files_in_settings_of_a_shipped_scenario_are_in_the_working_directory(

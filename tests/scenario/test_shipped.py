@@ -4,7 +4,7 @@ import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_dae import load_scenario, shipped_model
+from drake_dae import shipped_model
 from drake_dae.errors import ModelError
 
 
@@ -17,7 +17,3 @@ def test_a_model_is_found_by_its_name():
 def test_a_name_that_is_none_is_reported_with_those_that_are():
     with pytest.raises(ModelError, match=r"two_link_arm\.urdf"):
         shipped_model("two_link_arm")
-
-
-def test_a_scenario_is_found_by_its_name_as_by_the_command():
-    assert load_scenario("two_link_wall", ["duration=3"]).duration == 3.0

@@ -8,6 +8,7 @@ from runs import run_scenario
 from vendors import joint, link, robot
 
 from drake_dae import build_scenario, load_scenario
+from drake_dae.cli import main
 
 TILT, PLACE = (0.0, 0.2, 0.0), (1.15, 0.0, 0.05)
 
@@ -40,6 +41,13 @@ def test_the_tilt_is_that_from_the_wall_of_the_law_on_the_wall_of_the_plant(plan
     assert_allclose(rest, 0.0, atol=1e-9)
 
 
+ARM = robot(
+    "arm",
+    *(link(name, 1.0) for name in ("base", "one", "end")),
+    joint("first", "base", "one", "0 1 0", (0.0, 0.0, 0.0), limits=(-3, 3)),
+    joint("second", "one", "end", "0 1 0", (0.0, 0.0, 1.0), limits=(-3, 3)),
+)
+
 MECHANISM = """
 robot: {file: arm.urdf, base: {weld: base}, actuators: []}
 constraints:
@@ -51,14 +59,7 @@ integrator: {accuracy: 1.0e-10}
 
 def test_a_mechanism_without_drive_starts_in_motion_and_keeps_its_energy(tmp_path):
     """By MultibodyPlant's energies: an ideal constraint does no work, and no motor is there."""
-    (tmp_path / "arm.urdf").write_text(
-        robot(
-            "arm",
-            *(link(name, 1.0) for name in ("base", "one", "end")),
-            joint("first", "base", "one", "0 1 0", (0.0, 0.0, 0.0), limits=(-3, 3)),
-            joint("second", "one", "end", "0 1 0", (0.0, 0.0, 1.0), limits=(-3, 3)),
-        )
-    )
+    (tmp_path / "arm.urdf").write_text(ARM)
     (tmp_path / "mechanism.yaml").write_text(MECHANISM)
     chosen = load_scenario(tmp_path / "mechanism.yaml", ["duration=0.4"])
     loop, _, record = run_scenario(chosen)
@@ -74,3 +75,13 @@ def test_a_mechanism_without_drive_starts_in_motion_and_keeps_its_energy(tmp_pat
     assert_allclose(energies, energies[0], atol=1e-7)  # Of 30 J; steps of 1e-10 of the states.
     assert record["control"].shape[1] == record["tracking_error"].shape[1] == 0
     assert np.abs(record["constraint_residual"]).max() < 1e-7
+
+
+def test_what_needs_a_law_says_that_a_mechanism_has_none(tmp_path, capsys):
+    (tmp_path / "arm.urdf").write_text(ARM)
+    (tmp_path / "mechanism.yaml").write_text(MECHANISM)
+    for command in ("analyze", "export"):
+        words = [command, str(tmp_path / "mechanism.yaml")]
+        words += ["--out", str(tmp_path / "out")] if command == "export" else []
+        assert main(words) == 1
+        assert "robot.actuators" in capsys.readouterr().err

@@ -2,12 +2,10 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from runs import run_scenario, scenario, some
+from runs import some
 
-from drake_dae import build_scenario, load_scenario, shipped_model, simulate, start_meshcat
+from drake_dae import build_scenario, load_scenario, shipped_model
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.build import build_completed
@@ -59,47 +57,11 @@ def test_command_runs_a_task_in_drakes_own_contact(file, tmp_path, capsys):
     assert '"phases": [[0.0, "Approach"], [0.' in page
 
 
-@pytest.mark.slow
-def test_live_view_draws_a_task(file):
-    meshcat = start_meshcat()
-    found = load_scenario(file, ["plant=!MultibodyPlant {radius: 1.0e-5}"])
-    loop, context = build_scenario(found, meshcat)
-    simulate(loop.diagram, context, 0.02, found.integrator)
-    assert meshcat.HasPath("/contact/wall/surface")
-
-
-@pytest.mark.slow
-def test_shipped_task_polishes_its_eight(tmp_path):
-    """Within 0.02 mm and 0.1 N two seconds after the transition; the touch does not bounce."""
-    completed, loop = build_completed(scenario("wall_polish"))
-    rolled = roll_scenario(completed.scenario, loop, start_scenario(completed.scenario, loop))
-    record, changes = rolled.record, loop.changes(rolled.record)
-    assert loop.generator is None
-    assert [change.phase for change in changes][-1] == "done"
-    times = {change.phase: change.time for change in changes}
-    late = (record.time > times["Move 2"] + 2.0) & (record.time < times["Dwell"])
-    errors, force = record["tracking_error"][late], record["constraint_force"][:, 0]
-    assert np.linalg.norm(errors[:, :2], axis=1).max() < 2e-5
-    assert np.abs(errors[:, 6]).max() < 0.1
-    assert force[(record.time > times["Press"]) & (record.time < times["Release"])].min() > 0.0
-    assert force.max() < 27.0
-
-
 def test_analysis_of_a_task_knows_its_robot(file):
     """Not its motion."""
     found = find_feasibility(load_scenario(file))
     assert found.problems == ()
     assert found.analysis.structure is not None
-
-
-@pytest.mark.slow
-def test_several_integrals_serve_a_task_whose_contact_opens(file):
-    """The task holds them itself while the contact is open."""
-    measured = "sensors.force={sample_period: 0.001}"
-    settings = [measured, "law.integral=[tool.z, wall.force]", "task.phases.1.tolerance=3"]
-    loop, _, record = run_scenario(load_scenario(file, settings))
-    assert loop.changes(record)[-1].phase == "done"
-    assert_allclose(record["tracking_error"][-1, 1], 0.0, atol=0.05)
 
 
 @pytest.mark.slow
@@ -164,48 +126,6 @@ def test_a_rollout_of_a_task_reports_its_phases(file, tmp_path, capsys):
         told.append([line.split(";")[0] for line in lines[first : first + 4]])
     assert told[0] == told[1]
     assert ": done, after" in told[1][-1]
-
-
-def test_a_task_that_begins_in_contact_starts_on_it(file):
-    """The positions of the file are 20 mm before the wall."""
-    change = ["task.phases=[!Press {force: 10}]", "start.positions.joint1=1.2"]
-    loop, context = build_scenario(load_scenario(file, change))
-    own = loop.plant.GetMyContextFromRoot(context)
-    assert abs(loop.plant.GetOutputPort("constraint_residual").Eval(own)[0]) < 1e-12
-
-
-@pytest.mark.slow
-def test_a_task_has_the_noise_of_its_seed(file):
-    noisy = "sensors.force={sample_period: 0.001, noise_deviation: 0.1}"
-    found = []
-    for seed in (1, 2, 1):
-        settings = [noisy, f"sensors.force.seed={seed}"]
-        loop, context = build_scenario(load_scenario(file, settings))
-        own = loop.noise.GetMyContextFromRoot(context)
-        found.append(loop.noise.get_output_port().Eval(own).item())
-    assert found[0] == found[2] != found[1]
-
-
-@pytest.mark.slow
-def test_a_link_is_heavier_in_either_plant(file):
-    """The free robot sags alike; Drake's steps of 0.1 ms are off by their order, 0.1 %."""
-    sagged = []
-    for plant in ("!CompliantContact {time_step: 1.0e-4}", "!MultibodyPlant {time_step: 1.0e-4}"):
-        change = [f"plant={plant}", "plant.parameters={link2.mass: 13}", "duration=0.05"]
-        found = load_scenario(file, change)
-        loop, context = build_scenario(found)
-        simulate(loop.diagram, context, found.duration, found.integrator)
-        sagged.append(loop.record(context)["tracking_error"][-1, 0])
-    assert abs(sagged[0]) > 1e-3
-    assert sagged[1] == pytest.approx(sagged[0], rel=5e-3)
-
-
-def test_a_phase_takes_a_file_beside_the_scenario(file):
-    (file.parent / "path.csv").write_text("time,z\n0,0.30\n0.1,0.31\n0.2,0.32\n")
-    rows = "!Csv {file: path.csv, columns: [z]}"
-    loop, _ = build_scenario(load_scenario(file, [f"task.phases.2.references.tool.z={rows}"]))
-    reference = loop.controller.task.phases[2].references["tool.z"]
-    assert reference.file == str(file.parent / "path.csv")
 
 
 def test_a_task_does_not_start_outside_of_limits(tmp_path):

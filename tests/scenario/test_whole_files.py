@@ -111,40 +111,12 @@ def test_a_closed_chain_of_sdformat_on_a_wall(chain):
         np.testing.assert_allclose(*ends, atol=1e-8)
 
 
-SLIDER = """<sdf version="1.8"><model name="press">
-<link name="crank"><inertial><pose>0.1 0 0 0 0 0</pose><mass>1</mass></inertial></link>
-<joint name="motor" type="revolute"><parent>world</parent><child>crank</child>
-<axis><xyz>0 1 0</xyz><limit><effort>9</effort></limit></axis></joint>
-<link name="rod"><pose relative_to="crank">0.2 0 0 0 0.3 0</pose>
-<inertial><mass>1</mass></inertial></link>
-<joint name="big_end" type="revolute"><parent>crank</parent><child>rod</child>
-<axis><xyz>0 1 0</xyz><limit><effort>0</effort></limit></axis></joint>
-<link name="piston"><pose>0.5 0 0 0 0 0</pose><inertial><mass>1</mass></inertial></link>
-<joint name="small_end" type="revolute"><parent>rod</parent><child>piston</child>
-<axis><xyz>0 1 0</xyz><limit><effort>0</effort></limit></axis></joint>
-<joint name="barrel" type="TYPE"><parent>world</parent><child>piston</child>
-<axis><xyz>1 0 0</xyz><limit><lower>-0.4</lower><upper>0.4</upper><effort>0</effort></limit>
-<dynamics><damping>3</damping></dynamics></axis></joint></model></sdf>"""
 PRESS = """
 robot: {file: press.sdf}
 outputs: [!JointPositions {joints: [motor]}]
 forces: []
 references: {motor: -0.3}
 """
-
-
-def press(folder: Path, kind: str):
-    (folder / "press.sdf").write_text(SLIDER.replace("TYPE", kind))
-    (folder / "mine.yaml").write_text(PRESS)
-    return scenario_model(load_scenario(folder / "mine.yaml"))
-
-
-def test_a_joint_that_slides_closes_a_loop(tmp_path):
-    """With its damping and its limits, held across the plane's normal alone."""
-    (barrel,) = press(tmp_path, "prismatic").constraints
-    assert (barrel.name, barrel.normal, barrel.axis) == ("barrel", "x", "z")
-    assert (barrel.damping, barrel.lower, barrel.upper) == (3.0, -0.4, 0.4)
-    assert len(barrel.force_signals) == 2
 
 
 def test_a_loop_that_cannot_be_cut_says_what_to_do(tmp_path):

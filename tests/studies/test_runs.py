@@ -5,7 +5,7 @@ import pytest
 from runs import run_scenario, scenario, some
 
 from drake_dae import build_scenario
-from drake_dae.analysis.limits import robot_limits
+from drake_dae.analysis import robot_limits
 from drake_dae.errors import ScenarioError
 from drake_dae.running.summary import figures_of
 from drake_dae.scenario.rolled import for_rollout, roll_scenario

@@ -45,7 +45,7 @@ class PointOnSurface(Constraint):
     v_s the point creeps. The parameters "<name>.friction", "<name>.stiction_tolerance" and
     "<name>.viscous_friction" are mu, v_s and d; plant and law may have different values if both
     have these parameters; use 0 for a surface that has them but no friction. If friction reverses
-    the effect of lambda on phi'', the Painleve paradox occurs: see `dae.system.contacts`. With
+    the effect of lambda on phi'', the Painleve paradox occurs: see `dae.contacts`. With
     flexible joints, motors or hydraulics the law differentiates s, whose slopes are 1 / v_s; then
     v_s = 0.01 m/s (0.03 m/s with hydraulics, or fixed steps of 5 ms) avoids peaks of the control at
     reversals. With rigid joints v_s does not affect the law.

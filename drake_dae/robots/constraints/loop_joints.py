@@ -16,8 +16,8 @@ from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
 from drake_dae.robots.constraints.points import rotation_error
-from drake_dae.robots.links.joints import without_round_off
 from drake_dae.robots.links.links import Frames, Kinematics
+from drake_dae.robots.links.plant_frames import without_round_off
 from drake_dae.robots.surfaces.surface import Vector
 
 Letter = Literal["x", "y", "z"]

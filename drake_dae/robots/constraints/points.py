@@ -14,9 +14,8 @@ from drake_dae.arrays import check_axes
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Application, Constraint
-from drake_dae.robots.links.joints import constant_pose
 from drake_dae.robots.links.links import Frames, Kinematics
-from drake_dae.robots.links.plant_frames import body_with_frame
+from drake_dae.robots.links.plant_frames import body_with_frame, constant_pose
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.trace.expressions import length_of
 

@@ -13,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.articulated import ArticulatedBodies
+from drake_dae.robots.links.tree import ArticulatedBodies
 
 ORIGIN = (0.0, 0.0, 0.0)
 
@@ -160,7 +160,7 @@ class Outline(NamedTuple):
     radius: float = 0.0
 
 
-class Links(Frames, Protocol):
+class Links(ABC):
     """Rigid links without contact: M(q) v' + H(q, v) = B u + R, q' = N(q) v.
 
     R is the generalized force of a reaction. `MultibodyExpressions` are links of a MultibodyPlant,
@@ -181,88 +181,54 @@ class Links(Frames, Protocol):
        and `velocity_signals` together.
     """
 
-    @property
-    def v(self) -> ca.SX:
-        """Generalized velocities, symbols, shape (nv, 1)."""
+    q: ca.SX  # Generalized positions, symbols, shape (nq, 1).
+    v: ca.SX  # Generalized velocities, symbols, shape (nv, 1).
+    velocity_map: ca.SX  # N(q) of q' = N(q) v, shape (nq, nv).
+    mass_matrix: ca.SX  # M(q), shape (nv, nv).
+    bias: ca.SX  # H(q, v), shape (nv, 1).
+    actuation_matrix: FloatArray  # B, shape (nv, nu).
+    parameters: tuple[Parameter, ...]  # Numbers that a study may change.
+    position_signals: tuple[Signal, ...]  # Names and units of q, and so on.
+    velocity_signals: tuple[Signal, ...]
+    actuator_signals: tuple[Signal, ...]
+    effort_limits: FloatArray  # Largest |u|, shape (nu,), infinite where there is no limit.
+    reflected_inertia: FloatArray  # The part of M from each rotor, kg m^2 (kg), shape (nu,).
+    gear_ratios: FloatArray  # Motor turns per joint turn, shape (nu,).
+    default_positions: FloatArray  # A typical configuration, shape (nq,).
+    position_limits: tuple[FloatArray, FloatArray]  # Lower and upper ones, shape (nq,) each.
+    velocity_limits: tuple[FloatArray, FloatArray]  # The same of v, shape (nv,) each.
+    plant: MultibodyPlant | None = None  # Their MultibodyPlant, for Drake's visualization.
+    landmark_names: tuple[str, ...]  # The frames whose origins are landmarks of the robot.
+    outlines: tuple[Outline, ...]  # Of the collision geometry of each link, or its origin.
 
-    @property
-    def velocity_map(self) -> ca.SX:
-        """N(q) of q' = N(q) v, shape (nq, nv)."""
+    @abstractmethod
+    def rotation(self, frame: Any) -> ca.SX:
+        """R_WF, shape (3, 3): the orientation of a frame in the world."""
 
-    @property
-    def mass_matrix(self) -> ca.SX:
-        """M(q), shape (nv, nv)."""
+    @abstractmethod
+    def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
+        """p_W in m, shape (3, 1): the position of a point that is fixed in a frame."""
 
-    @property
-    def bias(self) -> ca.SX:
-        """H(q, v), shape (nv, 1)."""
-
-    @property
-    def actuation_matrix(self) -> FloatArray:
-        """B, shape (nv, nu)."""
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Numbers that a study may change."""
-
-    @property
-    def velocity_signals(self) -> tuple[Signal, ...]:
-        """Names and units of v."""
-
-    @property
-    def actuator_signals(self) -> tuple[Signal, ...]:
-        """Names and units of u."""
-
-    @property
-    def effort_limits(self) -> FloatArray:
-        """Largest |u|, shape (nu,), infinite where there is no limit."""
-
-    @property
-    def reflected_inertia(self) -> FloatArray:
-        """The part of M from the rotor of each actuator, kg m^2 (kg), shape (nu,)."""
-
-    @property
-    def gear_ratios(self) -> FloatArray:
-        """Motor turns per joint turn, shape (nu,)."""
-
-    @property
-    def default_positions(self) -> FloatArray:
-        """A typical configuration, shape (nq,)."""
-
-    @property
-    def position_limits(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper limit of q, shape (nq,) each."""
-
-    @property
-    def velocity_limits(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper limit of v, shape (nv,) each."""
-
-    @property
-    def plant(self) -> MultibodyPlant | None:
-        """Their MultibodyPlant, for Drake's visualization; None without one."""
-
-    def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
-        """Factors of M, where `rotors`, shape (nv,), are the addition of rotors to its diagonal."""
-
+    @abstractmethod
     def landmarks(self) -> ca.SX:
         """Points of the robot for views of it, in m, shape (3, k)."""
 
-    @property
-    def landmark_names(self) -> tuple[str, ...]:
-        """The names of the frames whose origins the landmarks are, k of them."""
-
-    @property
-    def outlines(self) -> tuple[Outline, ...]:
-        """Points of the collision geometry of each link, of one without any its origin."""
-
+    @abstractmethod
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
         """The frames in motion with v' = `acceleration`, a symbol of its own if None."""
 
+    def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
+        """Factors of M, where `rotors`, shape (nv,), are the addition of rotors to its diagonal."""
+        return None
+
     def generalized_force(self, kinematics: Any, reaction: Reaction) -> ca.SX:
         """tau of each column of a reaction in kinematics of these links, shape (nv, k)."""
+        return reaction.generalized
 
     def inverse_dynamics(self, kinematics: Any, reaction: Reaction) -> ca.SX:
         """M(q) v' + H(q, v) - tau of (37), shape (nv, 1), with v' of the kinematics."""
+        inertial = ca.mtimes(self.mass_matrix, kinematics.acceleration) + self.bias
+        return inertial - self.generalized_force(kinematics, reaction)
 
 
 def velocities_are_rates(links: Links) -> bool:

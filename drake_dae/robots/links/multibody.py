@@ -2,38 +2,54 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Frame, Joint, MultibodyForces
+from pydrake.multibody.tree import (
+    BodyIndex,
+    ForceElementIndex,
+    Frame,
+    Joint,
+    LinearSpringDamper,
+    MultibodyForces,
+    PrismaticSpring,
+    RevoluteSpring,
+    UniformGravityFieldElement,
+)
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae import Parameter, Signal
+from drake_dae.dae.signals import LARGEST
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.articulated import ArticulatedBodies, is_one_by_one
-from drake_dae.robots.links.joints import (
+from drake_dae.robots.links.links import ORIGIN, Links, Reaction
+from drake_dae.robots.links.plant_frames import (
+    PlantFrames,
     check_joint,
     elementary_joints,
     joint_velocity_map,
+    outlines_of,
+    position_of,
     read_links,
+    unique_names,
     without_round_off,
 )
-from drake_dae.robots.links.links import ORIGIN, Reaction
-from drake_dae.robots.links.plant_frames import PlantFrames, outlines_of, position_of, unique_names
-from drake_dae.robots.links.springs import Springs, force_elements
 from drake_dae.robots.links.tree import (
+    ArticulatedBodies,
     Inertia,
     LinkMotion,
     frame_jacobian,
     inverse_dynamics,
+    is_one_by_one,
     link_motions,
     mass_matrix,
 )
 from drake_dae.robots.links.tree_kinematics import TreeKinematics
+from drake_dae.trace.expressions import length_of
 from drake_dae.trace.functions import TracedFunction
 
 TOLERANCE = 1e-10
@@ -41,7 +57,7 @@ TOLERANCE = 1e-10
 
 
 @checked(ModelError)
-class MultibodyExpressions:
+class MultibodyExpressions(Links):
     """The links of a finalized MultibodyPlant; see `Links`:
 
         M(q) v' + H(q, v) = B u,    q' = N(q) v,
@@ -85,8 +101,9 @@ class MultibodyExpressions:
         force_elements(plant)
         if plant.num_velocities() == 0:
             raise ModelError("the plant has no joint that moves")
-        self.plant = plant
+        self.plant: MultibodyPlant = plant
         self._bodies = [plant.get_body(BodyIndex(i)) for i in range(plant.num_bodies())]
+        self.landmark_names = tuple(body.name() for body in self._bodies)
         self.outlines = outlines_of(plant, scene_graph, self._bodies)
         moving = [joint for joint in joints if joint.num_velocities() > 0]
         moving.sort(key=lambda joint: joint.velocity_start())
@@ -144,11 +161,6 @@ class MultibodyExpressions:
     def landmarks(self) -> ca.SX:
         """The origins of all bodies, in m, shape (3, k)."""
         return ca.horzcat(*[self.position(body.body_frame()) for body in self._bodies])
-
-    @property
-    def landmark_names(self) -> tuple[str, ...]:
-        """The names of all bodies, in the order of the landmarks."""
-        return tuple(body.name() for body in self._bodies)
 
     def kinematics(self, acceleration: ca.SX | None = None) -> TreeKinematics:
         """The frames in motion with v' = `acceleration`, a symbol if None."""
@@ -351,3 +363,73 @@ def _compare_with_plant(
                     f"q = {state[0]}, v = {state[1]}; this is an error in drake_dae, please "
                     "report the model"
                 )
+
+
+SUPPORTED_FORCE_ELEMENTS = (
+    UniformGravityFieldElement,
+    RevoluteSpring,
+    PrismaticSpring,
+    LinearSpringDamper,
+)
+
+
+def force_elements(plant: MultibodyPlant) -> list[Any]:
+    """All force elements of a plant; refuses a type that is not represented."""
+    count = plant.num_force_elements()
+    elements = [plant.get_force_element(ForceElementIndex(i)) for i in range(count)]
+    for element in elements:
+        if not isinstance(element, SUPPORTED_FORCE_ELEMENTS):
+            names = ", ".join(supported.__name__ for supported in SUPPORTED_FORCE_ELEMENTS)
+            raise ModelError(
+                f"the plant has a force element of type {type(element).__name__}, which is not "
+                f"supported; supported are {names}"
+            )
+    return elements
+
+
+class Springs:
+    """The springs and dampers of a plant as expressions of q and v.
+
+    Attributes:
+        force: The generalized force of joint damping and springs, shape (nv, 1).
+        energy: The potential energy of the springs in J, a scalar.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        joints: list[Joint],
+        frames: PlantFrames,
+        q: ca.SX,
+        v: ca.SX,
+        velocity_map: ca.SX,
+    ) -> None:
+        for joint in joints:
+            largest = np.max(joint.default_damping_vector(), initial=0.0)
+            if largest > LARGEST:
+                raise ModelError(
+                    f"joint '{joint.name()}' has a damping of {largest:g}, and the largest that "
+                    f"can be computed with is {LARGEST:g}"
+                )
+        damping = np.concatenate([joint.default_damping_vector() for joint in joints])
+        self.force, self.energy = -ca.SX(damping) * v, ca.SX(0)
+        elements = force_elements(plant)
+        for element in elements:
+            if isinstance(element, RevoluteSpring):
+                stiffness, rest = element.default_stiffness(), element.default_nominal_angle()
+            elif isinstance(element, PrismaticSpring):
+                stiffness, rest = element.stiffness(), element.nominal_position()
+            else:
+                continue
+            i = element.joint().position_start()
+            self.force[i] += stiffness * (rest - q[i])
+            self.energy += stiffness / 2 * (rest - q[i]) ** 2
+        for spring in (e for e in elements if isinstance(e, LinearSpringDamper)):
+            start = position_of(frames.pose(spring.bodyA().body_frame()), spring.p_AP())
+            end = position_of(frames.pose(spring.bodyB().body_frame()), spring.p_BQ())
+            length = length_of(end - start)
+            gradient = ca.jacobian(length, q) @ velocity_map
+            tension = spring.stiffness() * (length - spring.free_length())
+            tension += spring.damping() * (gradient @ v)
+            self.force -= gradient.T @ tension
+            self.energy += spring.stiffness() / 2 * (length - spring.free_length()) ** 2

@@ -1,8 +1,7 @@
 """A robot given by its own equations."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,15 +12,14 @@ from drake_dae.arrays import FloatArray, numbers, unknown_name
 from drake_dae.dae import Parameter, Signal, as_expression, signals
 from drake_dae.dae.signals import is_symbol
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.links import ORIGIN, Kinematics, Outline, Reaction
+from drake_dae.robots.links.links import ORIGIN, Kinematics, Links, Outline, Reaction
 
 
 @checked(ModelError)
-@dataclass(frozen=True, eq=False)
-class LinkExpressions:
+class LinkExpressions(Links):
     """Links with given M(q) and H(q, v), as in a textbook; see `Links`.
 
-    Attributes:
+    Args:
         q: Generalized positions, SX symbols, shape (nq, 1).
         v: Generalized velocities, SX symbols, shape (nv, 1).
         mass_matrix: M(q), shape (nv, nv), symmetric positive definite.
@@ -42,73 +40,77 @@ class LinkExpressions:
         ModelError: A shape does not fit.
     """
 
-    q: ca.SX
-    v: ca.SX
-    mass_matrix: ca.SX
-    bias: ca.SX
-    frames: Mapping[str, ca.SX | tuple[ca.SX, ca.SX]] = field(default_factory=dict)
-    velocity_map: ca.SX = None
-    actuation_matrix: FloatArray = field(default=None)  # type: ignore[arg-type]
-    parameters: tuple[Parameter, ...] = ()
-    position_signals: tuple[Signal, ...] = ()
-    velocity_signals: tuple[Signal, ...] = ()
-    actuator_signals: tuple[Signal, ...] = ()
-    effort_limits: FloatArray = field(default=None)  # type: ignore[arg-type]
-    reflected_inertia: FloatArray = field(default=None)  # type: ignore[arg-type]
-    gear_ratios: FloatArray = field(default=None)  # type: ignore[arg-type]
-    default_positions: FloatArray = field(default=None)  # type: ignore[arg-type]
-    position_limits: tuple[FloatArray, FloatArray] = field(default=None)  # type: ignore[assignment]
-    velocity_limits: tuple[FloatArray, FloatArray] = field(default=None)  # type: ignore[assignment]
-    plant: ClassVar[None] = None
-
-    def __post_init__(self) -> None:
-        for name in ("q", "v"):
-            if not is_symbol(getattr(self, name)):
+    def __init__(
+        self,
+        q: ca.SX,
+        v: ca.SX,
+        mass_matrix: ca.SX,
+        bias: ca.SX,
+        frames: Mapping[str, ca.SX | tuple[ca.SX, ca.SX]] | None = None,
+        velocity_map: ca.SX | None = None,
+        actuation_matrix: FloatArray | None = None,
+        parameters: tuple[Parameter, ...] = (),
+        position_signals: tuple[Signal, ...] = (),
+        velocity_signals: tuple[Signal, ...] = (),
+        actuator_signals: tuple[Signal, ...] = (),
+        effort_limits: FloatArray | None = None,
+        reflected_inertia: FloatArray | None = None,
+        gear_ratios: FloatArray | None = None,
+        default_positions: FloatArray | None = None,
+        position_limits: tuple[FloatArray, FloatArray] | None = None,
+        velocity_limits: tuple[FloatArray, FloatArray] | None = None,
+    ) -> None:
+        for name, symbol in (("q", q), ("v", v)):
+            if not is_symbol(symbol):
                 raise ModelError(f"{name} must be a CasADi SX column of symbols")
-        matrices = ("mass_matrix", "bias", "velocity_map")
-        for name in (name for name in matrices if getattr(self, name) is not None):
-            value = as_expression("LinkExpressions", name, getattr(self, name))
-            object.__setattr__(self, name, value)
-        nq, nv = self.q.numel(), self.v.numel()
-        actuation = np.eye(nv) if self.actuation_matrix is None else self.actuation_matrix
-        actuation = numbers("actuation_matrix", actuation)
-        if actuation.ndim != 2 or actuation.shape[0] != nv:
-            raise ModelError(f"actuation_matrix has shape {actuation.shape}, expected ({nv}, nu)")
-        nu = actuation.shape[1]
-        fill = {
-            "velocity_map": ca.SX.eye(nv) if self.velocity_map is None else self.velocity_map,
-            "actuation_matrix": actuation,
-            "position_signals": self.position_signals or signals([f"q{i}" for i in range(nq)]),
-            "velocity_signals": self.velocity_signals or signals([f"v{i}" for i in range(nv)]),
-            "actuator_signals": self.actuator_signals or signals([f"u{i}" for i in range(nu)]),
-            "effort_limits": _filled("effort_limits", self.effort_limits, nu, np.inf),
-            "reflected_inertia": _filled("reflected_inertia", self.reflected_inertia, nu, 0.0),
-            "gear_ratios": _filled("gear_ratios", self.gear_ratios, nu, 1.0),
-            "default_positions": _filled("default_positions", self.default_positions, nq, 0.0),
-            "position_limits": _limits("position_limits", self.position_limits, nq),
-            "velocity_limits": _limits("velocity_limits", self.velocity_limits, nv),
-        }
-        for key, value in fill.items():
-            object.__setattr__(self, key, value)
-        for key, shape in (
-            ("mass_matrix", (nv, nv)),
-            ("bias", (nv, 1)),
-            ("velocity_map", (nq, nv)),
-            ("effort_limits", (nu,)),
-            ("reflected_inertia", (nu,)),
-            ("gear_ratios", (nu,)),
-            ("default_positions", (nq,)),
-        ):
-            given = getattr(self, key).shape
-            if given != shape:
-                raise ModelError(f"{key} has shape {given}, expected {shape}")
+        self.q, self.v, self.frames, self.parameters = q, v, dict(frames or {}), parameters
+        nq, nv = q.numel(), v.numel()
+
+        def matrix(name: str, given: ca.SX | None, shape: tuple[int, int]) -> ca.SX:
+            if given is None:
+                given = ca.SX.eye(nv)
+            return _fitting(name, as_expression("LinkExpressions", name, given), shape)
+
+        self.mass_matrix = matrix("mass_matrix", mass_matrix, (nv, nv))
+        self.bias = matrix("bias", bias, (nv, 1))
+        self.velocity_map = matrix("velocity_map", velocity_map, (nq, nv))
+        B = (
+            np.eye(nv)
+            if actuation_matrix is None
+            else numbers("actuation_matrix", actuation_matrix)
+        )
+        if B.ndim != 2 or B.shape[0] != nv:
+            raise ModelError(f"actuation_matrix has shape {B.shape}, expected ({nv}, nu)")
+        self.actuation_matrix, nu = B, B.shape[1]
+        self.position_signals = position_signals or signals([f"q{i}" for i in range(nq)])
+        self.velocity_signals = velocity_signals or signals([f"v{i}" for i in range(nv)])
+        self.actuator_signals = actuator_signals or signals([f"u{i}" for i in range(nu)])
+
+        def array(name: str, given: ArrayLike | None, size: int, default: float) -> FloatArray:
+            values = np.full(size, default) if given is None else numbers(name, given)
+            return _fitting(name, values, (size,))
+
+        self.effort_limits = array("effort_limits", effort_limits, nu, np.inf)
+        self.reflected_inertia = array("reflected_inertia", reflected_inertia, nu, 0.0)
+        self.gear_ratios = array("gear_ratios", gear_ratios, nu, 1.0)
+        self.default_positions = array("default_positions", default_positions, nq, 0.0)
+
+        def limits(
+            name: str, given: tuple[ArrayLike, ArrayLike] | None, size: int
+        ) -> tuple[FloatArray, FloatArray]:
+            lower, upper = given or (np.full(size, -np.inf), np.full(size, np.inf))
+            ends = array(name, lower, size, 0.0), array(name, upper, size, 0.0)
+            if not np.all(ends[0] < ends[1]):
+                raise ModelError(f"{name}: the lower limits must be below the upper, got {given!r}")
+            return ends
+
+        self.position_limits = limits("position_limits", position_limits, nq)
+        self.velocity_limits = limits("velocity_limits", velocity_limits, nv)
+        self.landmark_names = ("world", *self.frames)
+        self.outlines = tuple(Outline(name, name) for name in self.landmark_names)
 
     def rotation(self, frame: str) -> ca.SX:
-        """R_WF(q), shape (3, 3): the orientation of a frame in the world.
-
-        Raises:
-            ModelError: The frame is unknown, or was given without a rotation.
-        """
+        """R_WF(q), shape (3, 3); ModelError if the frame is unknown or has no rotation."""
         if frame == "world":
             return ca.SX.eye(3)
         pose = self._pose(frame)
@@ -129,42 +131,25 @@ class LinkExpressions:
         origin = pose[1] if isinstance(pose, tuple) else pose
         return origin + ca.mtimes(self.rotation(frame), offset) if offset.any() else origin
 
-    def landmarks(self) -> ca.SX:
-        """The origins of all frames, in m, shape (3, k)."""
-        return ca.horzcat(ca.SX(3, 1), *[self.position(frame) for frame in self.frames])
-
-    @property
-    def landmark_names(self) -> tuple[str, ...]:
-        """The names of all frames, in the order of the landmarks."""
-        return ("world", *self.frames)
-
-    @property
-    def outlines(self) -> tuple[Outline, ...]:
-        """The origins of all frames."""
-        return tuple(Outline(name, name) for name in self.landmark_names)
-
-    def kinematics(self, acceleration: ca.SX | None = None) -> "TextbookKinematics":
-        """The frames in motion with v' = `acceleration`, a symbol if None."""
-        if acceleration is None:
-            acceleration = ca.SX.sym("acceleration", self.v.numel())
-        return TextbookKinematics(self, acceleration)
-
-    def articulated_bodies(self, rotors: FloatArray) -> None:
-        """None: these links are no tree."""
-
-    def generalized_force(self, kinematics: "TextbookKinematics", reaction: Reaction) -> ca.SX:
-        """tau of each column of a reaction, shape (nv, k)."""
-        return reaction.generalized
-
-    def inverse_dynamics(self, kinematics: "TextbookKinematics", reaction: Reaction) -> ca.SX:
-        """M(q) v' + H(q, v) - tau of (37), shape (nv, 1)."""
-        inertial = ca.mtimes(self.mass_matrix, kinematics.acceleration) + self.bias
-        return inertial - reaction.generalized
-
     def _pose(self, frame: str) -> ca.SX | tuple[ca.SX, ca.SX]:
         if frame not in self.frames:
             raise ModelError(unknown_name("frame", frame, ["world", *self.frames]))
         return self.frames[frame]
+
+    def landmarks(self) -> ca.SX:
+        """The origins of all frames, in m, shape (3, k)."""
+        return ca.horzcat(ca.SX(3, 1), *[self.position(frame) for frame in self.frames])
+
+    def kinematics(self, acceleration: ca.SX | None = None) -> "TextbookKinematics":
+        if acceleration is None:
+            acceleration = ca.SX.sym("acceleration", self.v.numel())
+        return TextbookKinematics(self, acceleration)
+
+
+def _fitting(name: str, given: Any, shape: tuple[int, ...]) -> Any:
+    if given.shape != shape:
+        raise ModelError(f"{name} has shape {given.shape}, expected {shape}")
+    return given
 
 
 class TextbookKinematics(Kinematics):
@@ -204,21 +189,3 @@ class TextbookKinematics(Kinematics):
 
     def value(self, expression: ca.SX) -> ca.SX:
         return expression
-
-
-def _filled(name: str, given: ArrayLike | None, size: int, default: float) -> FloatArray:
-    return np.full(size, default) if given is None else numbers(name, given)
-
-
-def _limits(
-    name: str, given: tuple[ArrayLike, ArrayLike] | None, size: int
-) -> tuple[FloatArray, FloatArray]:
-    lower, upper = (np.full(size, end) for end in (-np.inf, np.inf))
-    if given is not None:
-        lower, upper = (numbers(name, end) for end in given)
-    if lower.shape != (size,) or upper.shape != (size,) or not np.all(lower < upper):
-        raise ModelError(
-            f"{name} must be a lower and an upper limit of shape ({size},), the lower one below, "
-            f"got {given!r}"
-        )
-    return lower, upper

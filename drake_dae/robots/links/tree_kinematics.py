@@ -13,9 +13,13 @@ from pydrake.multibody.tree import Frame
 
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae import Signal
-from drake_dae.robots.links.joints import elementary_joints
 from drake_dae.robots.links.links import ORIGIN, JointAxis, Kinematics, Reaction, position_index
-from drake_dae.robots.links.plant_frames import PlantFrames, frame_name, position_of
+from drake_dae.robots.links.plant_frames import (
+    PlantFrames,
+    elementary_joints,
+    frame_name,
+    position_of,
+)
 from drake_dae.robots.links.tree import LinkMotion
 
 

@@ -18,7 +18,7 @@ from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 from drake_dae.files import MESHES, check_file, read_mesh
 from drake_dae.robots.surfaces.meshes import PosedShape, mesh_of_grid
-from drake_dae.robots.surfaces.surface import Pair, Surface, Vector, tangents, triple, unit_vector
+from drake_dae.robots.surfaces.surface import Pair, Surface, Vector, tangents
 
 CELLS, BEYOND = 16, 3
 """The default number of bells along the longer side; bells beyond each edge, for a fit there."""
@@ -47,7 +47,7 @@ class MeasuredSurface(Surface):
         size: The lengths of the rectangle, m, shape (2,); None for all of a mesh.
         heights: Heights above the plane through `point`, shape (r, c): a row is along the first
             coordinate, and the rows follow each other along the second.
-        file: A file instead: a table (.csv, .npy, .npz with one array), or a mesh for trimesh.
+        file: A file instead: a table (.csv, .npy), or a mesh for trimesh.
         point: The middle of a table, or the origin of a mesh, whose axes are the world's, m.
         normal: The direction of the heights and of the free side, of any length, shape (3,).
         scale: The length of a unit of the heights, or of the mesh, m.
@@ -69,8 +69,7 @@ class MeasuredSurface(Surface):
     coordinate_signals: ClassVar = (Signal("along", "m"), Signal("across", "m"))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "point", triple("point", self.point))
-        object.__setattr__(self, "normal", unit_vector("normal", self.normal))
+        super().__post_init__()
         if self.size is not None:
             object.__setattr__(self, "size", tuple(vector("size", self.size, 2).tolist()))
         for name in ("size", "scale", "resolution"):
@@ -86,10 +85,6 @@ class MeasuredSurface(Surface):
     @property
     def fit(self) -> "_Fit":
         return _fit(self, None if self.file is None else check_file(self.file, ModelError))
-
-    @property
-    def position(self) -> Vector:
-        return self.point
 
     def distance(self, offset: ca.SX) -> ca.SX:
         x, y = ca.vertsplit(self.coordinates(offset))
@@ -230,11 +225,8 @@ def _read_table(file: Path) -> FloatArray:
         else:
             with file.open("rb") as stream:  # NumPy leaves a damaged archive open.
                 data = np.load(stream, allow_pickle=False)
-                if not isinstance(data, np.ndarray):
-                    (name,) = data.files
-                    data = data[name]
     except Exception as error:  # NumPy, whose headers are Python, raises many kinds.
-        text = f"'{file.name}' is no table of heights (.csv, .npy, .npz) and no mesh"
+        text = f"'{file.name}' is no table of heights (.csv, .npy) and no mesh"
         raise ModelError(f"{text} ({', '.join(MESHES)}): {brief(str(error))}") from None
     return _table(f"'{file.name}'", data)
 

@@ -54,14 +54,6 @@ class Plane(Surface):
     coordinate_signals: ClassVar = (Signal("along", "m"), Signal("across", "m"))
     has_exact_distance: ClassVar = True
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "point", triple("point", self.point))
-        object.__setattr__(self, "normal", unit_vector("normal", self.normal))
-
-    @property
-    def position(self) -> Vector:
-        return self.point
-
     def distance(self, offset: ca.SX) -> ca.SX:
         return ca.dot(ca.DM(self.normal), offset)
 
@@ -102,13 +94,8 @@ class Sphere(Surface):
     has_exact_distance: ClassVar = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", triple("center", self.center))
-        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
+        super().__post_init__()
         positive("radius", self.radius)
-
-    @property
-    def position(self) -> Vector:
-        return self.center
 
     def distance(self, offset: ca.SX) -> ca.SX:
         return _side(length_of(offset) - self.radius, self.inside)
@@ -121,8 +108,7 @@ class Sphere(Surface):
         return PosedShape(geometry.Sphere(self.radius), RigidTransform())
 
     def solids(self) -> tuple[PosedShape, ...]:
-        ball = PosedShape(geometry.Sphere(self.radius), RigidTransform())
-        return () if self.inside else (ball,)
+        return () if self.inside else (self.picture(self.center, self.radius),)
 
 
 @checked(ModelError)
@@ -150,17 +136,12 @@ class Cylinder(Surface):
     has_exact_distance: ClassVar = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "point", triple("point", self.point))
-        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
+        super().__post_init__()
         positive("radius", self.radius)
         if self.zero is not None:
             object.__setattr__(self, "zero", unit_vector("zero", self.zero))
             if np.linalg.norm(np.cross(self.zero, self.axis)) < 1e-6:
                 raise ModelError(f"zero must not lie along the axis, got {self.zero}")
-
-    @property
-    def position(self) -> Vector:
-        return self.point
 
     def distance(self, offset: ca.SX) -> ca.SX:
         x, y, _ = _components(self.axis, offset)
@@ -176,9 +157,7 @@ class Cylinder(Surface):
         return PosedShape(geometry.Cylinder(self.radius, size), pose)
 
     def solids(self) -> tuple[PosedShape, ...]:
-        pose = RigidTransform(RotationMatrix(axes_along(self.axis)), np.zeros(3))
-        bar = PosedShape(geometry.Cylinder(self.radius, _SOLID_LENGTH), pose)
-        return () if self.inside else (bar,)
+        return () if self.inside else (self.picture(np.zeros(3), _SOLID_LENGTH),)
 
 
 @checked(ModelError)
@@ -201,14 +180,10 @@ class Ellipsoid(Surface):
     coordinate_signals: ClassVar = (Signal("longitude", "rad"), Signal("latitude", "rad"))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", triple("center", self.center))
+        super().__post_init__()
         object.__setattr__(self, "semi_axes", triple("semi_axes", self.semi_axes))
         for length in self.semi_axes:
             positive("semi_axes", length)
-
-    @property
-    def position(self) -> Vector:
-        return self.center
 
     def distance(self, offset: ca.SX) -> ca.SX:
         return _side(
@@ -247,18 +222,13 @@ class Torus(Surface):
     has_exact_distance: ClassVar = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", triple("center", self.center))
-        object.__setattr__(self, "axis", unit_vector("axis", self.axis))
+        super().__post_init__()
         positive("minor_radius", self.minor_radius)
         positive("major_radius", self.major_radius)
         if not self.major_radius > self.minor_radius:
             raise ModelError(
                 f"major_radius {self.major_radius} must exceed minor_radius {self.minor_radius}"
             )
-
-    @property
-    def position(self) -> Vector:
-        return self.center
 
     def distance(self, offset: ca.SX) -> ca.SX:
         x, y, z = _components(self.axis, offset)
@@ -304,7 +274,7 @@ class ImplicitSurface(Surface):
     _shape: ca.SX = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "point", triple("point", self.point))
+        super().__post_init__()
         object.__setattr__(self, "parameters", dict(self.parameters))
         object.__setattr__(self, "_shape", ca.SX(ca.DM(list(self.parameters.values()))))
         check_names(self.parameters, (*"xyz", *_TAKEN))
@@ -312,10 +282,6 @@ class ImplicitSurface(Surface):
             value = self._function(ca.SX.sym("p", 3))
             if value.is_constant():
                 raise ModelError(f"formula '{self.function}' has none of x, y and z: no surface")
-
-    @property
-    def position(self) -> Vector:
-        return self.point
 
     @property
     def shape(self) -> Mapping[str, float]:

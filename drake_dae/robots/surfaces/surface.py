@@ -36,7 +36,7 @@ class Surface(ABC):
 
     Points are given as offsets from its reference point, so that its position can be a parameter.
 
-    1. `position` is the default position of the reference point.
+    1. `position` is the default position of the reference point: an attribute `point` or `center`.
     2. `distance` is the signed distance of a point, to first order around the surface: zero on it,
        positive on the free side, with a gradient of length one on the surface. So the constraint
        force of `PointOnSurface` is the normal force in newtons. It is smooth around the surface.
@@ -58,10 +58,17 @@ class Surface(ABC):
     coordinate_signals: ClassVar[tuple[Signal, ...]] = ()
     has_exact_distance: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        """Points become tuples of floats, and directions unit vectors."""
+        converted = {"point": triple, "center": triple, "normal": unit_vector, "axis": unit_vector}
+        for name, convert in converted.items():
+            if hasattr(self, name):
+                object.__setattr__(self, name, convert(name, getattr(self, name)))
+
     @property
-    @abstractmethod
     def position(self) -> Vector:
         """The default position of the reference point in the world, m, shape (3,)."""
+        return getattr(self, "point", None) or self.center  # type: ignore[attr-defined]
 
     @abstractmethod
     def distance(self, offset: ca.SX) -> ca.SX:

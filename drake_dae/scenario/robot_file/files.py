@@ -14,7 +14,6 @@ import re
 import warnings
 from collections.abc import Iterator
 from functools import cache
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +25,6 @@ from pydrake.common import GetDrakePath
 from pydrake.geometry import Mesh
 from pydrake.multibody.parsing import PackageMap
 
-from drake_dae.arrays import brief, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.files import check_file, read_mesh
 from drake_dae.scenario.form import at
@@ -68,12 +66,7 @@ class RobotFiles:
         self._folders = [FOLDER / "models", *map(Path, robot.packages.values())]
         self._folders += [Path(GetDrakePath()), Path(cache_folder) / "drake" / "package_map"]
         main = Path(robot.file)
-        if robot.description:
-            with at("robot.description"):
-                main, described = described_robot(robot.description)
-                self._folders += described[:2]
-                self._places += described
-        elif "://" in robot.file:
+        if "://" in robot.file:
             main = self.needed(robot.file, Path())
         if "\0" in str(main) or not main.is_file():
             raise ModelError(
@@ -164,36 +157,6 @@ def _package_name(folder: Path) -> str:
         return (read_xml(folder / "package.xml").findtext("name") or "").strip()
     except ModelError:
         return ""
-
-
-def described_robot(name: str) -> tuple[Path, list[Path]]:
-    """The file of a robot of the package robot_descriptions, and folders that have its packages."""
-    try:
-        names = import_module("robot_descriptions").DESCRIPTIONS
-    except ImportError:
-        raise ModelError(
-            "this takes the package robot_descriptions; pip install 'drake_dae[descriptions]', or "
-            "name a file of your own as robot.file"
-        ) from None
-    if name not in names:
-        raise ModelError(unknown_name("robot in robot_descriptions", name, names))
-    try:
-        module = import_module(f"robot_descriptions.{name}")
-        file = Path(getattr(module, "URDF_PATH", None) or module.MJCF_PATH)
-    except AttributeError:
-        raise ModelError(
-            f"'{name}' comes as neither URDF nor MJCF; name its URDF, which xacro makes, as "
-            "robot.file"
-        ) from None
-    except Exception as error:  # Of git, of the network, of the disk.
-        raise ModelError(
-            f"'{name}' cannot be fetched: {brief(str(error))}. Clone it elsewhere, and let "
-            "ROBOT_DESCRIPTIONS_CACHE name the folder, or name its file as robot.file"
-        ) from None
-    package, repository = (
-        Path(getattr(module, key, file.parent)) for key in ("PACKAGE_PATH", "REPOSITORY_PATH")
-    )
-    return file, [package, repository, package.parent, repository.parent, file.parent]
 
 
 # Matches more than the formats permit, since their parsers do: options and line ends before a name.

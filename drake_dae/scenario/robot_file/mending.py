@@ -7,6 +7,7 @@ read. What changed on the way is collected, and so is what is lost.
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
@@ -29,6 +30,9 @@ _TYPES = {
 """Suffix of a file -> the types of joints that Drake reads."""
 
 _EMPTY = "shapes of size 0 are left out"
+
+_MOST_INCLUDED = 1000
+"""The largest number of files that an MJCF file includes: each may include another one twice."""
 
 
 def _lists() -> dict[str, list[str]]:
@@ -85,7 +89,7 @@ class Mender:
             return file
         root = _read(file, within)
         if kind == ".xml":
-            _include(root, file, own)
+            _include(root, file, own, count(1))
             mjcf.prepare(root, file)
         parents = {child: parent for parent in root.iter() for child in parent}
 
@@ -322,15 +326,17 @@ def _read(file: Path, within: tuple[Path, ...]) -> Element:
     return read_xml(file)
 
 
-def _include(owner: Element, main: Path, within: tuple[Path, ...]) -> None:
+def _include(owner: Element, main: Path, within: tuple[Path, ...], number: Iterator[int]) -> None:
     """Puts the content of files that an MJCF file includes into the places of their names."""
     for index, node in reversed(list(enumerate(owner))):
         if node.tag != "include":
-            _include(node, main, within)
+            _include(node, main, within, number)
             continue
+        if next(number) > _MOST_INCLUDED:
+            raise ModelError(f"'{main.name}' includes more than {_MOST_INCLUDED} files")
         file = main.parent / node.get("file", "")
         included = _read(file, within)
-        _include(included, main, (*within, file.resolve()))
+        _include(included, main, (*within, file.resolve()), number)
         for part in included.iter():
             part.line = 0  # type: ignore[attr-defined]
         owner[index : index + 1] = list(included)

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import numpy as np
 
 from drake_dae.arrays import positive
-from drake_dae.errors import ModelError
 from drake_dae.robots import Load, Vector
 from drake_dae.scenario.form import FILE, Value, in_folder
 from drake_dae.scenario.typed_yaml import TAG
@@ -115,9 +114,6 @@ class Robot:
     Attributes:
         file: A URDF, SDFormat or model-directives file, relative to the scenario, or
             "package://drake_dae_models/<file>" for a shipped one.
-        description: Instead of a file: the name of a robot in the package robot_descriptions, such
-            as "panda_description". It is cloned when it is first used. It needs the extra
-            `descriptions`.
         packages: Name -> folder, relative to the scenario, of a package in "package://<name>/...".
             Packages are found without this key if their package.xml is in a folder above the file
             that names them, or in a folder of the package's name in one of these, or in
@@ -145,23 +141,17 @@ class Robot:
             `plant.parameters`. And friction of joints.
     """
 
-    file: Annotated[str, ROBOT_FILE] = ""
+    file: Annotated[str, ROBOT_FILE]
     packages: dict[str, Annotated[str, FILE]] = field(default_factory=dict)
     free: list[str] = field(default_factory=list)
     base: RobotPlacement | None = None
     locked: dict[str, float] = field(default_factory=dict)
     actuators: Annotated[Any, ACTUATORS] | None = None
     leave_out: list[Annotated[str, LEFT_OUT]] = field(default_factory=list)
-    description: str = ""
     payloads: list[Payload] = field(default_factory=list)
     known_forces: list[Load] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        if bool(self.file) == bool(self.description):
-            keys = "the key 'file', or 'description' for a robot of robot_descriptions"
-            raise ModelError(f"needs {keys}{', not both' if self.file else ''}")
 
     @property
     def title(self) -> str:
         """The robot's name in messages and systems: "two_arms" for "two_arms.dmd.yaml"."""
-        return self.description or Path(self.file).name.split(".")[0]
+        return Path(self.file).name.split(".")[0]

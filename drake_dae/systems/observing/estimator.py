@@ -14,7 +14,7 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.observing.sample import EstimatorSample
+from drake_dae.systems.observing.sample import PARAMETER_PERIOD, EstimatorSample
 from drake_dae.systems.parameterized import ParameterizedSystem
 
 
@@ -202,10 +202,14 @@ def _block(law: TrackingLaw, sample: EstimatorSample, period: float) -> Block:
         signals["estimated_force"] = system.constraint_input_signals
     identified = observation.identified.signals
     if identified:
-        outputs["identified"], outputs["identified_deviation"] = sample.filter.told(
-            shown.filter, shown.friction
-        )
+        outputs["identified"] = ca.vertcat(shown.theta, shown.friction)
+        outputs["identified_deviation"] = sample.filter.deviations
         signals |= dict.fromkeys(("identified", "identified_deviation"), (*identified, *frictions))
+    held = {"memory": Held(sample.memory.column, sample.now.column, sample.start, period)}
+    if identified:
+        own = sample.filter
+        slower = period * max(round(PARAMETER_PERIOD / period), 1)
+        held["parameters"] = Held(own.held, sample.filtered(), own.start, slower)
     rates = observation.moving.function(sample.state, system.parameter_symbol)[0]
     return Block(
         "state_estimator",
@@ -213,7 +217,7 @@ def _block(law: TrackingLaw, sample: EstimatorSample, period: float) -> Block:
         {**outputs, "hold": sample.hold},
         parameters=system.parameter_symbol,
         start={"parameters": system.parameter_values},
-        held={"memory": Held(sample.memory.column, sample.now.column, sample.start, period)},
+        held=held,
         defaults={"hold": ca.SX.zeros(1), "reference": rates},
         signals=signals,
     )

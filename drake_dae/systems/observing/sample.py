@@ -16,8 +16,11 @@ from drake_dae.dae.beyond.disturbance import DISTURBANCE
 from drake_dae.dae.beyond.friction_share import Metric, beside, shares
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.observing.parameter_filter import ParameterFilter, Sampled
+from drake_dae.systems.observing.parameters import ParameterFilter
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
+
+PARAMETER_PERIOD = 0.01
+"""The time in s, in whole samples, between samples of the filter of parameters."""
 
 BREAK_RATE = 12.0
 """The rate in 1/s at which a coefficient of friction rises until its contact breaks away."""
@@ -42,6 +45,9 @@ fully developed from v_s / 10 on. An ideal contact has the friction of the model
 _FAST = 1e6
 """A displacement of 1 m is tested as a speed of this many m/s: friction is then fully developed."""
 
+_DEVELOPED = 0.9
+"""A joint moves where its Coulomb friction has this share of its full size."""
+
 _LITTLE = 1e-9
 """The least normal force, in N, by which is divided."""
 
@@ -62,7 +68,9 @@ class Memory:
         force: The constraint force of the model, if none is measured.
         momentum, drift: p and its rate without inputs, if the state is exact.
         control, measured_force: u and v of the sample before.
-        filter: The state of the `ParameterFilter`.
+        theta, regressor: The parameters, and Y of the `ParameterFilter`, shape (k c,).
+        momentum_slopes, drift_slopes: The derivatives of p and its rate with respect to theta.
+        rests: Whether a contact sticks.
     """
 
     sample: ca.SX
@@ -77,7 +85,11 @@ class Memory:
     drift: ca.SX
     control: ca.SX
     measured_force: ca.SX
-    filter: ca.SX
+    theta: ca.SX
+    regressor: ca.SX
+    momentum_slopes: ca.SX
+    drift_slopes: ca.SX
+    rests: ca.SX
 
     @classmethod
     def of(cls, column: ca.SX, sizes: dict[str, int]) -> Self:
@@ -100,7 +112,7 @@ class ContactTerms:
         planes: T of `Observation`, of each contact.
         held: T of the contacts that stick, side by side; zero for others.
         velocity: The velocities, shape (k, 1).
-        slides: 1 for each contact that certainly slides, shape (c,).
+        slides, sticks: 1 for each contact that certainly slides, or may stick, shape (c,).
         valid: Finite if all of these are valid.
     """
 
@@ -111,6 +123,7 @@ class ContactTerms:
     held: ca.SX
     velocity: ca.SX
     slides: ca.SX
+    sticks: ca.SX
     valid: ca.SX
 
 
@@ -175,11 +188,10 @@ class EstimatorSample:
                 f"{system.name}: parameters are estimated for rigid joints; behind springs "
                 "and motors only coefficients of friction are"
             )
-        values = system.parameter_values
-        frictions = [values[system.parameter_slice(name)] for name in observation.frictions]
-        known = [values[self._places], *frictions] if self._places else [np.zeros(0)]
+        known, values = len(self._places), system.parameter_values
+        self._ratio = max(round(PARAMETER_PERIOD / period), 1)
         self.filter = ParameterFilter(
-            identified, np.concatenate(known), observing.largest_friction, k, rates[0], period
+            identified, c, observing.largest_friction, rates[0], self._ratio * period
         )
         exact = 0 if estimates else k
         self.sizes = {
@@ -195,7 +207,11 @@ class EstimatorSample:
             "drift": exact,
             "control": system.num_controls,
             "measured_force": system.num_constraints if estimates and self.measures else 0,
-            "filter": self.filter.start.size,
+            "theta": known,
+            "regressor": k * (known + c) if known else 0,
+            "momentum_slopes": k * known,
+            "drift_slopes": k * known,
+            "rests": 1 if known else 0,
         }
         ports = {
             "measured_state": n,
@@ -207,21 +223,21 @@ class EstimatorSample:
         self.inputs = {name: ca.SX.sym(name, size) for name, size in ports.items()}
         if not self.measures:
             del self.inputs["measured_force"]
-        own = ca.SX.sym("held", sum(self.sizes.values()) - self.filter.start.size)
-        self.memory = Memory.of(ca.vertcat(own, self.filter.memory.column), self.sizes)
-        # The parameters are part of the filter's state.
-        self._theta = self.memory.filter[: len(self._places)]
+        self.memory = Memory.of(ca.SX.sym("held", sum(self.sizes.values())), self.sizes)
+        self._before = self._adopted()
         self.start = np.zeros(sum(self.sizes.values()))
         self.start[0] = -1.0
-        self.start[self.start.size - self.filter.start.size :] = self.filter.start
-        if c:
-            self.start[self.place("friction")] = np.concatenate(frictions)
+        for name, value in zip(observation.frictions, range(c), strict=True):
+            self.start[self.place("friction")][value] = values[system.parameter_slice(name)][0]
+        self.start[self.place("theta")] = values[self._places]
 
-        after = self._estimated() if estimates else self._observed()
+        sample = ca.floor(TIME / period + _SAME)
+        after = self._estimated() if estimates else self._observed(sample)
         if estimates:
-            sample = ca.floor(TIME / period + _SAME)
-            given = {name: getattr(after, name) for name in ("control", "measured_force")}
-            first = Memory(**{**vars(self.memory), **given, "state": self._measured})
+            # The state before the first sample is zero, where a contact may have no direction.
+            given = {"state": self._measured, "control": self.inputs["control"]}
+            given |= {"measured_force": self._measured_force} if self.measures else {}
+            first = Memory(**{**vars(self.memory), **given})
             begun = ca.if_else(self.memory.sample >= 0, after.column, first.column)
             fresh = ca.vertcat(sample, begun[1:])
             column = ca.if_else(ca.eq(self.memory.sample, sample), self.memory.column, fresh)
@@ -255,7 +271,7 @@ class EstimatorSample:
     def _parameters(self, friction: ca.SX | None = None, theta: ca.SX | None = None) -> ca.SX:
         """The model's parameters with estimates, and with given or no friction."""
         parameters = ca.SX(self._system.parameter_symbol)
-        parameters[self._places] = self._theta if theta is None else theta
+        parameters[self._places] = self._before.theta if theta is None else theta
         for j, name in enumerate(self.observation.frictions):
             value = 0 if friction is None else friction[j]
             parameters[self._system.parameter_slice(name)] = value
@@ -275,10 +291,13 @@ class EstimatorSample:
 
         is_slow = friction[1] < self._sharpness * self._observing.least_speed
         is_lost = self._is_lost(v)
-        held = self._side_by_side(planes, ca.logic_and(is_slow, ca.logic_not(is_lost)))
+        sticks = ca.logic_and(is_slow, ca.logic_not(is_lost))
+        held = self._side_by_side(planes, sticks)
         slides = ca.logic_not(ca.logic_or(is_slow, is_lost))
         velocity, valid = state[list(observation.rows)], friction[-1] + directions[-1]
-        return ContactTerms(friction[0], metric, free, planes, held, velocity, slides, valid)
+        return ContactTerms(
+            friction[0], metric, free, planes, held, velocity, slides, sticks, valid
+        )
 
     def _side_by_side(self, planes: Sequence[ca.SX], of_contacts: ca.SX) -> ca.SX:
         """T of all contacts side by side, each times its entry of a column."""
@@ -293,9 +312,9 @@ class EstimatorSample:
 
     # The exact state.
 
-    def _observed(self) -> Memory:
+    def _observed(self, sample: ca.SX) -> Memory:
         """What is held after a sample of the exact state."""
-        memory, x, v, u = self.memory, self._measured, self._measured_force, self.inputs["control"]
+        memory, x, v, u = self._before, self._measured, self._measured_force, self.inputs["control"]
         mu, has_sample = memory.friction, memory.sample >= 0
         parameters = self._parameters()
         late = self._lag * has_sample
@@ -310,18 +329,13 @@ class EstimatorSample:
         size = len(self.observation.rows)
         chain = ca.horzcat(ca.reshape(memory.lags, size, -1), memory.disturbance)
         chain = self._passed(contact, chain, d)
-        chain, change, filtered, moved, slopes = self._explained(
-            chain, x, v, acted, contact, parameters
-        )
-        if slopes is not None:
-            p += ca.mtimes(slopes.momentum, moved)
-            drift += ca.mtimes(slopes.drift, moved)
+        chain, change = self._shared(chain, contact)
         early, slid = self._early(contact, x, v, parameters, d)
         moves, (fast, slow) = ca.mtimes(contact.free, chain), self._lags
         rates = fast.derivatives(moves) + slow.derivatives(chain - moves)
         valid = momentum[-1] + contact.valid
         after = {
-            "sample": ca.SX(1.0),
+            "sample": sample if self._places else ca.SX(1.0),
             "disturbance": chain[:, -1],
             "rates": ca.vec(rates),
             "lags": ca.vec(chain[:, :-1]),
@@ -330,7 +344,7 @@ class EstimatorSample:
             "momentum": p,
             "drift": drift,
             "control": u,
-            "filter": filtered,
+            **self._regressed(x, v, acted, contact, parameters),
         }
         after = {name: where_finite(value, valid) for name, value in after.items()}
         return Memory(**{**vars(memory), **after})
@@ -350,62 +364,109 @@ class EstimatorSample:
     def _bounded(self, mu: ca.SX) -> ca.SX:
         return ca.fmin(ca.fmax(mu, 0.0), self._observing.largest_friction)
 
-    def _explained(
-        self,
-        chain: ca.SX,
-        x: ca.SX,
-        v: ca.SX,
-        acted: ca.SX,
-        contact: ContactTerms,
-        parameters: ca.SX,
-    ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, Sampled | None]:
-        """Friction, or all parameters, take their share of r.
+    def _shared(self, chain: ca.SX, contact: ContactTerms) -> tuple[ca.SX, ca.SX]:
+        """r with its lags without the share of friction, and the change of mu.
 
-        Returns:
-            r with its lags, the change of mu, the state of the filter, the change of the parameters
-            and their slopes.
+        With parameters friction is one of them.
         """
-        memory, size = self.memory, len(self.observation.rows)
-        mu, hold = memory.friction, self.inputs["hold"] != 0
-        if not self._places:
-            gain = -np.expm1(-self._observing.friction_rate * self._period)
-            terms = contact.friction, contact.planes, contact.velocity, contact.metric
-            after = self._bounded(mu + contact.slides * gain * shares(*terms, chain[:, -1]))
-            change = ca.if_else(hold, 0, after - mu)
-            share = ca.mtimes(contact.friction, change)
-            return chain - ca.repmat(share, 1, chain.shape[1]), change, memory.filter, mu, None
-        slopes = self._slopes(x, acted, v, parameters, contact, hold)
-        before = ca.reshape(memory.filter[self.filter.memory.parts["regressor"]], size, -1)
-        regressor = self.filter.regressor(slopes)
-        columns = zip(ca.horzsplit(before), ca.horzsplit(regressor), strict=True)
-        regressor = ca.horzcat(*(self._passed(contact, *pair) for pair in columns))
-        is_first = memory.sample < 0
-        filtered, moved = self.filter.after(slopes, regressor, chain[:, -1], mu, is_first)
-        known = len(self._places)
-        change = moved[known : known + mu.numel()]
-        return chain - ca.mtimes(regressor, moved), change, filtered, moved[:known], slopes
+        mu = self._before.friction
+        if self._places:
+            return chain, 0 * mu
+        gain = -np.expm1(-self._observing.friction_rate * self._period)
+        terms = contact.friction, contact.planes, contact.velocity, contact.metric
+        after = self._bounded(mu + contact.slides * gain * shares(*terms, chain[:, -1]))
+        change = ca.if_else(self.inputs["hold"] != 0, 0, after - mu)
+        share = ca.mtimes(contact.friction, change)
+        return chain - ca.repmat(share, 1, chain.shape[1]), change
 
-    def _slopes(
-        self, x: ca.SX, u: ca.SX, v: ca.SX, parameters: ca.SX, contact: ContactTerms, hold: ca.SX
-    ) -> Sampled:
-        """The sample of the functions of the filter."""
-        identified, rows = self.observation.identified, list(self.observation.rows)
-        slopes = identified.slopes.function(x, u, v, parameters)
-        forces = v[list(identified.pressed), :]
+    # Parameters.
+
+    def _adopted(self) -> Memory:
+        """What was held, with the last change of the parameters, whose filter is slower."""
+        memory, known, size = self.memory, len(self._places), len(self.observation.rows)
+        if not known:
+            return memory
+        rest = memory.sample / self._ratio  # Whole exactly after a sample of the filter.
+        is_new = ca.eq(rest, ca.floor(rest))
+        change = ca.if_else(is_new, self.filter.change, 0)
+        moves = {
+            "disturbance": -ca.mtimes(ca.reshape(memory.regressor, size, -1), change),
+            "friction": change[known:],
+            "theta": change[:known],
+        }
+        if memory.momentum.numel():
+            for name in ("momentum", "drift"):
+                slopes = ca.reshape(vars(memory)[f"{name}_slopes"], size, -1)
+                moves[name] = ca.mtimes(slopes, change[:known])
+        moved = {name: vars(memory)[name] + move for name, move in moves.items()}
+        return Memory(**{**vars(memory), **moved})
+
+    def _regressed(
+        self, x: ca.SX, v: ca.SX, acted: ca.SX, contact: ContactTerms, parameters: ca.SX
+    ) -> dict[str, ca.SX]:
+        """Y after a sample, low-pass filtered as r is, and what it is made of."""
+        memory, size, known = self.memory, len(self.observation.rows), len(self._places)
+        if not known:
+            return {}
+        slopes = self.observation.identified.slopes.function(x, acted, v, parameters)
+        momentum, drift, inputs = slopes[:3]
+        before, drifted = (
+            ca.reshape(each, size, -1) for each in (memory.momentum_slopes, memory.drift_slopes)
+        )
+        own = (drift + drifted) / 2.0 + inputs - (momentum - before) / self._period
+        for place in self._dry_places():  # A joint that rests may have any friction.
+            own[:, place] *= ca.mmax(ca.fabs(drift[:, place])) > _DEVELOPED
+        sliding = ca.mtimes(contact.friction, ca.diag(contact.slides))
+        signal, old = ca.horzcat(own, sliding), ca.reshape(memory.regressor, size, -1)
+        fast, slow = (float(lags.gain[0]) * (signal - old) for lags in self._lags)
+        step = slow + ca.mtimes(contact.free, fast - slow)
+        rests = ca.mmax(contact.sticks) if contact.sticks.numel() else ca.SX(0)
+        is_used = ca.logic_and(memory.sample >= 0, ca.logic_not(rests))
+        return {
+            "regressor": ca.vec(ca.if_else(is_used, old + step, old)),
+            "momentum_slopes": ca.vec(momentum),
+            "drift_slopes": ca.vec(drift),
+            "rests": rests,
+        }
+
+    def _dry_places(self) -> list[int]:
+        """The indices in theta of Coulomb friction in joints."""
+        names = [
+            p.name for p in self.observation.identified.parameters for _ in range(p.value.size)
+        ]
+        return [i for i, name in enumerate(names) if name in self._system.dry]
+
+    def filtered(self) -> ca.SX:
+        """What the filter of parameters holds after a sample of its own."""
+        memory, identified = self.memory, self.observation.identified
+        estimates = memory.state.numel() > 0
+        x = memory.state if estimates else self._measured
+        v = self._measured_force
+        if estimates:
+            v = memory.measured_force if self.measures else memory.force
+        rows, k = list(self.observation.rows), len(self.observation.rows)
+        parameters = self._parameters()
         mass = self._system.mass_matrix[rows, rows]
         before, after = [self._system.state, self._system.parameter_symbol], [x, parameters]
-        inertia = ca.diag(ca.substitute([mass], before, after)[0])
-        sliding = ca.mtimes(contact.friction, ca.diag(contact.slides))
-        is_closed = forces >= self._observing.least_force
-        momentum, drift, inputs, gaps, gap_slopes, gap_bends = slopes[:6]
-        known = momentum, drift, inputs, sliding, gaps, gap_slopes, gap_bends
-        return Sampled(*known, forces, is_closed, inertia, hold)
+        gaps = identified.slopes.function(x, memory.control, v, parameters)[3:6]
+        forces = v[list(identified.pressed), :]
+        excused = ca.logic_or(self.inputs["hold"] != 0, memory.rests)
+        return self.filter.after(
+            ca.vertcat(memory.theta, memory.friction),
+            memory.disturbance,
+            ca.reshape(memory.regressor, k, -1),
+            ca.diag(ca.substitute([mass], before, after)[0]),
+            gaps,
+            forces,
+            forces >= self._observing.least_force,
+            ca.logic_and(memory.sample >= 0, ca.logic_not(excused)),
+        )
 
     # The state from encoders.
 
     def _estimated(self) -> Memory:
         """What is held after a sample of measured positions."""
-        system, old, period, measured = self._system, self.memory, self._period, self._measured
+        system, old, period, measured = self._system, self._before, self._period, self._measured
         u, count = self.inputs["control"], len(self.observation.rows)
         acted = self._lag * old.control + (1.0 - self._lag) * u
 
@@ -459,7 +520,7 @@ class EstimatorSample:
 
         # Friction and parameters take their share of the disturbance.
         state = ca.vertcat(new_q, new_v)
-        new_r, change, filtered, _, _ = self._explained(new_r, state, v, acted, contact, parameters)
+        new_r, change = self._shared(new_r, contact)
         slid = old.slid
         if self._breaks_away:
             early, slid, jumps, is_early = self._slipped(
@@ -486,7 +547,7 @@ class EstimatorSample:
             "friction": mu,
             "slid": slid,
             "control": u,
-            "filter": filtered,
+            **self._regressed(state, v, acted, contact, parameters),
         }
         if self.measures:
             after["measured_force"] = v
@@ -518,7 +579,7 @@ class EstimatorSample:
         made = self._period * mass.solve(ca.mtimes(through, forces))
         stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, _LITTLE)
         # The noise of a force sensor may be less than zero.
-        return ca.mtimes(made, ca.fmin(self.memory.friction, ca.fmax(stopping, 0.0)))
+        return ca.mtimes(made, ca.fmin(self._before.friction, ca.fmax(stopping, 0.0)))
 
     def _model_force(self, state: ca.SX, r: ca.SX, mu: ca.SX, control: ca.SX) -> ca.SX:
         """v = alpha(x) + beta(x) u (25) with the observed disturbance and friction."""
@@ -557,7 +618,7 @@ class EstimatorSample:
         that it breaks away before the reference is far. Then samples of d are averaged, without a
         low-pass, until `friction_rate` is faster. Not with a law that needs derivatives of d.
         """
-        memory, observation, least = self.memory, self.observation, self._least_speed
+        memory, observation, least = self._before, self.observation, self._least_speed
         if not self._breaks_away:  # Springs answer jumps by swings.
             return 0.0 * memory.friction, memory.slid
         wanted, actual = (
@@ -661,8 +722,7 @@ class EstimatorSample:
     def _compensated(self, x: ca.SX, v: ca.SX, known: Memory) -> ca.SX:
         """The signals for the law: disturbance, coefficients of friction and their derivatives."""
         observation, mu = self.observation, known.friction
-        theta = known.filter[: len(self._places)]
-        parameters, r, valid = self._parameters(mu, theta), known.disturbance, ca.SX(0)
+        parameters, r, valid = self._parameters(mu, known.theta), known.disturbance, ca.SX(0)
         if mu.numel() or self._system.dry:
             goal = x
             if observation.wanted is not None:
@@ -677,7 +737,7 @@ class EstimatorSample:
         rows = {DISTURBANCE: [[r[i], *rates[i::size].elements()] for i in range(size)]}
         for name, value in zip(observation.frictions, mu.elements(), strict=True):
             rows[name] = [[value]]
-        values = iter(theta.elements())
+        values = iter(known.theta.elements())
         for p in observation.identified.parameters:
             rows[p.name] = [[next(values)] for _ in range(p.value.size)]
         stacked, degrees = list[ca.SX](), iter(self._law.exogenous_degrees)

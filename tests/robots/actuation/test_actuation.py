@@ -4,7 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from actuated import (
-    DEGREES,
     EACH,
     actuated,
     at_rest,
@@ -15,8 +14,8 @@ from actuated import (
 )
 from arms import arm, touching
 
-from drake_dae import LinkExpressions, RobotModel, RobotPlant, find_structure
-from drake_dae.errors import AssumptionError, ModelError
+from drake_dae import LinkExpressions, RobotModel, RobotPlant
+from drake_dae.errors import ModelError
 from drake_dae.robots import DcMotors, ElectrohydraulicServos, FlexibleJoints, JointPositions
 
 
@@ -53,17 +52,6 @@ def test_dynamics_are_those_of_a_dense_solve(name, kind):
             np.testing.assert_array_equal(plant.GetOutputPort(port).Eval(context), x[part])
     stage_ports = {"motor_state", "motor_current", "actuator_force"} - set(ports)
     assert not any(plant.HasOutputPort(port) for port in stage_ports)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "kind"), EACH)
-def test_degrees_are_found(name, kind):
-    """r = 2; joint damping takes one from mu = (4, 2), another stage adds one."""
-    structure = actuated(name, kind).structure
-    position, force = DEGREES[kind]
-    count = len(arm(name).model.position_signals)
-    assert structure.constraint_degrees == (2,)
-    assert structure.output_degrees == (position,) * count + (force,)
 
 
 @pytest.mark.slow
@@ -113,39 +101,6 @@ def test_rest_state_needs_drives_that_hold_it():
         pendulum(actuation_matrix=[[1.0], [1.0]])
 
 
-@pytest.mark.parametrize(
-    ("kind", "parameter", "matrix", "operation"),
-    [
-        ("flexible", "flexible_joints.stiffness", "stiffness", np.multiply),
-        ("flexible", "flexible_joints.inertia", "inertia", np.multiply),
-        ("damped", "flexible_joints.stiffness", "stiffness", np.multiply),
-        ("damped", "flexible_joints.inertia", "inertia", np.multiply),
-        ("damped", "flexible_joints.damping", "damping", np.multiply),
-        ("motor", "dc_motors.inductance", "inductance", np.multiply),
-        ("motor", "dc_motors.resistance", "resistance", np.multiply),
-        ("motor", "dc_motors.torque_constant", "torque", np.multiply),
-        ("motor", "dc_motors.gear_ratio", "torque", np.multiply),
-        ("flexible hydraulic", "hydraulics.stiffness", "compliance", np.divide),
-        ("flexible hydraulic", "hydraulics.leakage", "leakage", np.multiply),
-    ],
-)
-def test_parameters_act_in_the_context(kind, parameter, matrix, operation):
-    """A study changes them by name; the dense solve with the changed matrix says what follows."""
-    found, d = actuated("two_link", kind), drive("two_link", kind)
-    plant = RobotPlant(found.model, structure=found.structure)
-    context = plant.CreateDefaultContext()
-    x, u = states("two_link", kind, 1)[0], np.array([7.0, -3.0])
-    plant.set_state(context, x)
-    plant.GetInputPort("control").FixValue(context, u)
-    before = plant.EvalTimeDerivatives(context).CopyToVector()
-    value = plant.get_parameter(context, parameter)
-    plant.set_parameter(context, parameter, 1.3 * value)
-    after = plant.EvalTimeDerivatives(context).CopyToVector()
-    changed = d._replace(**{matrix: operation(getattr(d, matrix), 1.3)})
-    np.testing.assert_allclose(after, rates("two_link", changed, x, u).state, rtol=1e-11, atol=1e-9)
-    assert not np.allclose(after, before, rtol=1e-6)
-
-
 def test_controls_are_named_by_the_last_stage():
     rigid = arm("two_link").model
     for kind, ending, unit in (
@@ -190,57 +145,6 @@ SHAFT = {"stiffness": 8e3, "inertia": 1.0}
 def test_refusals(actuation, message):
     with pytest.raises(ModelError, match=message):
         touching("two_link", actuation)
-
-
-@pytest.mark.parametrize(
-    ("stage", "numbers", "message"),
-    [
-        (FlexibleJoints, SHAFT | {"stiffness": [np.inf, 8e3]}, "stiffness"),
-        (FlexibleJoints, SHAFT | {"stiffness": "stiff"}, "stiffness.*'stiff'"),
-        (DcMotors, MOTOR | {"inductance": np.nan}, "inductance.*nan"),
-    ],
-)
-def test_what_is_not_finite_is_refused_at_once(stage, numbers, message):
-    with pytest.raises(ModelError, match=f"{stage.__name__}.*{message}"):
-        stage(**numbers)
-
-
-def test_damping_of_some_joints_is_refused():
-    """The control would reach the outputs at different orders: B(x) is singular."""
-    with pytest.raises((ModelError, AssumptionError)):
-        find_structure(touching("two_link", [FlexibleJoints(**SHAFT, damping=[5.0, 0.0])]).dae)
-
-
-@pytest.mark.parametrize(
-    ("actuation", "message"),
-    [
-        (FlexibleJoints(**SHAFT), "actuation"),
-        (["springs"], r"actuation\[0\].*'springs'"),
-        ([FlexibleJoints(**SHAFT), FlexibleJoints(**SHAFT)], "FlexibleJoints"),
-        ([FlexibleJoints(**{**SHAFT, "damping": [5.0, 0.0]})], "Damp"),
-        (
-            [ElectrohydraulicServos(1e6, 1e-6, lambda q: [[q[0], 0], [0, q[1]]])],
-            "geometry",
-        ),
-    ],
-)
-def test_more_refusals(actuation, message):
-    with pytest.raises(ModelError, match=message):
-        touching("two_link", actuation)
-
-
-@pytest.mark.parametrize("kind", DEGREES)
-def test_the_default_state_is_at_rest(kind):
-    """Also where nominal_positions is off the wall: no spring is strained, no force acts."""
-    found = actuated("two_link", kind)
-    plant = RobotPlant(found.model, structure=found.structure)
-    context = plant.CreateDefaultContext()
-    plant.GetInputPort("control").FixValue(context, np.zeros(2))
-    force = plant.GetOutputPort("constraint_force").Eval(context)
-    assert np.max(np.abs(force)) < 1e-6
-    rate = plant.EvalTimeDerivatives(context).CopyToVector()[:4]
-    # Condition numbers of about 1e3 on forces of about 1e2.
-    assert np.max(np.abs(rate)) < 1e-7
 
 
 def test_velocities_that_are_no_derivatives_are_refused():

@@ -14,17 +14,12 @@ from actuated import (
     drive,
     lever,
     output_bias,
-    rates,
     slope,
-    split,
     start_position,
     states,
 )
 from arms import fixed_step, numbers
 from assigned_errors import closed_form, coupled, new_input
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
 from drake_dae import (
     ConstantReference,
@@ -36,7 +31,6 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.dae import gain_matrices
-from drake_dae.errors import DrakeDaeError
 
 
 def binomial(pole, degree, size):
@@ -171,50 +165,6 @@ def test_law_is_the_explicit_law(name, kind, full):
         assert np.linalg.norm(control - explicit) < tolerance * np.linalg.norm(explicit)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["flexible motor", "flexible hydraulic", "damped"])
-@pytest.mark.parametrize("name", MOSTLY_TWO_LINK)
-def test_error_obeys_the_assigned_equation(name, kind):
-    """e^(mu) + Lambda_mu e^(mu - 1) + ... + Lambda_1 e = 0, where no explicit law is on paper.
-
-    z'' = P v' + Pdot v and lambda come from MultibodyPlant, their derivatives by differences
-    along its own x' = f + g lambda + h u under the law's u. Three levels leave 6e-9.
-    """
-    found, random = actuated(name, kind), np.random.default_rng(7)
-    degree, force_degree = DEGREES[kind]
-    count = len(found.model.position_signals)
-    gains, force_gains = coupled(degree, count, random), coupled(force_degree, 1, random)
-    law = TrackingLaw(found.model.dae, gain_matrices(gains, force_gains), structure=found.structure)
-    d = drive(name, kind)
-
-    for x in states(name, kind, 2, seed=8):
-        reference = random.standard_normal(count * (degree + 1) + force_degree + 1)
-        u = law.control(x, reference)
-
-        def along_motion(x, order, u=u):
-            """(z'', lambda) differentiated `order` times along the motion."""
-            here = rates(name, d, x, u)
-            q, v = split(d, x)[:2]
-            if order == 0:
-                z = numbers(name, q, v).output_jacobian @ here.acceleration
-                return np.concatenate([z + output_bias(name, q, v), here.force])
-            # 10 mrad of the links, however fast they are.
-            step = 1e-2 * np.linalg.norm(here.state) / np.linalg.norm(v)
-            return slope(lambda x: along_motion(x, order - 1), x, here.state, step)
-
-        q, v = split(d, x)[:2]
-        n = numbers(name, q, v)
-        higher = [along_motion(x, order) for order in range(force_degree + 1)]
-        positions = [n.outputs, n.output_jacobian @ v, *[z[:count] for z in higher]]
-        forces = [z[count:] for z in higher]
-        for z, own_gains, own in (
-            (positions, gains, reference[: count * (degree + 1)]),
-            (forces, force_gains, reference[count * (degree + 1) :]),
-        ):
-            wanted = new_input(own, own_gains, z[:-1])
-            np.testing.assert_allclose(z[-1], wanted, rtol=0, atol=1e-7 * np.linalg.norm(wanted))
-
-
 REFERENCES = {
     "two_link": [SinusoidReference(0.3, 0.1, 2.0)],
     "seven_joint": [
@@ -284,55 +234,3 @@ def test_errors_are_their_closed_forms(name, kind):
     assert error[0, -1] > 5.0
     assert np.all(error[-1] < [*[0.004] * (error.shape[1] - 1), 0.01])
     assert np.max(np.abs(record["constraint_residual"])) < 1e-12
-
-
-def test_stiff_joints_do_not_make_the_closed_loop_stiff():
-    """The law cancels the springs: the loop has the assigned poles, whatever the stiffness.
-
-    Alone, the springs of the seven-joint arm ring at 1700 rad/s. Dormand and Prince's method grows
-    on the imaginary axis from h w = 1 on, 124 times a step at 6.8: at 4 ms the plant blows up
-    where nothing controls it, and needs 0.5 ms. Under its law even 4 ms do.
-    """
-    name, kind = "seven_joint", "flexible"
-    found, d = actuated(name, kind), drive(name, kind)
-    x, u = at_rest(name, kind, start_position(name), 14.0)
-    columns = [slope(lambda x: rates(name, d, x, u).state, x, e, 1e-4) for e in np.eye(x.size)]
-    fastest = np.max(np.abs(np.linalg.eigvals(np.array(columns).T)))
-    assert 1600.0 < fastest < 1800.0
-    assert max(track(name, kind, 4e-3, 0.8)[0]) < 1e-7
-
-    def hold(step):
-        """How far the shafts move under a constant control, 1 urad off their rest."""
-        builder = DiagramBuilder()
-        plant = builder.AddSystem(RobotPlant(found.model, structure=found.structure))
-        source = builder.AddSystem(ConstantVectorSource(u))
-        builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
-        shafts = LogVectorOutput(plant.GetOutputPort("motor_state"), builder)
-        simulator = Simulator(builder.Build())
-        ApplySimulatorConfig(fixed_step(step), simulator)
-        context = simulator.get_context()
-        plant.set_state(
-            plant.GetMyMutableContextFromRoot(simulator.get_mutable_context()),
-            x + np.repeat([0.0, 0.0, 1e-6, 0.0], 7),
-        )
-        simulator.AdvanceTo(0.04)
-        return np.ptp(shafts.FindLog(context).data()[:7], axis=1).max()
-
-    assert hold(5e-4) < 1e-5
-    with pytest.raises(DrakeDaeError):
-        hold(4e-3)
-
-
-def test_damped_joints_need_a_step_below_their_relaxation():
-    """With damping sum mu_i = 3 n - 2 m, which leaves n zero dynamics: K_2 d + D d' = tau(t).
-
-    The deflections d relax with D^-1 K_2 = 1000 / s, which the law (28) does not change. Dormand
-    and Prince's method is stable on the real axis to h D^-1 K_2 = 3.3: 3 ms do, 4 ms do not.
-    """
-    d = drive("two_link", "damped")
-    relaxation = np.linalg.eigvals(np.linalg.solve(d.damping, d.stiffness))
-    np.testing.assert_allclose(relaxation, 1e3, rtol=1e-12)
-    assert actuated("two_link", "damped").structure.zero_dynamics_dimension == 2
-    assert max(track("two_link", "damped", 3e-3, 0.8)[0]) < 1e-7
-    with pytest.raises(DrakeDaeError):
-        track("two_link", "damped", 4e-3, 0.8)

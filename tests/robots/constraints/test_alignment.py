@@ -3,25 +3,12 @@
 import casadi as ca
 import numpy as np
 import pytest
-from arms import fixed_step, parse
 
 from drake_dae import (
     AxisNormalToSurface,
-    ConstantReference,
-    JointPositions,
     LinkExpressions,
     Plane,
-    PointCoordinates,
-    PointOnSurface,
-    RobotModel,
-    RobotPlant,
-    SinusoidReference,
     Sphere,
-    TrackingLaw,
-    find_structure,
-    make_closed_loop,
-    poles,
-    simulate,
 )
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -69,62 +56,7 @@ def test_on_a_sphere_the_normal_turns_with_the_point():
     np.testing.assert_allclose(jacobian[0], 0.0, atol=1e-14)
 
 
-NOMINAL = [0.0, -0.2583, 0.0, -1.5038, 0.0, -1.3795, 0.0]
 DOME = Sphere((0.5, 0.0, 0.0), 0.45)
-
-
-def polisher():
-    """The 7-joint arm with its disk flush on a dome; its z axis points out of the tool."""
-    constraints = [
-        PointOnSurface("tool", DOME, name="dome"),
-        AxisNormalToSurface("tool", DOME, (0.0, 0.0, -1.0), name="flush"),
-    ]
-    outputs = [PointCoordinates("tool", "xy"), JointPositions(["joint3", "joint7"])]
-    return RobotModel.from_multibody(parse("seven_joint_arm"), constraints, outputs, NOMINAL)
-
-
-@pytest.mark.slow
-def test_a_disk_stays_flush_on_a_dome_with_chosen_moments():
-    """e(t) as predicted, the moments at once, and the axis along the normal by Drake; RK5 at 4 ms
-    leaves 1e-9."""
-    model = polisher()
-    structure = find_structure(model.dae)
-    assert structure.constraint_degrees == (2, 2, 2)
-    assert structure.output_degrees == (2,) * 4 + (0,) * 3
-    law = TrackingLaw(model.dae, poles(-4.0), structure=structure)
-    wanted = [
-        SinusoidReference(0.5, 0.08, 2.0),
-        SinusoidReference(0.0, 0.08, 1.5),
-        ConstantReference([0.0, 0.0]),
-        SinusoidReference(20.0, 5.0, 2.0),
-        SinusoidReference(0.0, 0.6, 3.0),
-        ConstantReference(0.4),
-    ]
-    loop = make_closed_loop(RobotPlant(model, structure=structure), law, wanted)
-    context = loop.diagram.CreateDefaultContext()
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    q = model.configuration([0.53, 0.02, 0.0, 0.0], NOMINAL)
-    loop.plant.set_consistent_state(own, [*q, *np.zeros(7)])
-    simulate(loop.diagram, context, 1.0, fixed_step(4e-3))
-    record = loop.record(context)
-    np.testing.assert_allclose(
-        record["tracking_error"], loop.predicted_error(record), rtol=0, atol=1e-8
-    )
-    plant = model.links.plant
-    tool, fresh = plant.GetFrameByName("tool"), plant.CreateDefaultContext()
-    for state in record["state"][::25]:
-        plant.SetPositions(fresh, state[:7])
-        pose = tool.CalcPoseInWorld(fresh)
-        normal = (pose.translation() - DOME.center) / DOME.radius
-        np.testing.assert_allclose(-pose.rotation().matrix()[:, 2], normal, atol=1e-8)
-    # The moments on the tool, about the two axes across its own, by the port.
-    wrenches = loop.plant.GetOutputPort("constraint_wrenches").Eval(own).reshape(-1, 6)
-    names = [signal.name for signal in loop.plant.wrench_signals[::6]]
-    flush = dict(zip(names, wrenches, strict=True))["flush.tool.mx"]
-    moments = record["constraint_force"][-1, 1:]
-    plant.SetPositions(fresh, loop.plant.state(own)[:7])
-    R = tool.CalcPoseInWorld(fresh).rotation().matrix()
-    np.testing.assert_allclose(R.T @ flush[:3], [moments[0], -moments[1], 0.0], atol=1e-6)
 
 
 def test_an_axis_of_no_length_is_refused():

@@ -10,27 +10,22 @@ import casadi as ca
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
     JacobianWrtVariable,
-    MultibodyForces,
     RevoluteJoint,
     RpyFloatingJoint,
     SpatialInertia,
 )
-from two_arms import APART, GRASP, NOMINAL, two_arms
+from two_arms import APART, NOMINAL, two_arms
 
 from drake_dae import (
     CoincidentPoints,
     JointPositions,
     LinkExpressions,
-    Plane,
-    PointOnSurface,
     RobotModel,
     RobotPlant,
-    Sphere,
     WeldedFrames,
     find_structure,
 )
@@ -92,13 +87,6 @@ def random_pose(random):
     return RigidTransform(RollPitchYaw(random.uniform(-1, 1, 3)), random.uniform(-1, 1, 3))
 
 
-def push(context, forces, frame, point, force, moment=(0.0, 0.0, 0.0)):
-    """Adds a force at a point and a moment, all in the world, to the body of a frame."""
-    plant, body = frame.GetParentPlant(), frame.body()
-    lever = point - body.EvalPoseInWorld(context).translation()
-    body.AddInForce(context, lever, SpatialForce(moment, force), plant.world_frame(), forces)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("first", "second"), PAIRS)
 def test_weld_measures_a_pose_and_its_rate_the_relative_velocity(first, second):
@@ -121,92 +109,6 @@ def test_weld_measures_a_pose_and_its_rate_the_relative_velocity(first, second):
         turning = np.eye(3) - _cross(r) / 2.0 + np.outer(r, r) / 4.0
         np.testing.assert_allclose(jacobian[:3], velocity[3:], atol=1e-10)
         np.testing.assert_allclose(jacobian[3:], turning @ velocity[:3], atol=1e-10 * scale)
-
-
-@pytest.mark.parametrize(("first", "second"), PAIRS)
-def test_rate_of_a_weld_is_the_spatial_velocity(first, second):
-    """On the constraint J v is the velocity of B in A, in m/s and rad/s, without a factor."""
-    links = arms()[0].links
-    a, b = frames(first, second)
-    for q, context, _ in configurations(3, seed=1):
-        pose = links.plant.CalcRelativeTransform(context, a, b)
-        phi, jacobian = evaluate(WeldedFrames(first, second, pose), links, q)
-        velocity = links.plant.CalcJacobianSpatialVelocity(context, VELOCITY, b, np.zeros(3), a, a)
-        np.testing.assert_allclose(phi, 0.0, atol=1e-12)
-        np.testing.assert_allclose(jacobian, np.roll(velocity, 3, axis=0), atol=1e-10)
-
-
-@pytest.mark.parametrize(("first", "second"), PAIRS)
-def test_multipliers_of_a_weld_are_force_and_moment(first, second):
-    """J^T lambda: A exerts them on B at B's origin, and B the opposite on A at the same point."""
-    links = arms()[0].links
-    a, b = frames(first, second)
-    for q, context, random in configurations(3, seed=2):
-        pose = links.plant.CalcRelativeTransform(context, a, b)
-        _, jacobian = evaluate(WeldedFrames(first, second, pose), links, q)
-        multiplier = random.uniform(-50.0, 50.0, 6)
-        rotation = a.CalcPoseInWorld(context).rotation().matrix()
-        force, moment = rotation @ multiplier[:3], rotation @ multiplier[3:]
-        point = b.CalcPoseInWorld(context).translation()
-        forces = MultibodyForces(links.plant)
-        push(context, forces, b, point, force, moment)
-        push(context, forces, a, point, -force, -moment)
-        generalized = links.plant.CalcGeneralizedForces(context, forces)
-        np.testing.assert_allclose(jacobian.T @ multiplier, generalized, atol=1e-10)
-        # Virtual power, from the bodies' own velocities.
-        v = random.uniform(-1.0, 1.0, q.size)
-        links.plant.SetVelocities(context, v)
-        velocity = b.CalcSpatialVelocity(context, a, a)
-        power = multiplier[:3] @ velocity.translational() + multiplier[3:] @ velocity.rotational()
-        assert multiplier @ jacobian @ v == pytest.approx(power, abs=1e-10)
-
-
-@pytest.mark.parametrize("axes", ["xyz", "xz", "y", "zx"])
-@pytest.mark.parametrize(("first", "second"), PAIRS)
-def test_multipliers_of_coincident_points_are_a_force(first, second, axes):
-    links = arms()[0].links
-    a, b = frames(first, second)
-    chosen = ["xyz".index(axis) for axis in axes]
-    for q, context, random in configurations(2, seed=3):
-        on_b = random.uniform(-0.5, 0.5, 3)
-        point = b.CalcPoseInWorld(context) @ on_b
-        on_a = a.CalcPoseInWorld(context).inverse() @ point
-        pin = CoincidentPoints(first, tuple(on_a), second, tuple(on_b), axes)
-        phi, jacobian = evaluate(pin, links, q)
-        np.testing.assert_allclose(phi, 0.0, atol=1e-12)
-        multiplier, force = random.uniform(-50.0, 50.0, len(axes)), np.zeros(3)
-        force[chosen] = multiplier
-        forces = MultibodyForces(links.plant)
-        push(context, forces, b, point, force)
-        push(context, forces, a, point, -force)
-        generalized = links.plant.CalcGeneralizedForces(context, forces)
-        np.testing.assert_allclose(jacobian.T @ multiplier, generalized, atol=1e-10)
-        # Apart, phi is the gap from A to B along the world's axes.
-        gap = random.uniform(-0.5, 0.5, 3)
-        moved = a.CalcPoseInWorld(context).inverse() @ (point - gap)
-        apart = CoincidentPoints(first, tuple(moved), second, tuple(on_b), axes)
-        np.testing.assert_allclose(evaluate(apart, links, q)[0], gap[chosen], atol=1e-12)
-
-
-@pytest.mark.parametrize("curved", [False, True])
-def test_multiplier_of_a_point_on_a_surface_is_its_normal_force(curved):
-    links = arms()[0].links
-    (frame,) = frames("object")
-    for q, context, random in configurations(3, seed=4):
-        on_body = random.uniform(-0.5, 0.5, 3)
-        point = frame.CalcPoseInWorld(context) @ on_body
-        normal = random.standard_normal(3)
-        normal /= np.linalg.norm(normal)
-        ball = Sphere(tuple(point - 0.4 * normal), 0.4)
-        surface = ball if curved else Plane(tuple(point), tuple(normal))
-        contact = PointOnSurface("object", surface, tuple(on_body))
-        phi, jacobian = evaluate(contact, links, q)
-        np.testing.assert_allclose(phi, 0.0, atol=1e-12)
-        multiplier = random.uniform(-50.0, 50.0)
-        forces = MultibodyForces(links.plant)
-        push(context, forces, frame, point, multiplier * normal)
-        generalized = links.plant.CalcGeneralizedForces(context, forces)
-        np.testing.assert_allclose(jacobian[0] * multiplier, generalized, atol=1e-10)
 
 
 def rod(joint):
@@ -260,40 +162,16 @@ def test_support_carries_half_of_a_rod():
         np.testing.assert_allclose(force, WEIGHT / 2.0 + torque / 0.8, rtol=1e-12)
 
 
-def test_moving_arms_obey_newton_and_euler():
-    """Inverse dynamics of MultibodyPlant with the multipliers as external forces gives u."""
-    model, structure = arms()
-    plant, system = model.links.plant, RobotPlant(model, structure=structure)
-    a, b = frames("object", "right::tool")
-    context, context_here = plant.CreateDefaultContext(), system.CreateDefaultContext()
-    random = np.random.default_rng(6)
-    spread = np.repeat([0.2, 1.0], 14)
-    for _ in range(6):
-        guess = model.dae.nominal_state + spread * random.standard_normal(28)
-        q, v = np.split(system.set_consistent_state(context_here, guess), 2)
-        u = 50.0 * random.standard_normal(14)
-        system.GetInputPort("control").FixValue(context_here, u)
-        acceleration = system.EvalTimeDerivatives(context_here).CopyToVector()[14:]
-        multiplier = system.GetOutputPort("constraint_force").Eval(context_here)
-        plant.SetPositions(context, q)
-        plant.SetVelocities(context, v)
-        rotation = a.CalcPoseInWorld(context).rotation().matrix()
-        force, moment = rotation @ multiplier[:3], rotation @ multiplier[3:]
-        point = b.CalcPoseInWorld(context).translation()
-        forces = MultibodyForces(plant)
-        plant.CalcForceElementsContribution(context, forces)
-        push(context, forces, b, point, force, moment)
-        push(context, forces, a, point, -force, -moment)
-        needed = plant.CalcInverseDynamics(context, acceleration, forces)
-        # Forces of 1e2 to 1e3 N, and J M^-1 J^T of condition 1e2 to 1e3.
-        np.testing.assert_allclose(needed, u, atol=1e-9)
-        # And the tool stays where it is in the object.
-        still = np.zeros(3)
-        jacobian = plant.CalcJacobianSpatialVelocity(context, VELOCITY, b, still, a, a)
-        bias = plant.CalcBiasSpatialAcceleration(context, VELOCITY, b, still, a, a)
-        np.testing.assert_allclose(jacobian @ v, 0.0, atol=1e-10)
-        relative = jacobian @ acceleration + bias.get_coeffs()
-        np.testing.assert_allclose(relative, 0.0, atol=1e-9)
+def turntable():
+    """One joint about z."""
+    q, v = ca.SX.sym("q"), ca.SX.sym("v")
+    c, s = ca.cos(q), ca.sin(q)
+    rotation = ca.SX(3, 3)
+    rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1], rotation[2, 2] = c, -s, s, c, 1
+    pose = (rotation, ca.SX.zeros(3))
+    return LinkExpressions(
+        q, v, ca.SX(1), ca.SX(0), frames={"plate": pose, "point": ca.SX.zeros(3)}
+    )
 
 
 def test_weld_has_no_other_root():
@@ -308,41 +186,6 @@ def test_weld_has_no_other_root():
     for turn in (-3.0, -1.6, 1.6, 3.0):
         guess = NOMINAL + turn * np.eye(14)[13]
         np.testing.assert_allclose(model.configuration(midway, guess), NOMINAL, atol=1e-6)
-
-
-def turntable():
-    """One joint about z."""
-    q, v = ca.SX.sym("q"), ca.SX.sym("v")
-    c, s = ca.cos(q), ca.sin(q)
-    rotation = ca.SX(3, 3)
-    rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1], rotation[2, 2] = c, -s, s, c, 1
-    pose = (rotation, ca.SX.zeros(3))
-    return LinkExpressions(
-        q, v, ca.SX(1), ca.SX(0), frames={"plate": pose, "point": ca.SX.zeros(3)}
-    )
-
-
-def test_names_units_and_parameters():
-    dae = arms()[0].dae
-    names = [f"grasp.{axis}" for axis in ("fx", "fy", "fz", "mx", "my", "mz")]
-    assert [s.name for s in dae.constraint_input_signals] == names
-    assert [s.unit for s in dae.constraint_input_signals] == ["N"] * 3 + ["N m"] * 3
-    names = [f"grasp.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")]
-    assert [s.name for s in dae.constraint_output_signals] == names
-    assert [s.unit for s in dae.constraint_output_signals] == ["m"] * 3 + ["rad"] * 3
-    np.testing.assert_array_equal(
-        dae.parameter_values[dae.parameter_slice("grasp.position")], GRASP.pose.translation()
-    )
-    pin = CoincidentPoints("a", (0, 0, 0), "b", (0, 0, 0), "xz", "pin")
-    assert [s.name for s in pin.force_signals] == ["pin.fx", "pin.fz"]
-    assert [s.unit for s in (*pin.force_signals, *pin.residual_signals)] == ["N", "N", "m", "m"]
-
-
-def test_the_pose_of_a_weld_is_a_copy():
-    pose = RigidTransform()
-    weld = WeldedFrames("world", "plate", pose)
-    pose.set_translation([1.0, 2.0, 3.0])
-    assert weld.pose.IsExactlyIdentity()
 
 
 @pytest.mark.parametrize(

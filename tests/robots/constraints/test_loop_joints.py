@@ -23,7 +23,6 @@ from pydrake.multibody.tree import (
     SpatialInertia,
     UnitInertia,
 )
-from pydrake.systems.analysis import Simulator
 
 from drake_dae import (
     JointPositions,
@@ -31,15 +30,9 @@ from drake_dae import (
     RevoluteLoopJoint,
     RobotModel,
     RobotPlant,
-    SurfaceCoordinates,
-    TrackingLaw,
     find_structure,
-    poles,
 )
-from drake_dae.analysis.limits import LimitKind, robot_limits
-from drake_dae.diagrams.wiring import make_closed_loop
 from drake_dae.errors import ModelError
-from drake_dae.references import SinusoidReference
 
 COUNT = 8
 SLIDES = {2, 6}
@@ -176,20 +169,6 @@ def rates(cut: int, both, torques):
 
 
 @pytest.mark.slow
-def test_the_ring_is_as_meant():
-    for cut in (2, 3, 6, 7):
-        assert structure(cut).constraint_degrees == (2,) * 5
-        assert structure(cut).zero_dynamics_dimension == 0
-    both = moving(0)
-    for cut in (2, 3, 6):
-        order = tree_joints(cut)
-        state = np.concatenate([both[0, order], both[1, order]])
-        assert_allclose(structure(cut).manifold.residual(state), 0.0, atol=1e-12)
-        assert_allclose(coordinates(cut, state), both, atol=1e-12)
-    assert np.abs(both).min() > 1e-3
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("cut", [2, 3, 6])
 def test_it_moves_as_where_it_is_cut_elsewhere(cut):
     """Accelerations up to 1e3, by two sets of equations: 1e-9 of them."""
@@ -242,78 +221,6 @@ def test_what_the_loop_joint_exerts_is_what_drakes_joint_does(cut):
     for name, value in found.items():
         assert value == pytest.approx(by_drake[name.split(".")[1]], rel=1e-9, abs=1e-9)
     assert len(found) == 5
-
-
-@pytest.mark.slow
-def test_power_balances():
-    """(T + V)' = u . c' - sum d c'^2, with the springs in V."""
-    both, torques = moving(2), np.random.default_rng(0).uniform(-5.0, 5.0, COUNT)
-    for cut in (2, 3):
-        plant, context, _ = rates(cut, both, torques)
-        links, dae = plant.model.links, plant.dae
-        energy = links.kinetic_energy + links.potential_energy
-        if cut in SPRING:
-            stiffness, rest = SPRING[cut]
-            energy += stiffness / 2.0 * (plant.model.loop_joints.state[0] - rest) ** 2
-        inputs = {"state": dae.state, "p": dae.parameter_symbol}
-        function = ca.Function("E", list(inputs.values()), [ca.jacobian(energy, dae.state)])
-        state = plant.state(context)
-        rate = plant.EvalTimeDerivatives(context).CopyToVector()
-        found = float(function(state, dae.parameter_values).full().ravel() @ rate)
-        drives = sum(torques[i] * both[1, i] for i in DRIVEN)
-        assert found == pytest.approx(drives - DAMPING @ both[1] ** 2, rel=1e-9)
-
-
-def closed_loop(model, amplitude=0.1):
-    law = TrackingLaw(model.dae, poles(-6.0))
-    plant = RobotPlant(model, structure=law.structure)
-    references = [SinusoidReference(0.0, [amplitude], [2.0]) for _ in range(2)]
-    return make_closed_loop(plant, law, references)
-
-
-@pytest.mark.slow
-def test_the_law_steers_through_a_motor_in_the_loop_and_limits_are_reported_alike():
-    """The same closed loop, cut at the driven joint 3 and elsewhere, integrated at 1e-9."""
-    records, left = [], []
-    for cut in (3, 7):
-        loop = closed_loop(ring(cut, limited=True))
-        simulator = Simulator(loop.diagram)
-        simulator.get_mutable_integrator().set_target_accuracy(1e-9)
-        context = simulator.get_mutable_context()
-        own = loop.plant.GetMyMutableContextFromRoot(context)
-        both = moving(3)
-        order = tree_joints(cut)
-        loop.plant.set_state(own, np.concatenate([both[0, order], both[1, order]]))
-        simulator.AdvanceTo(1.0)
-        record = loop.record(context)
-        predicted = loop.predicted_error(record)
-        assert_allclose(record["tracking_error"], predicted, atol=1e-7)
-        records.append(record)
-        limits = robot_limits(loop.plant.model)
-        ranges = limits.ranges(record.time, limits.of_record(record))
-        over = [r for r in ranges if r.excess and r.kind is LimitKind.POSITION]
-        left += [(r.least, r.largest, r.low, r.high) for r in over]
-    first, second = records
-    assert [s.name for s in first.signals["loop_state"].signals] == ["loop.angle", "loop.angle'"]
-    ends = [first["loop_state"][-1, 0], second["state"][-1, 3]]
-    assert ends[0] == pytest.approx(ends[1], abs=1e-6)
-    motors = [first["control"][-1], second["control"][-1]]
-    assert first.signals["control"].signals[-1].name == "loop.motor"
-    assert_allclose(motors[0], motors[1][[1, 0]], atol=1e-5)
-    first, second = left
-    assert first[2:] == second[2:] == LIMITS
-    assert_allclose(first, second, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_the_angle_can_be_an_output():
-    model = ring(3)
-    loop = model.constraints[0]
-    parts = (model.links, [loop], [SurfaceCoordinates(loop), JointPositions(["joint1"])])
-    other = RobotModel(*parts, forces=[])
-    found = find_structure(other.dae)
-    assert found.output_degrees == (2, 2)
-    assert other.dae.output_signals[0].name == "loop.angle"
 
 
 def test_the_angle_counts_from_the_middle_of_its_limits():

@@ -6,7 +6,6 @@ from arms import parse, touching
 from numpy.testing import assert_allclose
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
-from runs import some
 
 from drake_dae import (
     AxisCoordinates,
@@ -36,81 +35,6 @@ def arm_on_plate(exogenous=("plate.position", "plate.rpy")):
         AT_WORK,
         exogenous=exogenous,
     )
-
-
-class Plate:
-    """Where a plate is in time: polynomials of degree 2, whose derivatives are given at t = 0."""
-
-    def __init__(self, random):
-        self.center = np.array([[0.5, 0.0, 0.4], *random.uniform(-0.5, 0.5, (2, 3))])
-        self.rpy = random.uniform(-0.3, 0.3, (3, 3))
-
-    @property
-    def signals(self):
-        """w_1, w_1', w_1'', w_2, ..., as the port takes them."""
-        return np.hstack([self.center, self.rpy]).T.ravel()
-
-    def at(self, t):
-        """The center and the normal."""
-        powers = np.array([1.0, t, t**2 / 2])
-        return powers @ self.center, RollPitchYaw(powers @ self.rpy).ToRotationMatrix().matrix()[
-            :, 2
-        ]
-
-    def derivatives(self):
-        """n, n', n'' at t = 0 by central differences of order 4, good to 1e-9 at this step."""
-        h = 1e-3
-        n = [self.at(k * h)[1] for k in (-2, -1, 0, 1, 2)]
-        first = (n[0] - 8 * n[1] + 8 * n[3] - n[4]) / (12 * h)
-        second = (-n[0] + 16 * n[1] - 30 * n[2] + 16 * n[3] - n[4]) / (12 * h**2)
-        return n[2], first, second
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(4)))
-def test_the_arm_stays_on_a_plate_that_moves_and_turns(seed):
-    """phi = n . (p - c), phi' and phi'' vanish, and the forces balance: by MultibodyPlant.
-
-    The tolerance is that of the differences for n''; the balance has none, and is round-off of
-    numbers of size 100.
-    """
-    random = np.random.default_rng(seed)
-    model, plate = arm_on_plate(), Plate(random)
-    plant = RobotPlant(model)
-    assert plant.exogenous_layout.degrees == (2,) * 6
-    context = plant.CreateDefaultContext()
-    control = random.uniform(-20.0, 20.0, 7)
-    plant.GetInputPort("exogenous").FixValue(context, plate.signals)
-    plant.GetInputPort("control").FixValue(context, control)
-    guess = np.concatenate([AT_WORK, random.uniform(-0.5, 0.5, 7)])
-    guess[:7] += random.uniform(-0.1, 0.1, 7)
-    state = plant.set_consistent_state(context, guess)
-    acceleration = plant.EvalTimeDerivatives(context).CopyToVector()[7:]
-    force = plant.GetOutputPort("constraint_force").Eval(context)
-
-    drake = parse("seven_joint_arm")
-    own = drake.CreateDefaultContext()
-    drake.SetPositionsAndVelocities(own, state)
-    tool, world = drake.GetFrameByName("tool"), drake.world_frame()
-    place = drake.CalcPointsPositions(own, tool, np.zeros(3), world)[:, 0]
-    J = drake.CalcJacobianTranslationalVelocity(
-        own, JacobianWrtVariable.kV, tool, np.zeros(3), world, world
-    )
-    bias = drake.CalcBiasTranslationalAcceleration(
-        own, JacobianWrtVariable.kV, tool, np.zeros(3), world, world
-    )[:, 0]
-    (n, n_1, n_2), (c, c_1, c_2) = plate.derivatives(), plate.center
-    offset, velocity = place - c, J @ state[7:] - c_1
-    relative = J @ acceleration + bias - c_2
-    assert_allclose(n @ offset, 0.0, atol=1e-14)
-    assert_allclose(n_1 @ offset + n @ velocity, 0.0, atol=1e-10)
-    assert_allclose(n_2 @ offset + 2 * n_1 @ velocity + n @ relative, 0.0, atol=1e-7)
-
-    applied = MultibodyForces(drake)
-    drake.CalcForceElementsContribution(own, applied)  # Gravity and damping.
-    needed = drake.CalcInverseDynamics(own, acceleration, applied)
-    given = drake.MakeActuationMatrix() @ control + J.T @ n * force[0]
-    assert_allclose(needed, given, atol=1e-9)
 
 
 @pytest.mark.parametrize(

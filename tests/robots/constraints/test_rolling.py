@@ -5,15 +5,11 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-import scipy.integrate
-from arms import fixed_step
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
-    BallRpyJoint,
     FixedOffsetFrame,
     PlanarJoint,
-    PrismaticJoint,
     RevoluteJoint,
     SpatialInertia,
     UnitInertia,
@@ -27,20 +23,12 @@ from drake_dae import (
     RobotModel,
     RobotPlant,
     RollingWheel,
-    SinusoidReference,
     Sphere,
-    TrackingLaw,
     find_structure,
-    make_closed_loop,
-    poles,
-    simulate,
 )
-from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.errors import ModelError
 from drake_dae.robots import Blade, RollingBall
 from drake_dae.trace.functions import TracedFunction
-
-GRAVITY = 9.81
-
 
 # A robot with two driven wheels, on a planar joint: two wheels roll, one of them holds the side.
 
@@ -134,44 +122,6 @@ def test_a_cart_moves_as_the_unicycle_of_the_textbook():
         np.testing.assert_allclose(wrenches[3][3:], -push, atol=1e-10)
 
 
-def test_a_cart_tracks_with_a_point_ahead_of_its_axle():
-    """e(t) of double poles at -3; RK5 at 4 ms leaves 1e-9. The wheels do not slip."""
-    model, structure = cart()
-    law = TrackingLaw(model.dae, poles(-3.0), structure=structure)
-    wanted = [SinusoidReference(0.2, 0.5, 0.8), SinusoidReference(0.0, 0.4, 1.1)]
-    loop = make_closed_loop(RobotPlant(model, structure=structure), law, wanted)
-    context = loop.diagram.CreateDefaultContext()
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    start = rolling_state(-0.1, 0.05, 0.7, 0.3, 0.2)
-    loop.plant.set_state(own, start)
-    simulate(loop.diagram, context, 1.5, fixed_step(4e-3))
-    record = loop.record(context)
-    predicted = loop.predicted_error(record)
-    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-8)
-    assert np.abs(record["tracking_error"][0]).min() > 0.01
-    for state in record["state"][::40]:
-        speed = (state[8] + state[9]) / 2 * RADIUS
-        along = [speed * np.cos(state[2]), speed * np.sin(state[2])]
-        np.testing.assert_allclose(state[5:7], along, atol=1e-9)
-
-
-def test_a_start_that_slips_is_refused_and_mended():
-    """The level is that of velocities: positions are free, and the nearest motion has no slip."""
-    model, structure = cart()
-    block = RobotPlant(model, structure=structure)
-    context = block.CreateDefaultContext()
-    block.GetInputPort("control").FixValue(context, [0.0, 0.0])
-    slipping = rolling_state(3.0, -2.0, 0.5, 1.0, 0.3)
-    slipping[5:7] += [0.2, 0.3]
-    block.set_state(context, slipping)
-    with pytest.raises(InconsistentStateError, match=r"left\.side_speed"):
-        simulate(block, context, 0.1, fixed_step())
-    mended = block.set_consistent_state(context, slipping)
-    heading, rates = mended[2], mended[5:]
-    assert -np.sin(heading) * rates[0] + np.cos(heading) * rates[1] == pytest.approx(0, abs=1e-12)
-    simulate(block, context, 0.1, fixed_step())
-
-
 # Rates, by the velocities of body points that Drake computes.
 
 
@@ -235,98 +185,6 @@ def test_rates_are_velocities_of_the_points_that_touch():
 # A ball, carried by a gantry without mass whose motors push its center.
 
 BALL, SIZE = 1.3, 0.2
-
-
-def rolling(surface, **options):
-    """A solid ball of 2/5 m r^2."""
-    plant = MultibodyPlant(0.0)
-    light, parent = SpatialInertia.Zero(), plant.world_frame()
-    for name, axis in (("x", [1, 0, 0]), ("y", [0, 1, 0]), ("z", [0, 0, 1])):
-        body = plant.AddRigidBody(f"slide_{name}", light)
-        joint = plant.AddJoint(PrismaticJoint(name, parent, body.body_frame(), axis))
-        plant.AddJointActuator(f"push_{name}", joint)
-        parent = body.body_frame()
-    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(BALL, SIZE))
-    plant.AddJoint(BallRpyJoint("turn", parent, ball.body_frame()))
-    plant.Finalize()
-    contact = RollingBall("ball", surface, SIZE, **options)
-    x, y, z = surface.position
-    return RobotModel.from_multibody(
-        plant,
-        [contact],
-        [PointCoordinates("ball", "xy")],
-        [x, y, z + SIZE, 0.0, 0.0, 0.0],
-        forces=["ball.force"],
-    )
-
-
-def run(model, structure, state, duration, step=1e-3):
-    block = RobotPlant(model, structure=structure)
-    context = block.CreateDefaultContext()
-    block.GetInputPort("control").FixValue(context, np.zeros(3))
-    block.set_state(context, state)
-    simulate(block, context, duration, fixed_step(step))
-    return block.state(context), block.GetOutputPort("constraint_force").Eval(context)
-
-
-def test_a_ball_swings_in_a_bowl_as_a_slow_pendulum():
-    """a'' = -5 g / (7 (R - r)) sin a, against SciPy: RK5 at 1 ms leaves 1e-11."""
-    wide, duration, angle = 1.5, 1.2, 0.7
-    middle = np.array([0.3, -0.2, 2.0])
-    model = rolling(Sphere(tuple(middle), wide, inside=True))
-    arm = wide - SIZE
-    place = middle + arm * np.array([0.0, np.sin(angle), -np.cos(angle)])
-    state, force = run(model, find_structure(model.dae), [*place, *np.zeros(9)], duration)
-    angle, rate = scipy.integrate.solve_ivp(
-        lambda t, y: [y[1], -5 * GRAVITY / (7 * arm) * np.sin(y[0])],
-        (0.0, duration),
-        [angle, 0.0],
-        method="DOP853",
-        rtol=1e-13,
-        atol=1e-13,
-    ).y[:, -1]
-    place = middle + arm * np.array([0.0, np.sin(angle), -np.cos(angle)])
-    np.testing.assert_allclose(state[:3], place, atol=1e-10)
-    pressed = BALL * (arm * rate**2 + GRAVITY * np.cos(angle))
-    assert force[0] == pytest.approx(pressed, rel=1e-9)
-
-
-def test_a_spinning_ball_keeps_its_energy_in_a_bowl():
-    """Rolling friction takes no power, in three dimensions with spin; RK5 leaves 1e-10."""
-    middle = np.array([0.0, 0.0, 1.5])
-    model = rolling(Sphere(tuple(middle), 1.5, inside=True))
-    structure, plant = find_structure(model.dae), model.links.plant
-    place = middle + 1.3 * np.array([0.28, 0.0, -0.96])
-    guess = [*place, 0.1, 0.2, 0.3, 0.0, 0.8, 0.0, 0.5, -0.4, 1.0]
-    start = structure.manifold.project(guess)
-    state, _ = run(model, structure, start, 0.8)
-    energies = []
-    for x in (start, state):
-        context = plant.CreateDefaultContext()
-        plant.SetPositionsAndVelocities(context, x)
-        energies.append(plant.EvalKineticEnergy(context) + plant.EvalPotentialEnergy(context))
-    assert energies[1] == pytest.approx(energies[0], abs=1e-9)
-    assert np.linalg.norm(state[:3] - start[:3]) > 0.3
-
-
-def test_a_pushed_ball_tracks_with_its_normal_force():
-    """e(t) of double poles at -4, and the force at once."""
-    model = rolling(Sphere((0.0, 0.0, -2.0), 2.0))
-    structure = find_structure(model.dae)
-    law = TrackingLaw(model.dae, poles(-4.0), structure=structure)
-    wanted = [SinusoidReference(0.1, 0.2, 1.0), SinusoidReference(0.0, 0.2, 1.5)]
-    wanted.append(SinusoidReference(30.0, 5.0, 2.0))
-    loop = make_closed_loop(RobotPlant(model, structure=structure), law, wanted)
-    context = loop.diagram.CreateDefaultContext()
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    q = model.configuration([0.15, 0.05], [0.1, 0.0, 0.2, 0.0, 0.0, 0.0])
-    loop.plant.set_consistent_state(own, model.rest_state(q, [30.0]))
-    simulate(loop.diagram, context, 1.0, fixed_step(4e-3))
-    record = loop.record(context)
-    predicted = loop.predicted_error(record)
-    np.testing.assert_allclose(record["tracking_error"], predicted, atol=1e-8)
-    apart = np.linalg.norm(record["state"][:, :3] - [0.0, 0.0, -2.0], axis=1)
-    np.testing.assert_allclose(apart, 2.0 + SIZE, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -41,21 +41,6 @@ def test_terms_are_those_of_the_plant(seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
-def test_gravity_is_the_bias_at_rest(seed):
-    """At rest H is gravity and springs, which Drake computes apart from the rest."""
-    robot = random_robot(seed)
-    plant, random = robot.plant, np.random.default_rng(200 + seed)
-    context = random_context(plant, random)
-    q, v = state(plant, context)
-    plant.SetVelocities(context, 0.0 * v)
-    springs = -plant_bias(plant, context) - plant.CalcGravityGeneralizedForces(context)
-    H = robot.terms(q, 0.0 * v, default_masses(robot.expressions))[1]
-    gravity = plant.CalcGravityGeneralizedForces(context)
-    assert_close(-H - springs, gravity, "gravity", scale=np.abs(H).max())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
 def test_accelerations_are_those_of_the_continuous_plant(seed):
     """Holds damping, springs, actuation and rotors to what Drake simulates.
 
@@ -185,18 +170,6 @@ def test_contact_forces_and_their_constraints_by_inverse_dynamics(seed):
     )
     row += 2 * numbers[0][-1] * robot.terms(*numbers, default_masses(expressions))[2][-1]
     assert_close(J[3], row, "J of an angle", 1.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(4)))
-def test_discrete_plant_has_the_same_terms(seed):
-    continuous, discrete = random_robot(seed), random_robot(seed, time_step=1e-3)
-    context = random_context(discrete.plant, np.random.default_rng(500 + seed))
-    masses = default_masses(discrete.expressions)
-    assert_terms_agree(discrete.plant, context, discrete.terms, masses)
-    arguments = (*state(discrete.plant, context), masses)
-    for own, other in zip(discrete.terms(*arguments), continuous.terms(*arguments), strict=True):
-        np.testing.assert_array_equal(own, other)
 
 
 @pytest.mark.slow

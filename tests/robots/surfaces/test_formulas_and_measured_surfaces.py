@@ -1,9 +1,5 @@
 """Surfaces from formulas and from data: what they are, and how far they are off it."""
 
-import re
-import tracemalloc
-import zipfile
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -79,12 +75,6 @@ def test_a_formula_of_one_length_is_smooth_where_its_gradient_is_not_zero(
         np.testing.assert_allclose(np.array(hessian(place)), wanted, atol=2e-6)
 
 
-@pytest.mark.parametrize("text", ["1_0 - x", "0x10 - x", "0b1 - x", "x - 1e400", "x*1_000.5"])
-def test_numbers_of_python_alone_are_none_of_a_formula(text):
-    with pytest.raises(ModelError, match=re.escape(text)):
-        ImplicitSurface(text)
-
-
 @pytest.mark.parametrize(
     ("formula", "numbers", "built_in"),
     [
@@ -98,14 +88,6 @@ def test_a_formula_is_the_built_in_surface(formula, numbers, built_in):
     known = derivatives(built_in, 4)
     for p in np.random.default_rng(0).uniform(0.3, 0.8, (10, 3)):
         np.testing.assert_allclose(own(p)[0], known(p)[0], rtol=1e-12, atol=1e-12)
-
-
-def test_a_formula_of_squares_has_the_same_normal_on_the_sphere():
-    own = derivatives(ImplicitSurface("x**2 + y**2 + z**2 - r**2", parameters={"r": 0.7}), 1)
-    known = derivatives(Sphere((0, 0, 0), 0.7), 1)
-    for p in np.random.default_rng(0).normal(size=(10, 3)):
-        foot = 0.7 * p / np.linalg.norm(p)
-        np.testing.assert_allclose(own(foot)[0], known(foot)[0], rtol=0, atol=1e-14)
 
 
 def test_numbers_of_a_formula_are_parameters_of_the_constraint():
@@ -247,11 +229,10 @@ def test_files_hold_what_the_table_does(tmp_path):
     tall = 0.05 + 0.02 * np.sin(10 * X) * np.cos(12 * Y)[:, None] + 0.1 * Y[:, None]
     table = MeasuredSurface((0.4, 0.3), tall)
     np.save(tmp_path / "a.npy", tall)
-    np.savez_compressed(tmp_path / "a.npz", any=tall)
     np.savetxt(tmp_path / "a.csv", tall, delimiter=",")
     np.savetxt(tmp_path / "b.csv", 1e3 * tall, delimiter="; ")
     wanted = table.fit.heights(X, Y)
-    for name, scale in (("a.npy", 1), ("a.npz", 1), ("a.csv", 1), ("b.csv", 1e-3)):
+    for name, scale in (("a.npy", 1), ("a.csv", 1), ("b.csv", 1e-3)):
         own = MeasuredSurface((0.4, 0.3), file=tmp_path / name, scale=float(scale))
         np.testing.assert_allclose(own.fit.heights(X, Y), wanted, rtol=0, atol=1e-12)
         assert name in own.remark
@@ -261,24 +242,6 @@ def test_files_hold_what_the_table_does(tmp_path):
     np.save(tmp_path / "a.npy", 2.0 * tall[:-1])
     changed = MeasuredSurface((0.4, 0.3), file=tmp_path / "a.npy")
     assert changed.fit.heights(X, Y)[0, 0] == pytest.approx(2.0 * wanted[0, 0], rel=1e-3)
-
-
-@pytest.mark.parametrize("kind", ["npz", "obj"])
-def test_what_an_archive_unpacks_to_is_bounded_before_it_is_read(kind, tmp_path):
-    """A megabyte that would be a gigabyte: refused without the memory for it."""
-    file = tmp_path / f"bomb.{kind}"
-    with (
-        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive,
-        archive.open("heights.npy", "w") as member,
-    ):
-        for _ in range(1024):
-            member.write(bytes(1 << 20))
-    assert file.stat().st_size < 2 << 20
-    tracemalloc.start()
-    with pytest.raises(ModelError, match="1,073,741,824"):
-        MeasuredSurface((0.4, 0.3), file=file)
-    assert tracemalloc.get_traced_memory()[1] < 10 << 20
-    tracemalloc.stop()
 
 
 def test_a_map_stands_where_its_point_and_normal_say():
@@ -386,10 +349,3 @@ def test_refusals(make, words, tmp_path):
         make(tmp_path)
     assert words in str(caught.value)
     assert len(str(caught.value)) < 400
-
-
-def test_what_is_missing_to_read_a_mesh_is_reported(tmp_path, monkeypatch):
-    file = stl_of(tmp_path / "box.stl", *box([0, 0, 0], [1, 1, 1]))
-    monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
-    with pytest.raises(ModelError, match=r"drake_dae\[meshes\]"):
-        MeasuredSurface(file=file)

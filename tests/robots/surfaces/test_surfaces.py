@@ -24,7 +24,6 @@ from drake_dae.robots import (
     Sphere,
     Surface,
     Torus,
-    tangents,
 )
 from drake_dae.trace.functions import TracedFunction
 
@@ -145,21 +144,6 @@ def test_coordinates_cover_the_surface(name):
     assert min(volumes) > 0.1
 
 
-def test_the_angle_of_a_cylinder_is_counted_from_zero_direction():
-    """A pipe before a robot at the origin: 0 where it faces it, growing to its right."""
-    pipe = Cylinder((0.8, 0.0, 0.0), (0.0, 0.0, 2.0), 0.2, zero=(-1.0, 0.0, 7.0))
-    for angle in (-2.9, -0.4, 0.0, 1.1):
-        offset = [-0.2 * np.cos(angle), -0.2 * np.sin(angle), 0.3]
-        found = np.array(ca.evalf(pipe.coordinates(ca.SX(offset)))).ravel()
-        np.testing.assert_allclose(found, [angle, 0.3], atol=1e-15)
-
-
-@pytest.mark.parametrize("name", [n for n in SURFACES if not SURFACES[n].coordinate_signals])
-def test_coordinates_that_there_are_not_are_refused(name):
-    with pytest.raises(ModelError, match="coordinates"):
-        SURFACES[name].coordinates(ca.SX.sym("p", 3))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(n for n in SURFACES if SURFACES[n].extent is None))
 def test_any_surface_is_drawn_from_its_distance_alone(name):
@@ -178,14 +162,6 @@ def test_any_surface_is_drawn_from_its_distance_alone(name):
         assert mesh.num_triangles() > 500
         assert apart.min() < 0.2
         assert 0.5 * size < apart.max() < 2.0 * size
-
-
-def test_a_patch_ends_where_the_surface_does():
-    """A small ball in a large patch: half of it is drawn, all of that on the ball."""
-    ball = Sphere((0.0, 0.0, 0.0), 0.1)
-    mesh = Surface.picture(ball, [0.0, 0.0, 0.3], 1.0).form
-    vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.1, atol=1e-12)
 
 
 AXIS = np.array([1.0, 2.0, 2.0]) / 3.0
@@ -220,16 +196,6 @@ def test_shapes_stand_where_the_surfaces_are(surface, kind):
         np.testing.assert_allclose(place, position, atol=1e-12)
 
 
-def test_a_torus_is_drawn_on_its_surface():
-    torus, position = Torus((0, 0, 0), (1, 2, 2), 0.5, 0.2), np.array([0.1, 0.2, 0.3])
-    picture = torus.picture(np.zeros(3), 1.0).moved(RigidTransform(position))
-    mesh, distance = picture.form, functions(torus)
-    points = [picture.pose @ mesh.vertex(i) for i in range(mesh.num_vertices())]
-    assert len(points) > 1000
-    distances = [distance(point - position)[0][0] for point in points]
-    np.testing.assert_allclose(distances, 0.0, atol=1e-12)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["plane", "sphere", "cylinder", "torus"])
 def test_distance_is_the_distance_to_the_nearest_point(name):
@@ -244,21 +210,6 @@ def test_distance_is_the_distance_to_the_nearest_point(name):
         assert function(foot)[0][0] == pytest.approx(0.0, abs=1e-12)
         _, cloud = points_on(surface, 40)
         assert np.min(np.linalg.norm(cloud - p, axis=1)) >= abs(distance[0]) - 1e-9
-
-
-def test_known_values():
-    assert float(Plane((1, 0, 0), (-2, 0, 0)).distance(ca.SX([-0.25, 5, 5]))) == 0.25
-    assert float(Sphere((0, 0, 0), 2.0).distance(ca.SX([3, 0, 4]))) == 3.0
-    assert float(Sphere((0, 0, 0), 2.0, inside=True).distance(ca.SX([0, 0, 1.5]))) == 0.5
-    assert float(Cylinder((0, 0, 0), (0, 0, 1), 1.0).distance(ca.SX([3, 4, 9]))) == 4.0
-    assert float(Torus((0, 0, 0), (0, 0, 1), 2.0, 0.5).distance(ca.SX([0, 3, 0]))) == 0.5
-    # On the long axis F = 3, |grad F| = 4: not the distance 1, but the same to first order.
-    assert float(Ellipsoid((0, 0, 0), (1, 1, 1)).distance(ca.SX([2, 0, 0]))) == 0.75
-
-
-def test_tangents_are_upright():
-    np.testing.assert_allclose(tangents([-1, 0, 0]), [[0, 1, 0], [0, 0, 1]], atol=0)
-    np.testing.assert_allclose(tangents([0, 0, 1]), [[1, 0, 0], [0, 1, 0]], atol=0)
 
 
 @pytest.mark.parametrize(
@@ -287,12 +238,6 @@ def test_tangents_are_upright():
 def test_refusals(make, message):
     with pytest.raises(ModelError, match=message):
         make()
-
-
-@pytest.mark.slow
-def test_a_surface_without_points_is_not_drawn_and_says_so():
-    with pytest.warns(UserWarning, match=r"ImplicitSurface.*0\.4"):
-        assert ImplicitSurface(lambda p: ca.sumsqr(p) + 1.0).picture([0.1, 0.0, 0.0], 0.4) is None
 
 
 def test_a_surface_is_drawn_around_its_tip():

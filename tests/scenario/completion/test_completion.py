@@ -13,10 +13,7 @@ from drake_dae import (
     CircleReference,
     ConstantReference,
     JointPositions,
-    Plane,
     PointCoordinates,
-    PointOnSurface,
-    Sphere,
     build_scenario,
     load_scenario,
     simulate,
@@ -44,19 +41,6 @@ def left_out(name="seven_joint_wall", **changes):
 
 def names(completed):
     return [s.name for s in scenario_model(completed.scenario).position_signals]
-
-
-def touching(*constraints):
-    """The seven-joint arm on other surfaces."""
-    forces = {f"{constraint.name}.force": FORCE for constraint in constraints}
-    return left_out(constraints=list(constraints), references=forces)
-
-
-def test_a_scenario_that_says_all_is_returned_as_it_is():
-    whole = scenario("seven_joint_wall")
-    completed = complete_scenario(whole)
-    assert completed.scenario is whole
-    assert completed.notes == ()
 
 
 def test_the_arm_on_the_wall_gets_the_outputs_and_the_start_that_were_chosen_by_hand():
@@ -91,35 +75,6 @@ def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "held"),
-    [
-        ("fixed", ["tool.z_axis.y", "tool.z_axis.z"]),
-        ("free", []),
-    ],
-)
-def test_the_tool_axis_may_be_fixed_or_free(kind, held):
-    found = names(complete_scenario(left_out(tool_axis=kind)))
-    assert found[:2] == ["tool.y", "tool.z"]
-    assert [name for name in found[2:] if "joint" not in name] == held
-    assert len(found) == 6
-
-
-def test_outputs_given_in_part_are_kept_and_come_first():
-    part = left_out(
-        outputs=[JointPositions(["joint1"]), PointCoordinates("tool", "z")],
-        references={"joint1": 0.1, "tool.z": 0.6, "wall.force": FORCE},
-    )
-    whole = complete_scenario(part)
-    completed, found = whole.scenario, names(whole)
-    assert found[:5] == ["joint1", "tool.z", "tool.y", "wall.tilt_x", "wall.tilt_y"]
-    assert found[5] in ("joint5", "joint7", "joint3")
-    assert completed.start.positions["joint1"] == 0.1
-    assert list(completed.references) == [*part.references, *found[2:]]
-    assert {name: completed.references[name] for name in part.references} == part.references
-
-
-@pytest.mark.slow
 def test_what_references_name_becomes_an_output_and_follows_them():
     """A circle of the tool is along the surface; a joint that is named is steered."""
     circle = CircleReference([0.0, 0.6], 0.1, period=5.0)
@@ -136,37 +91,6 @@ def test_what_references_name_becomes_an_output_and_follows_them():
     # It starts at rest, on a circle that does not: off as predicted, to the integrator's 1e-8.
     off = record["tracking_error"] - loop.predicted_error(record)
     np.testing.assert_allclose(off, 0.0, atol=1e-7)
-
-
-@pytest.mark.slow
-def test_the_tool_starts_normal_to_a_surface_that_bends():
-    ball = Sphere((0.5, 0.0, 0.2), 0.25)
-    loop, context = build_scenario(touching(PointOnSurface("tool", ball, name="ball")))
-    links = loop.plant.model.links
-    q = loop.plant.state(loop.plant.GetMyContextFromRoot(context))[:7]
-    low, high = links.position_limits
-    assert np.all((low < q) & (q < high))
-    own = links.plant.CreateDefaultContext()
-    links.plant.SetPositions(own, q)
-    pose = links.plant.GetFrameByName("tool").CalcPoseInWorld(own)
-    normal = (pose.translation() - ball.center) / 0.25
-    # The tool's z axis points into the ball; Newton's method leaves 1e-10.
-    assert pose.rotation().matrix()[:, 2] == pytest.approx(-normal, abs=1e-8)
-
-
-def test_a_start_that_is_left_out_is_found_for_outputs_that_are_given():
-    """The default configuration is stretched, where B(x) is singular."""
-    by_hand = scenario("two_link_wall")
-    completed = complete_scenario(replace(by_hand, start=Start(errors={"tool.z": 0.05})))
-    assert len(completed.notes) == 1
-    assert completed.notes[0].startswith("start found: {joint1:")
-    loop, context = build_scenario(completed.scenario)
-    own = loop.plant.GetMyContextFromRoot(context)
-    plant = loop.plant.model.links.plant
-    placed = plant.CreateDefaultContext()
-    plant.SetPositions(placed, loop.plant.state(own)[:2])
-    x, _, z = plant.GetFrameByName("tool").CalcPoseInWorld(placed).translation()
-    assert (x, z) == pytest.approx((1.2, 0.35), abs=1e-9)
 
 
 def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_kinetic_energy():
@@ -205,12 +129,6 @@ def test_a_start_out_of_reach_is_reported_with_the_output_and_by_how_much():
     assert message.startswith("references: ")
     assert "tool.z" in message
     assert "3 m" in message
-
-
-def test_a_surface_out_of_reach_is_reported():
-    far = PointOnSurface("tool", Plane((4.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), name="wall")
-    message = refusal(touching(far))
-    assert message.startswith("constraints: ")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from vendors import joint, link, robot
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import complete_scenario
-from drake_dae.scenario.model import scenario_model
 
 LEGS = """
 robot: {{file: {folder}/legs.urdf, free: [trunk], actuators: all}}
@@ -16,10 +15,6 @@ law:
   gains: {{all: [-4.0]}}
 {rest}
 """
-
-
-def names(completed):
-    return [s.name for s in scenario_model(completed.scenario).position_signals]
 
 
 def refusal(scenario):
@@ -72,31 +67,7 @@ def test_of_six_squeezes_of_feet_in_one_plane_five_are_independent(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pairs", [PAIRS[:5], ()])
-def test_force_outputs_that_are_missing_can_be_named_as_the_message_does(pairs, tmp_path):
-    """The trunk moves in six ways; twelve motors steer six forces beside them."""
-    held = ", ".join([*(f"{pair}: 1.0" for pair in pairs), "trunk_z: 0.0"])
-    forces = squeezes(pairs) if pairs else "forces: []"
-    message = refusal(legs(tmp_path, f"{forces}\nreferences: {{{held}}}\n{START}"))
-    named = message.partition("for example ")[2].split(", ")
-    assert len(named) == 6 - len(pairs)
-    more = "".join(f"\n- {name}" for name in named)
-    forces = (squeezes(pairs) if pairs else "forces:") + more
-    held += "".join(f", {name}: 5.0" for name in named)
-    done = complete_scenario(legs(tmp_path, f"{forces}\nreferences: {{{held}}}\n{START}"))
-    assert len(names(done)) == 6
-
-
-@pytest.mark.slow
 def test_a_free_base_whose_outputs_nothing_asks_for_says_so(tmp_path):
     scenario = legs(tmp_path, "forces: []")
     with pytest.raises(ScenarioError, match="outputs: "):
         build_scenario(scenario)
-
-
-@pytest.mark.slow
-def test_outputs_of_several_feet_are_merged_foot_by_foot(tmp_path):
-    """Names along a surface repeat with each foot: a.x, a.y, b.x, ..."""
-    forces = ", ".join(f"{name}.force: 10.0" for name in "abcd")
-    done = complete_scenario(legs(tmp_path, f"references: {{{forces}}}\n{START}", point=False))
-    assert len(names(done)) == 8

@@ -15,8 +15,6 @@ from drake_dae.scenario.form import (
     Family,
     Key,
     Reader,
-    attribute_texts,
-    introduction,
     keys_of,
 )
 from drake_dae.scenario.typed_yaml import dump_yaml, load_lines, load_yaml
@@ -130,29 +128,6 @@ def test_all_problems_are_told_at_once_with_their_lines():
     assert not any("\n" in text for text in found.values())
 
 
-def test_fields_that_are_not_arguments_are_no_keys():
-    found = problems("contact: {surface: !Funnel {apex: [0, 0, 0], height: 2}}")
-    assert all(name in found["contact.surface"] for name in ("'height'", "apex", "angle"))
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("2", 2.0),
-        ("[2]", 2.0),
-        ("[[2]]", 2.0),
-        ("1e-8", 1e-8),
-        ("[1, 2e3]", [1.0, 2000.0]),
-        ("[[1, 2], [3, 4]]", [[1.0, 2.0], [3.0, 4.0]]),
-    ],
-)
-def test_numbers(text, value):
-    head = "contact: {surface: {}}\nspring: {stiffness: 5}"
-    for key in ("stiffness", "inertia", "geometry"):
-        assert getattr(read(head, f"spring.{key}={text}").spring, key) == value
-    assert read(head, "spring.inertia=").spring.inertia is None
-
-
 def test_names_with_dots():
     made = read("contact: {surface: {}}", "free.a.b={c: 1}", "free.d={}")
     assert made.free == {"a.b": {"c": 1}, "d": {}}
@@ -190,31 +165,3 @@ def test_the_json_schema_has_defaults_and_no_tags():
     assert parts["Config"]["properties"]["step"]["description"] == "How far."
     assert READER.tags == ["!Bowl", "!Funnel"]
     assert "_tag" not in str(READER.schema)
-
-
-def test_docstrings_are_read_with_those_of_bases():
-    class Base:
-        """A base.
-
-        Attributes:
-            first, second: Both of them,
-                on two lines.
-        """
-
-    class Derived(Base):
-        """A class: it
-        derives.
-
-        Attributes:
-            third: With a colon: here.
-
-        Raises:
-            ValueError: Never.
-        """
-
-    assert attribute_texts(Derived) == {
-        "first": "Both of them, on two lines.",
-        "second": "Both of them, on two lines.",
-        "third": "With a colon: here.",
-    }
-    assert introduction(Derived.__doc__) == "A class: it\nderives."

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import warnings
 from pathlib import Path
 
 import pytest
@@ -108,22 +107,3 @@ def test_files_of_the_model_are_drawn_also_through_links(tmp_path: Path):
     loop, context = build_scenario(load_scenario(path), meshcat := start_meshcat())
     loop.diagram.ForcedPublish(context)
     assert base64.b64encode(bytes(range(36))).decode() in meshcat.StaticHtml()
-
-
-def test_a_package_is_one_place(tmp_path: Path):
-    path = robot(tmp_path, "../secret.txt")
-    (tmp_path / "package.xml").write_text("<package><name>arm</name></package>")
-    # It is no mesh, which Meshcat leaves out.
-    with pytest.warns(GeometryWarning, match=r"'secret\.txt'"):
-        build_scenario(load_scenario(path))
-
-
-def test_a_folder_can_be_named_as_a_package(tmp_path: Path):
-    path = robot(tmp_path, "m.gltf", m_gltf=gltf("../shared/data.bin"))
-    (tmp_path / "shared").mkdir()
-    (tmp_path / "shared" / "data.bin").write_bytes(bytes(36))
-    with pytest.warns(GeometryWarning, match=r"robot\.packages.*'m\.gltf'"):
-        build_scenario(load_scenario(path))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        build_scenario(load_scenario(path, ["robot.packages.shared=shared"]))

@@ -10,7 +10,6 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from runs import run_scenario
 from vendors import joint, link, mobile_arm, panda, robot, write_panda
 
 from drake_dae import load_scenario
@@ -77,23 +76,6 @@ references:
 start: {errors: {shoulder: 0.02}}
 duration: 1.0
 """
-
-# Both fingers are coupled and the first one is driven; the seven joints follow as well.
-GRIP = """
-robot:
-  file: panda_description/urdf/panda.urdf
-  base: {weld: panda_link0}
-  actuators: all
-outputs: [!JointPositions {joints: [ARM, panda_finger_joint1]}]
-forces: []
-law:
-  gains: !Poles {all: [-4.0]}
-references:
-  ARM: !Constant {values: [0.1, 0.5, 0.2, -1.1, 0.1, 1.3, 0.4]}
-  panda_finger_joint1: !Sinusoids {offset: 0.02, amplitudes: [0.01], frequencies: [2.0]}
-start: {errors: {panda_joint2: 0.05}}
-duration: 1.0
-""".replace("ARM", ", ".join(ARM))
 
 
 def files(folder: Path, text: str) -> Path:
@@ -170,88 +152,6 @@ def test_accelerations_are_those_of_a_robot_whose_file_says_the_same(text, expec
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("text", [PANDA, MOBILE, GRIP], ids=["arm", "cart", "gripper"])
-def test_a_run_ends_with_the_predicted_error(text, tmp_path):
-    """The accuracy of a step, 1e-8 or 1e-6, leaves less than 1e-5 along the way."""
-    loop, _, record = run_scenario(load_scenario(files(tmp_path, text)))
-    error = record["tracking_error"]
-    assert record.time[-1] == 1.0
-    assert np.abs(error[0]).max() > 0.009
-    np.testing.assert_allclose(error, loop.predicted_error(record), atol=1e-5)
-    if text == GRIP:
-        q = record["state"][:, :9]
-        np.testing.assert_allclose(q[:, 8], q[:, 7], atol=1e-10)
-        assert np.ptp(q[:, 7]) > 0.008
-
-
-def test_what_leads_a_locked_joint_is_locked_as_well(tmp_path):
-    """q_2 = -0.5 q_1 + 0.1 = 0.3 has q_1 = -0.4, and q_3 = 2 q_2."""
-    mimics = ['<mimic joint="j1" multiplier="-0.5" offset="0.1"/>']
-    mimics += ['<mimic joint="j2" multiplier="2"/>', '<mimic joint="j5"/>']
-    text = robot(
-        "tree",
-        *(link(f"b{k}", 1.0) for k in range(7)),
-        joint("j1", "b0", "b1", "0 1 0"),
-        joint("j2", "b1", "b2", "0 1 0", rest=mimics[0]),
-        joint("j3", "b2", "b3", "0 1 0", rest=mimics[1]),
-        joint("j4", "b0", "b4", "0 1 0", rest=mimics[2]),
-        joint("j5", "b0", "b5", "0 1 0"),
-        joint("j6", "b0", "b6", "1 0 0"),
-    )
-    (tmp_path / "tree.urdf").write_text(text)
-    path = tmp_path / "tree.yaml"
-    path.write_text(
-        "robot: {file: tree.urdf, base: {weld: b0}, locked: {j2: 0.3}, actuators: all}\n"
-        "outputs: [!JointPositions {joints: [j5, j6]}]\nforces: []\n"
-        "references: {j5: 0, j6: 0}"
-    )
-    model = scenario_model(load_scenario(path))
-    assert [signal.name for signal in model.links.position_signals] == ["j4", "j5", "j6"]
-    assert [signal.name for signal in model.links.actuator_signals] == ["j5", "j6"]
-    assert [constraint.name for constraint in model.constraints] == ["j4_coupler"]
-    for number, angle in ((1, -0.4), (2, 0.3), (3, 0.6)):
-        weld = model.links.plant.GetJointByName(f"j{number}").X_FM()
-        np.testing.assert_allclose(
-            RollPitchYaw(weld.rotation()).vector(), [0, angle, 0], atol=1e-15
-        )
-    with pytest.raises(ScenarioError, match="j1 = 5 rad"):
-        scenario_model(load_scenario(path, ["robot.locked.j2=-2.4"]))
-
-
-DRIVEN = """
-robot: {file: ROBOT}
-outputs: [!JointPositions {joints: [joint1]}]
-references: {joint1: 0}
-"""
-
-
-def test_actuators_of_the_file_stay_or_go(tmp_path):
-    """The two-link arm has two: u has the order of the file, limits those of the scenario."""
-    path = tmp_path / "driven.yaml"
-    path.write_text(DRIVEN.replace("ROBOT", "package://drake_dae_models/two_link_arm.urdf"))
-
-    def links(*settings: str):
-        outputs = "outputs.0.joints=[joint1, joint2]"
-        values = "references={joint1: 0, joint2: 0}"
-        many = [outputs, values] if "joint2" in settings[0] or "all" in settings[0] else []
-        return scenario_model(load_scenario(path, [*settings, *many])).links
-
-    own = links("robot.actuators=all")
-    assert len(own.actuator_signals) == 2
-    one = links("robot.actuators=[joint1]")
-    assert [signal.name for signal in one.actuator_signals] == [own.actuator_signals[0].name]
-    np.testing.assert_array_equal(one.effort_limits, own.effort_limits[:1])
-    limited = links("robot.actuators={joint2: 7, joint1: null}")
-    assert limited.actuator_signals == own.actuator_signals
-    np.testing.assert_array_equal(limited.effort_limits, [own.effort_limits[0], 7.0])
-
-
-def test_limits_of_the_scenario_are_those_of_actuators_that_it_adds(tmp_path):
-    links = scenario_model(load_scenario(files(tmp_path, MOBILE))).links
-    np.testing.assert_array_equal(links.effort_limits, [60.0, 87.0])
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -314,53 +214,11 @@ def test_an_effort_limit_of_0_is_unknown(tmp_path):
     assert not read_robot(Robot(str(file)))[1].joints["effort"]
 
 
-def test_effort_limits_of_a_file_with_a_prefix_that_it_does_not_declare(tmp_path):
-    """Drake reads such files, with the acceleration limit, where XML has none of these names."""
-    file = tmp_path / "robot.urdf"
-    text = robot("one", link("a", 1.0), link("b", 1.0), joint("j", "a", "b", "0 0 1"))
-    file.write_text(text.replace("<limit", '<limit drake:acceleration="7"'))
-    chosen = Robot(file=str(file), actuators="all")
-    plant, mender = read_robot(chosen)
-    change_robot(chosen, plant, mender)
-    assert mender.joints["effort"] == {("", "j"): 87.0}
-    plant.Finalize()
-    assert plant.GetAccelerationUpperLimits()[-1] == 7.0
-    assert plant.GetEffortUpperLimits().tolist() == [87.0]
-
-
 FRICTION = """
 robot: {file: arm.urdf, base: {weld: base}, actuators: all, leave_out: [dynamics/friction]}
 outputs: [!JointPositions {joints: [j]}]
 references: {j: 0}
 """
-
-
-def test_joint_friction_is_left_out_where_the_scenario_says_so(tmp_path):
-    friction = '<dynamics damping="0.5" friction="1.0"/>'
-    arm = joint("j", "base", "arm", "0 1 0", rest=friction)
-    (tmp_path / "arm.urdf").write_text(robot("arm", link("base", 1), link("arm", 1), arm))
-    (tmp_path / "arm.yaml").write_text(FRICTION)
-    links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
-    assert links.plant.GetJointByName("j").default_damping() == 0.5
-    with pytest.raises(ScenarioError, match=r"robot\.file: .*arm\.urdf:7: joint 'j'"):
-        scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[]"]))
-    with pytest.raises(ScenarioError, match=r"leave_out\.0: "):
-        load_scenario(tmp_path / "arm.yaml", ["robot.leave_out=[x]"])
-
-
-def test_a_transmission_without_effort_needs_actuators(tmp_path):
-    """Drake leaves such a transmission out; whoever names the driven joints has answered it."""
-    drive = (
-        "<transmission><type>transmission_interface/SimpleTransmission</type>"
-        '<joint name="j"/><actuator name="m"/></transmission>'
-    )
-    arm = joint("j", "base", "arm", "0 1 0", effort=0.0)
-    (tmp_path / "arm.urdf").write_text(robot("arm", link("base", 1), link("arm", 1), arm, drive))
-    (tmp_path / "arm.yaml").write_text(FRICTION)
-    links = scenario_model(load_scenario(tmp_path / "arm.yaml")).links
-    np.testing.assert_array_equal(links.effort_limits, [np.inf])
-    with pytest.raises(ScenarioError, match=r"robot\.file: .*'j'.*robot\.actuators"):
-        scenario_model(load_scenario(tmp_path / "arm.yaml", ["robot.actuators=null"]))
 
 
 def test_a_joint_that_follows_with_multiplier_0_stands(tmp_path):

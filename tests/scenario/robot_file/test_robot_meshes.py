@@ -1,14 +1,13 @@
 """Meshes that Drake cannot read or draw are left out by name; the rest of a robot is as it was."""
 
 import json
-import sys
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.geometry import Role, SceneGraph
-from vendors import binary_stl, write_panda, write_ur5
+from vendors import write_ur5
 
 from drake_dae.errors import GeometryWarning, ModelError
 from drake_dae.scenario.robot_file.reading import read_robot
@@ -23,66 +22,6 @@ def count(scene_graph: SceneGraph, role: Role) -> int:
 
 def read(file: Path, scene_graph: SceneGraph, **more: object):
     return read_robot(Robot(str(file), **more), scene_graph)[0]
-
-
-@pytest.fixture
-def without_trimesh(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-
-
-def test_collision_meshes_are_left_out_by_name_and_the_rest_stays(tmp_path: Path):
-    scene_graph = SceneGraph()
-    with pytest.warns(GeometryWarning) as told:
-        plant = read(write_panda(tmp_path), scene_graph)
-    (message,) = (str(warning.message) for warning in told)
-    assert all(f"'panda_link{k}.stl'" in message for k in range(8))
-    assert "2 more" in message
-    assert "\n" not in message
-    assert (plant.num_joints(), plant.num_constraints()) == (10, 1)
-    assert count(scene_graph, Role.kProximity) == 0
-    assert count(scene_graph, Role.kIllustration) == 11
-
-
-def test_a_collision_that_drake_can_read_stays(tmp_path: Path):
-    file = write_ur5(tmp_path)
-    (tmp_path / "meshes" / "good.obj").write_text(OBJ)
-    text = file.read_text()
-    file.write_text(text.replace("link.stl", "good.obj", 3))
-    scene_graph = SceneGraph()
-    with pytest.warns(GeometryWarning, match=r"'link\.stl'"):
-        read(file, scene_graph)
-    assert count(scene_graph, Role.kProximity) == 3
-    file.write_text(text.replace("link.stl", "good.obj"))
-    read(file, scene_graph := SceneGraph())
-    assert count(scene_graph, Role.kProximity) == 7
-
-
-def test_models_of_directives_are_read_so_too(tmp_path: Path):
-    write_panda(tmp_path)
-    (tmp_path / "cell.dmd.yaml").write_text(
-        "directives:\n"
-        + "".join(
-            f"- add_model: {{name: {name}, file: "
-            "'package://panda_description/urdf/panda.urdf'}\n"
-            f"- add_weld: {{parent: world, child: '{name}::panda_link0'}}\n"
-            for name in ("left", "right")
-        )
-    )
-    scene_graph = SceneGraph()
-    with pytest.warns(GeometryWarning, match=r"'panda_link0\.stl'"):
-        plant = read(tmp_path / "cell.dmd.yaml", scene_graph)
-    assert plant.HasModelInstanceNamed("left")
-    assert plant.num_joints() == 22
-    assert count(scene_graph, Role.kIllustration) == 22
-
-
-@pytest.mark.usefixtures("without_trimesh")
-def test_what_meshcat_cannot_draw_is_named(tmp_path: Path):
-    file = write_ur5(tmp_path)
-    text = file.read_text().replace("link.dae", "link.stl")
-    file.write_text(text.replace("<collision>", "<!--").replace("</collision>", "-->"))
-    with pytest.warns(GeometryWarning, match=r"'link\.stl'"):
-        read(file, SceneGraph())
 
 
 @pytest.mark.parametrize(
@@ -175,36 +114,6 @@ def test_shapes_of_size_0_are_left_out(kind: str, shape: str, tmp_path: Path):
     with pytest.warns(GeometryWarning, match="'a'"):
         read(tmp_path / f"robot.{kind}", scene_graph)
     assert scene_graph.model_inspector().num_geometries() == 0
-
-
-MJCF = """<mujoco model="arm"><compiler meshdir="assets"/>
-<asset><mesh name="upper" file="upper.stl"/><mesh file="lower.obj"/>
-<!-- <mesh name="old" file="old.stl"/> --></asset>
-<worldbody><body name="a"><inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>
-<joint name="j1" axis="0 1 0"/><geom type="mesh" mesh="upper"/>
-<body name="b" pos="0 0 0.4"><inertial pos="0 0 0.2" mass="2" diaginertia="0.1 0.2 0.1"/>
-<joint name="j2" axis="0 1 0"/><geom type="mesh" mesh="lower"/></body></body></worldbody>
-</mujoco>"""
-
-
-@pytest.mark.usefixtures("without_trimesh")
-def test_meshes_of_mjcf_are_left_out_unless_a_mass_is_that_of_one(tmp_path: Path):
-    (tmp_path / "assets").mkdir()
-    (tmp_path / "assets" / "upper.stl").write_bytes(binary_stl())
-    (tmp_path / "assets" / "lower.obj").write_text(OBJ)
-    file = tmp_path / "arm.xml"
-    file.write_text(MJCF)
-    scene_graph = SceneGraph()
-    with pytest.warns(GeometryWarning, match=r"'upper\.stl'"):
-        plant = read(file, scene_graph)
-    assert [plant.GetBodyByName(name).default_mass() for name in "ab"] == [1.0, 2.0]
-    assert count(scene_graph, Role.kProximity) == 1
-    weighed = '<compiler inertiafromgeom="true"'
-    lighter = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>'
-    for old, new in (("<compiler", weighed), (lighter, "")):
-        file.write_text(MJCF.replace(old, new))
-        with pytest.raises(ModelError, match=r"'a'.*upper\.stl"):
-            read(file, SceneGraph())
 
 
 def box_of_collada(file: Path, unit: float) -> None:

@@ -72,39 +72,6 @@ def test_a_package_in_ros_package_path_is_found(tmp_path: Path, monkeypatch):
     assert joints(tmp_path, file) == 7
 
 
-def test_the_file_itself_may_be_in_ros_package_path(tmp_path: Path, monkeypatch):
-    write_panda(tmp_path)
-    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))
-    assert joints(tmp_path, "package://panda_description/urdf/panda.urdf") == 7
-
-
-def test_a_folder_in_ros_package_path_has_the_name_that_files_use(tmp_path: Path, monkeypatch):
-    """As in the package example-robot-data, whose package.xml has another name."""
-    write_panda(tmp_path)
-    package = tmp_path / "panda_description" / "package.xml"
-    package.write_text("<package><name>another</name></package>", "utf-8")
-    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path))
-    assert joints(tmp_path, "package://panda_description/urdf/panda.urdf") == 7
-
-
-def test_packages_of_the_scenario_come_first(tmp_path: Path):
-    """The meshes of the file's own package are no more: those of the named one are read."""
-    write_panda(tmp_path)
-    (tmp_path / "panda_description" / "meshes").rename(tmp_path / "meshes")
-    with pytest.warns(GeometryWarning, match=r"panda_link1\.dae"):
-        drawn(tmp_path, "panda_description/urdf/panda.urdf")
-    file = "panda_description/urdf/panda.urdf"
-    assert drawn(tmp_path, file, panda_description=str(tmp_path)) == 11
-
-
-def test_a_package_in_ament_prefix_path_is_found(tmp_path: Path, monkeypatch):
-    file = away(tmp_path)
-    (tmp_path / "share").mkdir()
-    (tmp_path / "workspace" / "panda").rename(tmp_path / "share" / "panda_description")
-    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/none:{tmp_path}")
-    assert drawn(tmp_path, file) == 11
-
-
 def test_directives_name_packages_by_files_in_packages(tmp_path: Path, monkeypatch):
     write_panda(tmp_path)
     cell = tmp_path / "cell"
@@ -124,13 +91,6 @@ def test_geometry_of_an_unknown_package_is_left_out_with_the_key(tmp_path: Path)
     with pytest.warns(GeometryWarning, match=r"robot\.packages.*'package://panda_description/"):
         assert drawn(tmp_path, file) == 3 * 11  # Crosses.
     assert drawn(tmp_path, file, panda_description=str(tmp_path / "workspace/panda")) == 11
-
-
-def test_a_folder_without_a_package_xml_is_no_package(tmp_path: Path):
-    """A file from a stranger must not make a package of whatever lies near it."""
-    write_panda(tmp_path)
-    (tmp_path / "panda_description" / "package.xml").unlink()
-    assert drawn(tmp_path, "panda_description/urdf/panda.urdf") == 3 * 11
 
 
 @pytest.mark.parametrize(

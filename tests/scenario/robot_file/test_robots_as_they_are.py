@@ -1,20 +1,18 @@
 """Robots whose files Drake refuses or reads otherwise than their authors mean them."""
 
 import warnings
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.geometry import Mesh, Role, SceneGraph
+from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RotationalInertia
 from scipy.optimize import minimize
-from vendors import binary_stl, joint, link, robot
+from vendors import joint, link, robot
 
-from drake_dae import load_scenario
 from drake_dae.errors import ModelError, RobotFileWarning, ScenarioError
 from drake_dae.scenario.robot_file.changes import change_robot
 from drake_dae.scenario.robot_file.mending import nearest_inertia
@@ -83,31 +81,6 @@ def test_an_mjcf_body_of_mass_0_weighs_nothing_and_neither_does_its_geometry(par
     np.testing.assert_allclose(mass_matrix(plant), mass_matrix(other), rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
-@pytest.mark.parametrize("has_trimesh", [True, False])
-def test_a_base_that_stands_needs_no_mass_and_a_link_has_that_of_its_mesh(
-    has_trimesh, tmp_path, monkeypatch
-):
-    """The tetrahedron of 0.1 m has the volume 1e-3 / 6 m^3, of 1000 kg/m^3 in MuJoCo."""
-    if not has_trimesh:
-        monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
-    (tmp_path / "part.stl").write_bytes(binary_stl())
-    mesh = '<asset><mesh name="part" file="part.stl"/></asset><worldbody>'
-    base = '<geom type="mesh" mesh="part"/>'
-    text = MJCF.format(base=base, mark=NOTHING).replace("<worldbody>", mesh)
-    plant = plant_of(written(tmp_path, text, "arm.xml"))
-    other = drakes(MJCF.format(base="", mark=LIGHT), ".xml")
-    np.testing.assert_allclose(mass_matrix(plant), mass_matrix(other), rtol=1e-10, atol=1e-12)
-    moving = text.replace(NOTHING, "").replace('<geom type="sphere" size="0.05"/>', base)
-    file = written(tmp_path, moving, "arm.xml")
-    if has_trimesh:
-        mass = plant_of(file).GetBodyByName("mark").default_mass()
-        assert mass == pytest.approx(1000 * 1e-3 / 6, rel=1e-6)
-    else:
-        with pytest.raises(ModelError, match=r"'mark' .*'part\.stl'"):
-            plant_of(file)
-
-
 @pytest.mark.parametrize("name", ["arm.urdf", "arm.xml"])
 def test_a_joint_that_moves_no_mass_is_named(name, tmp_path):
     texts = {
@@ -129,29 +102,6 @@ def test_a_joint_that_moves_no_mass_is_named(name, tmp_path):
     )
     with pytest.raises(ScenarioError, match=r"robot\.file: .*j2\b.*lower"):
         robot_links(own, SceneGraph())
-
-
-def test_a_point_mass_moves_by_both_joints_though_not_where_the_arm_is_straight(tmp_path):
-    """|M(q)| = (m l^2 sin q_2)^2 of a mass m at the end of two links of l without mass."""
-    mass = '<inertial><origin xyz="0 0 0.4"/><mass value="2"/><inertia {}/></inertial>'
-    none = " ".join(f'{key}="0"' for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
-    parts = [
-        link("base", 1),
-        '<link name="upper"/>',
-        f'<link name="lower">{mass.format(none)}</link>',
-        joint("j1", "base", "upper", "0 1 0"),
-        joint("j2", "upper", "lower", "0 1 0", (0.0, 0.0, 0.4)),
-    ]
-    file = written(tmp_path, robot("arm", *parts))
-    links, _ = robot_links(
-        Robot(str(file), base=RobotPlacement("base"), actuators="all"), SceneGraph()
-    )
-    plant = links.plant
-    context = plant.CreateDefaultContext()
-    for bend in (0.0, 0.7):
-        plant.SetPositions(context, [0.3, bend])
-        found = np.linalg.det(plant.CalcMassMatrix(context))
-        assert found == pytest.approx((2.0 * 0.4**2 * np.sin(bend)) ** 2, abs=1e-12)
 
 
 # Limits.
@@ -194,17 +144,6 @@ def test_limits_that_leave_no_room_are_left_out_where_the_scenario_says_so(kind,
     if low > high:
         with pytest.raises(ModelError, match=r"'j'.*1 .*-1.*empty_limits"):
             plant_of(file)
-
-
-@pytest.mark.parametrize("gear", [1.0, 50.0, -20.0])
-def test_a_limit_of_an_mjcf_motor_is_that_of_its_joint(gear, tmp_path):
-    """In MuJoCo the joint feels gear times the control."""
-    motor = f'<actuator><motor name="m" joint="j1" gear="{gear}" ctrllimited="true" '
-    text = MJCF.format(base="", mark="").replace(
-        "</worldbody>", f'</worldbody>{motor} ctrlrange="-2 2"/></actuator>'
-    )
-    plant = plant_of(written(tmp_path, text, "arm.xml"))
-    assert plant.GetJointActuatorByName("m").effort_limit() == 2.0 * abs(gear)
 
 
 # Inertias.
@@ -284,73 +223,7 @@ def test_an_impossible_inertia_is_named_and_the_nearest_taken(name, entries, is_
         plant_of(file, **own)
 
 
-def test_a_negative_mass_is_refused_with_its_link(tmp_path):
-    text = robot("r", link("base", 1), link("arm", -2), joint("j", "base", "arm", "0 0 1"))
-    with pytest.raises(ModelError, match=r"'arm'.*-2"):
-        plant_of(written(tmp_path, text), leave_out=["inertia"])
-
-
-@pytest.mark.parametrize("name", ["robot.urdf", "robot.sdf"])
-def test_a_mass_of_0_has_no_inertia(name, tmp_path):
-    text = BODIES[name].format(1, 1, 1, 0, 0, 0).replace('value="2"', 'value="0"')
-    file = written(tmp_path, text.replace("<mass>2</mass>", "<mass>0</mass>"), name)
-    with pytest.raises(ModelError, match=r"'arm'.*\(1, 1, 1\)"):
-        plant_of(file, base=RobotPlacement("arm"))
-    with pytest.warns(RobotFileWarning, match="'arm'"):
-        plant = plant_of(file, base=RobotPlacement("arm"), leave_out=["inertia"])
-    assert plant.GetBodyByName("arm").default_mass() == 0.0
-
-
 # What a URDF means.
-
-GREY = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
-BOX = "<visual><geometry><box size='1 1 1'/></geometry>{}</visual></link>"
-
-
-def colours(folder: Path, *materials: str, top: str = "") -> list[float]:
-    """The first component of the colours of links with materials, in their order."""
-    links = [link(f"l{k}", 1).replace("</link>", BOX.format(m)) for k, m in enumerate(materials)]
-    joints = [joint(f"j{k}", "l0", f"l{k}", "0 0 1") for k in range(1, len(materials))]
-    file = written(folder, robot("r", *links, *joints, top))
-    scene_graph = SceneGraph()
-    plant = plant_of(file, scene_graph, base=RobotPlacement("l0"))
-    inspector = scene_graph.model_inspector()
-    found = []
-    for k in range(len(materials)):
-        frame = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName(f"l{k}").index())
-        (geometry,) = inspector.GetGeometries(frame, Role.kIllustration)
-        properties = inspector.GetProperties(geometry, Role.kIllustration)
-        has_colour = properties.HasProperty("phong", "diffuse")
-        colour = properties.GetProperty("phong", "diffuse") if has_colour else None
-        found.append(-1.0 if colour is None else colour.r())
-    return found
-
-
-def test_a_material_has_the_colour_that_its_name_has_anywhere(tmp_path):
-    bare, white = '<material name="grey"/>', GREY.replace("0.5", "1.0")
-    assert colours(tmp_path, bare, bare, GREY) == [0.5] * 3
-    assert colours(tmp_path, bare, GREY, white) == [0.5] * 3
-    assert colours(tmp_path, bare, white, top=GREY) == [1.0] * 2
-    assert colours(tmp_path, '<material name="none"/>', GREY) == [-1.0, 0.5]
-
-
-def test_a_fixed_joint_mimics_nothing_and_a_transmission_to_no_joint_drives_nothing(tmp_path):
-    arm = joint("a", "base", "arm", "0 0 1")
-    hand = (
-        '<joint name="b" type="fixed"><parent link="arm"/><child link="hand"/>'
-        '<mimic joint="a" multiplier="2"/></joint>'
-    )
-    drive = (
-        '<transmission name="t{0}"><type>transmission_interface/SimpleTransmission</type>'
-        '<joint name="{0}"/><actuator name="motor"/></transmission>'
-    )
-    links = [link(name, 1) for name in ("base", "arm", "hand", "tool")]
-    more = joint("c", "hand", "tool", "0 1 0")
-    drives = "".join(drive.format(name) for name in ("a", "gone", "c"))
-    plant = plant_of(written(tmp_path, robot("r", *links, arm, hand, more, drives)))
-    assert plant.num_constraints() == 0
-    found = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
-    assert [(one.name(), one.joint().name()) for one in found] == [("motor", "a"), ("motor_2", "c")]
 
 
 @pytest.mark.parametrize(
@@ -371,34 +244,6 @@ def test_what_drake_cannot_read_is_reported_with_what_to_do(name, text, words, t
 
 
 # Meshes.
-
-
-@pytest.mark.parametrize("name", ["robot.urdf", "robot.sdf", "robot.xml"])
-def test_a_mesh_that_meshcat_does_not_draw_is_drawn_where_trimesh_is(name, tmp_path):
-    (tmp_path / "part.stl").write_bytes(binary_stl())
-    visual = (
-        "<visual name='v'><geometry><mesh><uri>part.stl</uri></mesh></geometry></visual></link>"
-    )
-    texts = {
-        "robot.urdf": robot("r", link("arm", 1, "part.stl")),
-        "robot.sdf": BODIES["robot.sdf"].format(1, 1, 1, 0, 0, 0).replace("</link>", visual),
-        "robot.xml": BODIES["robot.xml"]
-        .format(1, 1, 1, 0, 0, 0)
-        .replace("<worldbody>", '<asset><mesh file="part.stl"/></asset><worldbody>')
-        .replace("</body>", '<geom type="mesh" mesh="part" contype="0" conaffinity="0"/></body>'),
-    }
-    scene_graph = SceneGraph()
-    plant_of(written(tmp_path, texts[name], name), scene_graph, free=["arm"])
-    inspector = scene_graph.model_inspector()
-    (geometry,) = inspector.GetAllGeometryIds(Role.kIllustration)
-    shape = inspector.GetShape(geometry)
-    assert isinstance(shape, Mesh)
-    lines = Counter(
-        line.split()[0] for line in Path(shape.source().path()).read_text().splitlines()
-    )
-    assert lines == {"v": 4, "vn": 4, "f": 4}
-    box = inspector.GetObbInGeometryFrame(geometry)
-    assert np.all(box.half_width() <= 0.1)
 
 
 # Where robots stand.
@@ -515,25 +360,7 @@ def test_a_floating_joint_moves_as_drakes_quaternion_does(name, tmp_path):
         np.testing.assert_allclose(*found, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", FLOATING)
-def test_a_floating_joint_can_be_welded(name, tmp_path):
-    plant = plant_of(written(tmp_path, FLOATING[name], name), base=RobotPlacement("hull"))
-    assert plant.num_velocities() == 1
-    links, _ = robot_links(
-        Robot(str(tmp_path / name), base=RobotPlacement("hull"), actuators="all"), SceneGraph()
-    )
-    assert [signal.name for signal in links.position_signals] == ["a"]
-
-
 # A robot in the place of a scenario.
-
-
-@pytest.mark.parametrize("name", [*HELD, "two.dmd.yaml"])
-def test_a_robot_in_the_place_of_a_scenario_is_reported(name, tmp_path):
-    text = HELD.get(name) or TWO.format(written(tmp_path, HELD["arm.urdf"], "arm.urdf"))
-    file = written(tmp_path, text, name)
-    with pytest.raises(ScenarioError, match="drake-dae new"):
-        load_scenario(file)
 
 
 # MJCF with defaults.

@@ -3,7 +3,7 @@
 import casadi as ca
 import pytest
 
-from drake_dae.analysis.report import Analysis, Finding
+from drake_dae.analysis import Analysis, Finding
 from drake_dae.dae import DaeSystem, find_structure
 from drake_dae.errors import AssumptionError
 

@@ -6,12 +6,7 @@ import pytest
 
 from drake_dae import DaeSystem
 from drake_dae.dae import IdentifiedTerms, Parameter
-from drake_dae.systems.observing.parameter_filter import (
-    FADING,
-    ParameterFilter,
-    Sampled,
-    _pushes,
-)
+from drake_dae.systems.observing.parameters import FADING, ParameterFilter, _pushes
 
 RATE, PERIOD, PLACE = 20.0, 0.002, 3e-3
 
@@ -26,20 +21,13 @@ def filter_of(place, distance):
     motion = dict.fromkeys(("momentum", "drift", "inputs"), still)
     terms = IdentifiedTerms.of(body, (place,), motion, {"constraint_input": force})
     size = place.value.size
-    estimator = ParameterFilter(terms, np.zeros(size), 1.0, 1, RATE, PERIOD)
-    memory, zero = estimator.memory, ca.SX.zeros(1, 1)
-    gap = distance(memory.values[:size], x)
-    sample = Sampled(
-        *3 * (ca.SX.zeros(1, size),),
-        *(ca.SX(1, 0), gap, ca.jacobian(gap, memory.values)[:, :size]),
-        *(ca.hessian(gap, memory.values)[0][:size, :size], force),
-        is_closed=force > 0.5,
-        inertia=ca.SX.ones(1, 1),
-        hold=zero,
-    )
-    regressor = estimator.regressor(sample)
-    after, _ = estimator.after(sample, regressor, zero, ca.SX(0, 1), zero)
-    return estimator, ca.Function("step", [memory.column, x, force], [after])
+    estimator, theta = ParameterFilter(terms, 0, 1.0, RATE, PERIOD), ca.SX.sym("theta", size)
+    gap = distance(theta, x)
+    gaps = gap, ca.jacobian(gap, theta), ca.hessian(gap, theta)[0]
+    still, one = (ca.SX.zeros(1, 1), ca.SX.zeros(1, size)), ca.SX.ones(1, 1)
+    held = estimator.after(theta, *still, one, gaps, force, force > 0.5, one)
+    after = ca.vertcat(theta + held[:size], held)
+    return estimator, ca.Function("step", [ca.vertcat(theta, estimator.held), x, force], [after])
 
 
 def filter_of_a_wall():
@@ -51,10 +39,12 @@ def filter_of_a_wall():
 def found(filter_and_step, times, states, forces):
     """The place and the compliances after samples."""
     estimator, step = filter_and_step
-    state = ca.DM(estimator.start)
+    size = estimator.change.numel()
+    state = ca.DM([*np.zeros(size), *estimator.start])
     for time in times:
         state = step(state, states(time), forces(time))
-    return state[estimator.memory.parts["values"]].full().ravel()
+    values = state.full().ravel()
+    return np.array([*values[:size], *values[2 * size : 2 * size + 2]])
 
 
 def found_place(depth):
@@ -145,11 +135,12 @@ def test_what_was_measured_fades_while_nothing_touches():
     From a hundredth of the bounds' deviation: 0.0165 of it after F, 0.12 after 5 F.
     """
     estimator, step = filter_of_a_wall()
-    state, part = ca.DM(estimator.start), estimator.memory.parts["covariance"]
-    least, prior = 1e-4, estimator.prior[0] ** 2
-    state[part.start] = least * prior
+    state = ca.DM([0.0, *estimator.start])
+    least, prior, place = 1e-4, 0.02**2 / 12.0, 1 + 1 + 2  # After theta, change, compliances.
+    assert float(state[place]) == pytest.approx(prior)
+    state[place] = least * prior
     after = step.mapaccum("run", round(FADING / PERIOD))
     for times in (1, 5):
         run = after if times == 1 else step.mapaccum("long", round(times * FADING / PERIOD))
-        left = float(run(state, ca.DM([0.0, 0.0]), 0.0)[part.start, -1]) / prior
+        left = float(run(state, ca.DM([0.0, 0.0]), 0.0)[place, -1]) / prior
         assert left == pytest.approx(1.0 / (1.0 + (1.0 / least - 1.0) * np.exp(-times)), rel=1e-3)

@@ -1,0 +1,393 @@
+"""Examines one system and reports what the theory says about it: `analyze`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drake_dae.analysis.report import Analysis, Assumption, Finding
+from drake_dae.analysis.tables import count_of
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray, check_whole_number, numbers, unknown_name
+from drake_dae.dae import (
+    ConstraintStructure,
+    DaeSystem,
+    Manifold,
+    RankMargin,
+    Region,
+    Stability,
+    Structure,
+    Violation,
+    ZeroDynamics,
+    why_no_law,
+)
+from drake_dae.dae.margins import ContactMargins, find_margin, is_regular
+from drake_dae.dae.samples import Samples
+from drake_dae.dae.structure import (
+    check_system,
+    constraint_violation,
+    control_violation,
+    examine_constraints,
+    examine_outputs,
+)
+from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
+from drake_dae.references import Reference
+
+STATEMENTS = (
+    "v acts on y_i first in derivative r_i",
+    "A(x) has rank m, so v can enforce all constraints",
+    "u does not act on y_i before derivative r_i",
+    "u acts on z_i first in derivative mu_i",
+    "B(x) has rank p, so u can control all outputs",
+)
+"""Assumptions (1) to (5), in a line each."""
+
+COUNT, SEED = 50, 0
+"""The number of random states that are examined by default, and the seed of their numbers."""
+
+NEIGHBOURS = 5
+"""How many states are added close to the first given one, which may be a zero of a function."""
+
+Bounds = Mapping[str, tuple[float, float]]
+"""A region: state name -> (lowest, highest)."""
+
+
+@checked(ModelError)
+def analyze(
+    system: DaeSystem,
+    *,
+    region: Bounds | None = None,
+    states: ArrayLike | None = None,
+    reference: Callable[[float], FloatArray] | None = None,
+    times: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    period: float | None = None,
+    exogenous: Sequence[Reference] = (),
+    count: int = COUNT,
+    seed: int = SEED,
+) -> Analysis:
+    """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, also along a reference.
+
+    Numbers are decided at consistent states with the default parameters: at those given, or at
+    random ones in a region or around `system.nominal_state`. Degrees must be the same for all
+    numbers that parameters may have, see `DaeSystem.with_bounds`. A determinant that changes its
+    sign between the first state and another one is zero on the way. From the worst of the random
+    ones the smallest singular values of A(x) and B(x) are also followed downhill, inside the region
+    or the box that the random states span, so that a singular state between them is found as a
+    rule. There is no proof that none was missed.
+
+    Where friction acts on contacts that can only push, the margin of A(x) is that without friction,
+    and the sign of `contact_margin` shows how far friction is from the Painleve paradox, with the
+    critical coefficients; the same along a reference.
+
+    Args:
+        system: The system (1)-(3).
+        region: State name -> (lowest, highest); other states are drawn around the nominal one.
+        states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
+            few others close to the first, since an expression may vanish at a single state.
+        reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
+            the motion that it commands, and the zero dynamics judged at its first outputs.
+        times: Times in s at which the reference is examined, increasing, shape (k,).
+        start: State near which the motion along the reference starts, shape (n,); the first
+            examined state if None; only with a reference.
+        period: The period of the reference and of the exogenous signals, in s; the zero dynamics
+            are then also judged along the reference.
+        exogenous: The references of the exogenous signals; all else is examined with
+            these signals at rest at their parameters' values.
+        count: The number of random states.
+        seed: The seed of the random numbers.
+
+    Returns:
+        The report. An assumption that is violated is part of it, with what is known before.
+
+    Raises:
+        InconsistentStateError: There is no consistent state in the region or around the nominal
+            state, or given states are not consistent.
+        ModelError: Arguments make no sense, or the system has a function that is not finite, or a
+            mass matrix that is not symmetric and positive definite.
+    """
+    if region is not None and states is not None:
+        raise ModelError(f"{system.name}: give a region or states, not both")
+    if (reference is None) != (times is None):
+        raise ModelError(f"{system.name}: a reference needs times, and times need a reference")
+    for name, value in (("start", start), ("period", period)):
+        if value is not None and reference is None:
+            raise ModelError(f"{system.name}: {name} is that of a reference, and none is given")
+    check_whole_number(f"{system.name}: count", count, 1)
+    check_whole_number(f"{system.name}: seed", seed, 0)
+    random = np.random.default_rng(seed)
+    chosen = (
+        ExaminedStates.drawn(system, region, count, random)
+        if states is None
+        else ExaminedStates.given(system, states, random)
+    )
+    analysis = examine(system, chosen)
+    if reference is None or times is None:
+        return _at_rest(analysis)
+    return along(analysis, reference, times, start, period, exogenous)
+
+
+def examine(system: DaeSystem, chosen: ExaminedStates | None = None) -> Analysis:
+    """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics."""
+    if chosen is None:
+        chosen = ExaminedStates.drawn(system, None, COUNT, np.random.default_rng(SEED))
+    given_states = chosen.guesses[: chosen.num_given]
+    try:
+        check_system(system)
+        constrained, around = examine_constraints(system, chosen.guesses, chosen.region)
+    except AssumptionError as error:
+        where = chosen.describe(len(chosen.guesses), "state")
+        tried = given_states if chosen.num_given else chosen.guesses
+        return Analysis(system, where, tried, _assumptions((), [error.violation]))
+    except InconsistentStateError as error:
+        if chosen.region is None:
+            raise
+        raise InconsistentStateError(
+            f"{system.name}: no consistent state found with {chosen.describe_region()}; choose "
+            "another region",
+            error.residual,
+        ) from error
+    samples = around
+    if chosen.num_given:
+        # Degrees are decided also at states around them, margins only at them.
+        samples = Samples(around.manifold, given_states)
+        _check_consistent(samples.manifold, given_states, samples.states)
+    where = chosen.describe(len(samples.states), "consistent state")
+    analysis = _examine(constrained, around, samples, where, search=not chosen.num_given)
+    return replace(analysis, region=chosen.region)
+
+
+def _at_rest(analysis: Analysis) -> Analysis:
+    """Adds the zero dynamics at rest, where there is a structure."""
+    if analysis.structure is None:
+        return analysis
+    dynamics, states = ZeroDynamics(analysis.system, structure=analysis.structure), analysis.states
+    stability = dynamics.stability(states[0])
+    equilibria = _equilibria(dynamics, stability, states, None)
+    return replace(analysis, zero_dynamics=stability, equilibria=equilibria)
+
+
+def along(
+    analysis: Analysis,
+    reference: Callable[[float], FloatArray],
+    times: ArrayLike,
+    start: ArrayLike | None,
+    period: float | None,
+    exogenous: Sequence[Reference],
+) -> Analysis:
+    """Adds what `analyze` says along a reference, where there is a structure."""
+    system, states, structure = analysis.system, analysis.states, analysis.structure
+    if structure is None:
+        return analysis
+    dynamics = ZeroDynamics(system, structure=structure)
+    guess = states[0] if start is None else start
+    motion = dynamics.motion(reference, times, guess, exogenous=exogenous)
+    rest, outputs = states[0], None
+    if motion.times.size:
+        # The state does not determine outputs with mu_i = 0: they are taken from the start of the
+        # reference.
+        rest = motion.states[0]
+        outputs = structure.layout.values(reference(float(motion.times[0])))
+    stability = dynamics.stability(rest, outputs=outputs)
+    stability_along = None
+    if dynamics.dimension and period is not None:
+        stability_along = dynamics.stability_along(reference, motion, period, exogenous=exogenous)
+    contact_margin_along = None
+    if system.frictional_contacts and motion.times.size:
+        contacts = ContactMargins(system, structure.elimination.constraint_matrix)
+        contact_margin_along = contacts.along(motion.times, motion.states, motion.parameters)
+    return replace(
+        analysis,
+        motion=motion,
+        contact_margin_along=contact_margin_along,
+        zero_dynamics=stability,
+        equilibria=_equilibria(dynamics, stability, states, outputs),
+        zero_dynamics_along=stability_along,
+    )
+
+
+def _equilibria(
+    dynamics: ZeroDynamics, stability: Stability, states: FloatArray, outputs: FloatArray | None
+) -> tuple[Stability, ...]:
+    """Returns the verdicts on all equilibria with the same outputs, the judged one first."""
+    if not dynamics.dimension:
+        return ()
+    judged: tuple[Stability, ...] = ()
+    if stability.state is not None and len(dynamics.equilibria([stability.state], None, outputs)):
+        judged, states = (stability,), np.vstack([stability.state, states])
+    others = dynamics.equilibria(states, outputs=outputs)[len(judged) :]
+    return (*judged, *(dynamics.stability(state, outputs=outputs) for state in others))
+
+
+def _examine(
+    constrained: ConstraintStructure, around: Samples, samples: Samples, where: str, search: bool
+) -> Analysis:
+    """Examines degrees at some samples and margins at others, without zero dynamics."""
+    system, elimination = samples.system, constrained.elimination
+    results: dict[str, Any] = {"constraint_degrees": constrained.constraint_degrees}
+    margins: dict[int, RankMargin] = {}
+    violations: list[Violation] = []
+    satisfied, regular = {1, 2, 3}, True
+
+    def judge(margin: RankMargin, violation: Violation | None, number: int) -> None:
+        if violation:
+            violations.append(violation)
+            satisfied.difference_update({violation.assumption, number})
+        margins[violation.assumption if violation else number] = margin
+
+    if constrained.constraint_margin is not None:
+        matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
+        margin = find_margin(samples, matrix, search=search)
+        constrained = replace(constrained, constraint_margin=margin)
+        judge(margin, constraint_violation(constrained), 2)
+        regular = is_regular(samples, matrix)
+    if regular:
+        results["constraint_structure"] = constrained
+        if system.frictional_contacts:
+            margins_of_contacts = ContactMargins(system, elimination.constraint_matrix)
+            results["contact_margin"] = margins_of_contacts.over(samples, search)
+    without_law = why_no_law(system)
+    if regular and not without_law:
+        try:
+            structure = examine_outputs(constrained, around)
+        except AssumptionError as error:
+            violations.append(error.violation)
+        else:
+            matrix = structure.control_matrix
+            satisfied |= {4, 5}
+            margin = find_margin(samples, matrix, structure.round_off, search)
+            structure = replace(structure, control_margin=margin)
+            judge(margin, control_violation(structure), 5)
+            results |= {
+                "output_degrees": structure.output_degrees,
+                "independence": _independence(structure, samples),
+            }
+            if is_regular(samples, matrix, structure.round_off):
+                results["structure"] = structure
+    assumptions = _assumptions(satisfied, violations, margins, without_law)
+    return Analysis(system, where, samples.states, assumptions, **results)
+
+
+def _assumptions(
+    satisfied: Container[int],
+    violations: Sequence[Violation],
+    margins: Mapping[int, RankMargin] | None = None,
+    not_examined: str = "",
+) -> tuple[Assumption, ...]:
+    """Returns Assumptions (1)-(5); those neither satisfied nor violated were not examined."""
+    violated = {violation.assumption: violation for violation in violations}
+    before = f"Assumption ({violations[0].assumption}) is violated" if violations else not_examined
+    result = []
+    for number, statement in enumerate(STATEMENTS, start=1):
+        if number in violated:
+            finding, reason = Finding.VIOLATED, str(violated[number])
+        elif number in satisfied:
+            finding, reason = Finding.SATISFIED, ""
+        else:
+            finding, reason = Finding.NOT_EXAMINED, before
+        margin = (margins or {}).get(number)
+        violation = violated.get(number)
+        result.append(Assumption(number, statement, finding, margin, reason, violation))
+    return tuple(result)
+
+
+def _independence(structure: Structure, samples: Samples) -> RankMargin | None:
+    """Returns the margin of the row vectors of Theorem 2.1."""
+    functions = ca.vertcat(structure.manifold.residual_expression, structure.chain)
+    if not functions.numel():
+        return None
+    return find_margin(samples, ca.jacobian(functions, structure.system.state))
+
+
+@dataclass(frozen=True, eq=False)
+class ExaminedStates:
+    """The states that an analysis starts from: random ones, or those given and some beside."""
+
+    guesses: FloatArray
+    num_given: int
+    bounds: Bounds
+    region: Region | None
+
+    @classmethod
+    def drawn(
+        cls, system: DaeSystem, bounds: Bounds | None, count: int, random: np.random.Generator
+    ) -> ExaminedStates:
+        nominal = system.nominal_state
+        drawn = nominal + system.spread_around(nominal) * random.standard_normal(
+            (count, nominal.size)
+        )
+        if bounds is None:
+            return cls(np.vstack([nominal, drawn]), 0, {}, None)
+        region = _box(system, bounds)
+        named = np.isfinite(region.low)
+        low, high = region.low[named], region.high[named]
+        drawn[:, named] = random.uniform(low, high, (count, low.size))
+        guesses = np.vstack([np.clip(nominal, region.low, region.high), drawn])
+        return cls(guesses, 0, bounds, region)
+
+    @classmethod
+    def given(
+        cls, system: DaeSystem, states: ArrayLike, random: np.random.Generator
+    ) -> ExaminedStates:
+        rows = numbers(f"{system.name}: states", states)
+        shape = (len(rows) if rows.ndim else 0, system.num_states)
+        if rows.shape != shape or not rows.size or not np.all(np.isfinite(rows)):
+            raise ModelError(
+                f"{system.name}: states must be finite numbers of shape (k, {system.num_states}), "
+                f"got {states!r}"
+            )
+        around = system.spread_around(rows[0]) * random.standard_normal((NEIGHBOURS, shape[1]))
+        return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows), {}, None)
+
+    def describe(self, count: int, noun: str) -> str:
+        if self.num_given:
+            return f"{count_of(self.num_given, noun)} as given"
+        region = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
+        left_out = len(self.guesses) - count
+        missing = f"; {left_out} more were outside the domain or off N*" if left_out else ""
+        return f"{count_of(count, noun)} {region}{missing}"
+
+    def describe_region(self) -> str:
+        return ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.bounds.items())
+
+
+def _check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:
+    """Checks that the user's states are consistent and inside the domain of the system."""
+    name = manifold.system.name
+    for number, state in enumerate(states):
+        if not manifold.is_consistent(state):
+            residual = manifold.residual(state)
+            worst = int(np.argmax(np.abs(residual)))
+            raise InconsistentStateError(
+                f"{name}: states[{number}] is not consistent: "
+                f"{manifold.residual_signals[worst].name} = {residual[worst]:.3g}; project it, for "
+                "example with `find_structure(system).manifold.project`",
+                residual,
+            )
+        near = 1e-4 * np.maximum(np.abs(state), np.abs(projected).max(axis=0))
+        if not np.any(np.all(np.abs(projected - state) <= near, axis=1)):
+            raise ModelError(
+                f"{name}: states[{number}] is outside the domain: functions of (1)-(3) are not "
+                "finite there"
+            )
+
+
+def _box(system: DaeSystem, bounds: Bounds) -> Region:
+    low, high = np.full(system.num_states, -np.inf), np.full(system.num_states, np.inf)
+    names = [signal.name for signal in system.state_signals]
+    for name, interval in bounds.items():
+        if name not in names:
+            raise ModelError(f"{system.name}: region: {unknown_name('state', name, names)}")
+        pair = numbers(f"{system.name}: region: the bounds of '{name}'", interval)
+        if pair[0] > pair[1]:
+            raise ModelError(
+                f"{system.name}: region: '{name}' needs the lowest and the highest value, got "
+                f"{interval!r}"
+            )
+        low[names.index(name)], high[names.index(name)] = pair
+    return Region(low, high)

@@ -1,0 +1,373 @@
+"""`drake-dae simulate`, `plot` and `play`: runs, and pictures of the folders that they leave."""
+
+import argparse
+import os
+import shlex
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from datetime import datetime
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context
+
+import drake_dae
+from drake_dae.commands.parser import (
+    Parser,
+    check_folder,
+    complete,
+    open_page,
+    program,
+    waiting,
+)
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record, RecordAfter, Recorded
+from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
+from drake_dae.files import check_unwritten
+from drake_dae.pictures import ANIMATION, PLOTS
+from drake_dae.pictures.animation import make_animation
+from drake_dae.running.interruption import Interruption, end_at_once, ending_signals
+from drake_dae.running.record_writer import RecordWriter
+from drake_dae.running.simulate import RunStatistics, simulate
+from drake_dae.scenario.build import build_completed, build_scenario
+from drake_dae.scenario.judging import judge_run
+from drake_dae.scenario.rolled import for_rollout, roll_scenario
+from drake_dae.scenario.scenario import Scenario, load_scenario, save_scenario, scenario_data
+from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
+from drake_dae.scenario.start import start_scenario
+from drake_dae.scene.view import start_meshcat
+
+SCENARIO, SUMMARY, RECORD = "scenario.yaml", "summary.txt", "record.npz"
+PART = "record.part"
+"""The record during a run; it remains if the run is killed."""
+
+FILES = (SCENARIO, SUMMARY, RECORD, *PLOTS, ANIMATION)
+"""The files of a run in its folder."""
+
+
+def _simulate_options(parser: Parser) -> None:
+    parser.scenario(DEFAULT_SCENARIO)
+    parser.out("FOLDER", "folder for the results (default: runs/<scenario>-<time>)")
+    parser.flag("--meshcat", "show the robot while it runs, in a browser")
+    parser.flag("--open", "open the animation in a browser at the end")
+    parser.flag("--rollout", "run the whole loop as one function, without Drake's Simulator")
+    parser.flag("--check", "exit code 2 for a run that missed its task")
+    parser.json("print the verdict and the files")
+
+
+def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """Runs a scenario and writes its record, a summary and an animation into a folder.
+
+    The first line of the summary says whether the run is GOOD, BAD or UNDECIDED, and why. A rollout
+    is faster for many runs (see sweep), not for one; its record has every fixed step, or 1000 rows
+    under error control.
+    """
+    # The scenario, and whether its files may be written.
+    path = find_scenario(options.scenario)
+    scenario, remarks = load_scenario(path, options.settings), list[str]()
+    if options.open and not scenario.write.animation:
+        text = "--open shows the animation, so write.animation must be true"
+        raise ScenarioError(("write.animation", text))
+    if options.rollout and options.meshcat:
+        raise ScenarioError(("--meshcat", "leave it out: --rollout shows nothing while it runs"))
+    if options.out is not None:
+        check_folder(options.out)
+        check_unwritten((options.out / name for name in (*FILES, PART)), options.force)
+
+    # The loop at its start.
+    began = time.perf_counter()
+    if options.rollout:
+        scenario, *remarks = for_rollout(scenario)
+    if options.meshcat:
+        rate = scenario.integrator.target_realtime_rate
+        scenario.integrator.target_realtime_rate = rate or 1.0
+    meshcat = start_meshcat() if options.meshcat else None
+    with waiting(f"building {path.stem}"):
+        completed, loop = build_completed(scenario, meshcat)
+        scenario, context = completed.scenario, start_scenario(completed.scenario, loop)
+    notes = [*completed.notes, *filter(None, remarks)]
+    took = f"{path.stem}: built in {time.perf_counter() - began:.2f} s"
+    print(took, *notes, sep="\n", flush=True)
+
+    # The run, in a folder of its own.
+    folder = options.out or _new_folder(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in (*FILES, PART):
+        (folder / file).unlink(missing_ok=True)
+    first_line = f"# Scenario as run by drake-dae {drake_dae.__version__}"
+    save_scenario(scenario, folder / SCENARIO, first_line)
+    recorded: list[RecordAfter] = [lambda after: loop.record(context, after)]
+    statistics, reason, results, problems = None, "", dict[str, Any](), list[str]()
+    about = {"scenario": scenario_data(scenario)}
+    with (
+        _watched(meshcat),
+        RecordWriter(folder / PART, lambda _, after: recorded[0](after), about) as writer,
+    ):
+        look = writer.update if scenario.write.record else lambda context: None
+        try:
+            if options.rollout:
+                statistics = _roll(scenario, loop, context, recorded, look)
+            else:
+                config, may_diverge = scenario.integrator, scenario.judgement.may_diverge
+                statistics = simulate(
+                    *(loop.diagram, context, scenario.duration, config),
+                    progress=True,
+                    look=look,
+                    may_diverge=may_diverge,
+                )
+        except DrakeDaeError as error:
+            reason = str(error)
+            raise
+        except KeyboardInterrupt:
+            reason = "interrupted in the middle of a step"
+            raise
+        finally:  # The files of what has been simulated.
+            record = recorded[0](None)
+            if record.time.size:
+                title = f"{path.stem}: {scenario.description}".removesuffix(": ")
+                made = scenario, loop, context, record, statistics, reason
+                results, problems = _write(*made, writer, folder, title, notes)
+    if options.open and (folder / ANIMATION).is_file():
+        open_page(folder / ANIMATION)
+    told = {"scenario": path.stem, "folder": str(folder), **results}
+    if statistics.interrupted:
+        return 128 + statistics.interrupted, told
+    return 1 if problems else 2 if options.check and results.get("missed") else 0, told
+
+
+def _new_folder(name: str) -> Path:
+    """Makes a folder below runs/ that no other run has."""
+    for i in count(1):
+        folder = Path("runs", name if i == 1 else f"{name}-{i}")
+        with suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            break
+    return folder
+
+
+@contextmanager
+def _watched(meshcat: Meshcat | None) -> Iterator[None]:
+    """Waits on a terminal for somebody who looks, and at the end for Enter: then the view ends."""
+    is_asked = meshcat is not None and sys.stdin is not None and sys.stdin.isatty()
+    if meshcat is not None:
+        waits = "; the run begins when this page is open" * is_asked
+        print(f"watch at {meshcat.web_url()}{waits}", flush=True)
+    while is_asked and meshcat is not None and not meshcat.GetNumActiveConnections():
+        time.sleep(0.1)
+    yield
+    if is_asked:
+        input("the view stays until you press Enter")
+
+
+def _roll(
+    scenario: Scenario,
+    loop: ClosedLoop,
+    context: Context,
+    recorded: list[RecordAfter],
+    look: Callable[[Context], None],
+) -> RunStatistics:
+    """Runs by `rollout`; `recorded` becomes what it has recorded."""
+    began = time.perf_counter()
+
+    def see(record: RecordAfter) -> bool:
+        recorded[0] = record
+        look(context)
+        return ending.signal is not None
+
+    with ending_signals(ending := Interruption()), waiting("rolling out"):
+        rollout = roll_scenario(scenario, loop, context, look=see)
+    recorded[0] = rollout.record.after
+    if rollout.failure is not None:
+        raise rollout.failure
+    times, wall = rollout.record.time, time.perf_counter() - began
+    simulated = float(times[-1] - times[0]) if times.size else 0.0
+    return RunStatistics(simulated, wall, rollout.steps, ending.signal)
+
+
+def _write(
+    scenario: Scenario,
+    loop: ClosedLoop,
+    context: Context,
+    record: Record,
+    statistics: RunStatistics | None,
+    reason: str,
+    writer: RecordWriter,
+    folder: Path,
+    title: str,
+    notes: Sequence[str],
+) -> tuple[dict[str, Any], list[str]]:
+    """Writes the files and prints the summary; returns the results, and what was not written."""
+    problems, wanted = list[str](), scenario.write
+
+    @contextmanager
+    def attempt(name: str) -> Iterator[Path]:
+        """Other files are written also if this one cannot be."""
+        try:
+            with complete(folder, name) as place:
+                yield place
+        except OSError as error:
+            problems.append(describe_os_error(error))
+
+    # A signal from here on takes effect after the record is written and before the pictures.
+    with ending_signals(ending := Interruption()):
+        summary = judge_run(scenario, loop, context, record, statistics, reason)
+        if wanted.record:
+            outputs = record.signals["tracking_error"].signals
+            predicted = Recorded(loop.predicted_error(record), outputs)
+            signals = {**record.signals, "predicted_error": predicted}
+            with attempt(RECORD) as place:
+                replace(record, signals=signals, about=writer.about).save(place / RECORD)
+            if problems:
+                with suppress(OSError):
+                    writer.finish(context)  # The rows that still fit.
+            else:
+                writer.path.unlink(missing_ok=True)
+        with attempt(SUMMARY) as place:
+            text = "\n".join([summary.text, *notes, ""])
+            (place / SUMMARY).write_text(text, encoding="utf-8")
+    try:
+        if ending.signal is not None:
+            end_at_once(ending.signal)
+        if not reason.startswith("interrupted"):
+            with waiting("drawing"):
+                if wanted.plots:
+                    from drake_dae.pictures.plots import save_plots  # Matplotlib takes a second.
+
+                    with attempt(PLOTS[0]) as place:
+                        save_plots(loop, record, context, place, summary.accuracy)
+                if wanted.animation:
+                    with attempt(ANIMATION) as place:
+                        page = make_animation(loop, record, context, title)
+                        (place / ANIMATION).write_text(page, encoding="utf-8")
+    finally:
+        written = [name for name in (*FILES, PART) if (folder / name).exists()]
+        text, word = summary.text, summary.judgement.outcome.name
+        if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
+            color = {"GOOD": 32, "BAD": 31, "UNDECIDED": 33}[word]
+            text = f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"
+        print(f"{text}\nwritten to {folder}/: {', '.join(written)}", flush=True)
+        if ANIMATION in written:
+            named = shlex.quote(str(folder))
+            plots = "" if wanted.plots else f"; plots: {program()} plot {named} --all"
+            print(f"watch it: {program()} play {named}{plots}", flush=True)
+        print(*(f"error: {line}\n" for line in problems), sep="", end="", file=sys.stderr)
+    return {**summary.data, "files": written}, problems
+
+
+def _plot_options(parser: Parser) -> None:
+    parser.path("runs", "RUN", "a folder of a run, or a record.npz", nargs="+")
+    signals = "what to draw, as wall.force,control (default: all outputs)"
+    parser.repeatable("--signals", "NAMES", signals)
+    parser.flag("--errors", "|z - r| of outputs, over the predicted one")
+    parser.flag("--all", "all plots of each run, into its folder, as write.plots=true does")
+    film = "the robot as it moves, with the paths and the forces of its contacts"
+    parser.flag("--film", f"{film}: a .gif, or a .png for four moments side by side")
+    parser.out("FILE", "a .png, .pdf or .svg (default: plot.png), or the film (film.gif)")
+
+
+def _plot(options: argparse.Namespace) -> int:
+    """Draws outputs of runs with their references, or other signals by name, or makes a film.
+
+    Errors are drawn as predicted beside those measured, all runs in one picture.
+    """
+    from drake_dae.pictures.film import save_film
+    from drake_dae.pictures.plots import plot_runs, save_plots
+
+    runs = options.runs
+    for path in runs:
+        if runs.count(path) > 1:
+            raise ModelError(f"the run '{path}' is named twice; name each run once")
+    if (options.all or options.film) and (
+        options.signals or options.errors or (options.all and (options.film or options.out))
+    ):
+        raise ModelError("--all and --film take no other options, but --film an --out")
+    if options.all:
+        check_unwritten((folder / name for folder in runs for name in PLOTS), options.force)
+        for folder in runs:
+            with waiting(f"drawing {folder}"):
+                again = _run_again(folder)
+                with complete(folder, PLOTS[0]) as place:
+                    save_plots(*again, place)
+            written = [name for name in PLOTS if (folder / name).exists()]
+            print(f"written to {folder}/: {', '.join(written)}")
+        return 0
+    if options.film:
+        if len(runs) > 1:
+            raise ModelError(f"a film is of one run, got {', '.join(map(str, runs))}")
+        path = options.out or runs[0] / "film.gif"
+        check_unwritten([path], options.force)
+        with waiting(f"filming {runs[0]}"):
+            again = _run_again(runs[0])
+            with complete(path.parent, path.name) as place:
+                save_film(*again, place / path.name)
+    else:
+        path = options.out or Path("plot.png")
+        if path.suffix not in (".png", ".pdf", ".svg"):
+            raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
+        check_unwritten([path], options.force)
+        # The whole path is the label where the last part is ambiguous.
+        same = Counter(run.name for run in runs)
+        labels = [run.name if run.name and same[run.name] == 1 else str(run) for run in runs]
+        records = dict(zip(labels, map(_load_record, runs), strict=True))
+        names = [name for text in options.signals for name in text.split(",") if name]
+        figure = plot_runs(records, names, options.errors)
+        with complete(path.parent, path.name) as place:
+            figure.savefig(place / path.name, dpi=110)
+    print(f"written to {path}")
+    return 0
+
+
+def _load_record(path: Path) -> Record:
+    """The record of a run: of its folder, or a file."""
+    names = [name for name in (RECORD, PART) if (path / name).is_file()]
+    if path.is_dir() and not names:
+        raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
+    record = Record.load(path / names[0] if names else path)
+    if not record.time.size:
+        raise ModelError(f"the record in '{path}' has no rows")
+    return record
+
+
+def _run_again(folder: Path) -> tuple[ClosedLoop, Record, Context]:
+    """The loop of the run in a folder, the record of the run, and a context."""
+    if not (folder / SCENARIO).is_file():
+        raise ModelError(f"'{folder}' is no folder of a run: it has no {SCENARIO}")
+    record = _load_record(folder)
+    loop, context = build_scenario(load_scenario(folder / SCENARIO))
+    if missing := loop.record(context).signals.keys() - record.signals.keys():
+        names = ", ".join(sorted(missing))
+        raise ModelError(f"the record in '{folder}' has not the signals of its loop: {names}")
+    return loop, record, context
+
+
+def _play_options(parser: Parser) -> None:
+    parser.path("folder", "RUN", "the folder of a run")
+
+
+def _play(options: argparse.Namespace) -> int:
+    """Opens the animation of a run in the browser."""
+    folder, page = options.folder, options.folder / ANIMATION
+    if not (folder / SCENARIO).is_file():
+        runs = sorted(path.parent for path in folder.parent.glob(f"*/{ANIMATION}"))
+        there = f"; there is {', '.join(map(str, runs))}" if runs else ""
+        raise ModelError(f"'{folder}' is no folder of a run{there}")
+    if not page.is_file():
+        raise ModelError(
+            f"'{folder}' has no {ANIMATION}: a run writes it at its end, unless write.animation is "
+            f"false; `{program()} simulate {folder / SCENARIO}` repeats the run"
+        )
+    open_page(page)
+    return 0
+
+
+COMMANDS = {
+    "simulate": (_simulate_options, _simulate),
+    "plot": (_plot_options, _plot),
+    "play": (_play_options, _play),
+}

@@ -1,0 +1,203 @@
+"""A Kalman filter of a model's parameters, from the disturbance that they leave."""
+
+import casadi as ca
+import numpy as np
+
+from drake_dae.dae import IdentifiedTerms
+
+GAP = 1e-5
+"""The standard deviation of a measured distance to a surface, in m."""
+
+COMPLIANCE = 3e-5, 1e-4
+"""The standard deviations of a contact's unknown compliances c_1 in m/N and c_2 in m/N^(1/2)."""
+
+MEMORY = 100.0
+"""The time in s in which a mass or a friction may move by its range."""
+
+FADING = 10.0
+"""The time in s in which what was measured of a place or a compliance fades. It covers the motion
+along a path and back; with 3 s and with 30 s the places of the tests are as good."""
+
+_SETTLING = 1.0
+"""The time in s in which the size of what no parameter explains is averaged."""
+
+_LEAST = 1e-6
+"""The least share of the start in this size, so that it stays positive."""
+
+
+class ParameterFilter:
+    """Estimates parameters theta with their covariance P, from the disturbance r that is left.
+
+    The true parameters leave r = 0 and, in contact, a depth that the force makes,
+
+        -phi(x) = c_1 lambda + c_2 lambda^(1/2),    c_1, c_2 >= 0.
+
+    A spring has c_1 alone, and a ball on a compliant layer, as in Drake's hydroelastic contact, c_2
+    alone; one of Hertz is between them. With the low-pass filtered regressor Y of the estimator
+
+        r = Y (theta* - theta) + noise,
+        -phi - c_1 lambda - c_2 lambda^(1/2) = dphi/dtheta (theta* - theta) + noise.
+
+    r is scaled by the root of the diagonal of M; its noise is s^2, the mean square of what
+    remained, times the samples in which it does not change, 2 / (k_o T). The noise of a distance
+    has a part from theta: with the second derivatives H of phi the line above is off by delta^T H
+    delta / 2, with the mean square
+
+        (tr H P)^2 / 4 + tr (H P H P) / 2,
+
+    which is 0.7 mm for a plane within 10 mm and 0.15 rad of where it is drawn, and nothing once its
+    place is known. Without it the first samples count for too much, and their errors stay.
+
+    P_0 is the variance of numbers that are equally likely within their bounds. Between samples
+    masses and frictions change: their P returns to P_0 in `MEMORY`. Places and compliances do not
+    change, but what was measured of them fades with the time constant F = `FADING`, since no model
+    of a surface is exact. So the information P^-1 returns to that of the bounds,
+
+        (P^-1)' = (P_0^-1 - P^-1) / F,    P' = (P - P P_0^-1 P) / F.
+
+    theta* is within its bounds, and c_1, c_2 >= 0. After a sample the estimate is projected on the
+    numbers within the bounds of each parameter, and of each contact's compliances, in the metric of
+    P^-1. As they are convex and hold theta*, no projection raises (theta - theta*)^T P^-1 (theta -
+    theta*), and without noise no sample does. To clip a number alone leaves what is correlated with
+    it where it is: in ideal contact the rest then moves away from theta* by a factor of e in 15 ms.
+
+    Args:
+        identified: The parameters.
+        frictions: The number of coefficients of friction, which follow these in theta.
+        largest_friction: Their upper bound.
+        rate: k_o in 1/s.
+        period: The time between samples of the filter in s.
+
+    Attributes:
+        change: The last change of theta, shape (c,).
+        held: All that is held, a column of symbols.
+        start: Its initial value.
+        deviations: The standard deviations of theta, shape (c,).
+    """
+
+    def __init__(
+        self,
+        identified: IdentifiedTerms,
+        frictions: int,
+        largest_friction: float,
+        rate: float,
+        period: float,
+    ) -> None:
+        self._period, self._samples = period, max(2.0 / (rate * period), 1.0)
+        self._low = np.concatenate([identified.low, np.zeros(frictions)])
+        self._high = np.concatenate([identified.high, np.full(frictions, largest_friction)])
+        self._num, self._contacts = self._low.size, len(identified.pressed)
+        deviations = (self._high - self._low) / 12.0**0.5
+        self._prior = np.concatenate([deviations, *self._contacts * [COMPLIANCE]]) ** 2
+        count = self._prior.size
+        self._fades = np.zeros(count)
+        self._fades[[*identified.places, *range(self._num, count)]] = 1.0
+        lower = ca.Sparsity.lower(count)
+        self.change, self._compliances, triangle, self._spread = parts = [
+            ca.SX.sym(name, size)
+            for name, size in (
+                ("change", self._num),
+                ("compliances", 2 * self._contacts),
+                ("covariance", lower.nnz()),
+                ("spread", 1),
+            )
+        ]
+        self.held = ca.vertcat(*parts)
+        self._covariance = ca.tril2symm(ca.SX(lower, triangle))
+        self.deviations = ca.sqrt(ca.fmax(ca.diag(self._covariance), 0))[: self._num]
+        prior = ca.DM(np.diag(self._prior))[lower].nonzeros()
+        self.start = np.array([*np.zeros(self._num + 2 * self._contacts), *prior, 1.0])
+
+    def after(
+        self,
+        theta: ca.SX,
+        r: ca.SX,
+        regressor: ca.SX,
+        inertia: ca.SX,
+        gaps: tuple[ca.SX, ca.SX, ca.SX],
+        forces: ca.SX,
+        is_closed: ca.SX,
+        is_used: ca.SX,
+    ) -> ca.SX:
+        """What is held after a sample.
+
+        Args:
+            theta: The parameters before it, with the coefficients of friction.
+            r: The disturbance that is left, shape (k, 1).
+            regressor: Y, low-pass filtered as r is, shape (k, c).
+            inertia: The diagonal of M, shape (k, 1).
+            gaps: The distances in contact, shape (j, 1), their derivatives, (j, c'), and their
+                second derivatives, (j c', c').
+            forces, is_closed: The constraint force at each of these, and whether it presses.
+            is_used: 0 while nothing is estimated.
+        """
+        num, P, scale = self._num, self._forgotten(), 1.0 / ca.sqrt(inertia)
+        rest, rows = scale * r, scale * regressor
+        rows = ca.horzcat(rows, ca.SX(rows.shape[0], 2 * self._contacts))
+        noise = self._spread * self._samples
+        measured = [(rows[i, :], rest[i], noise, is_used) for i in range(rest.numel())]
+        distances, slopes, bends = gaps
+        known = slopes.shape[1]
+        for j in range(self._contacts):
+            compliant = ca.SX(1, 2 * self._contacts)
+            compliant[2 * j : 2 * j + 2] = ca.vertcat(forces[j], ca.sqrt(ca.fmax(forces[j], 0)))
+            row = ca.horzcat(slopes[j, :], ca.SX(1, num - known), compliant)
+            gap = -(distances[j] + ca.mtimes(compliant, self._compliances))
+            bent = ca.mtimes(bends[j * known : (j + 1) * known, :], P[:known, :known])
+            off = ca.trace(bent) ** 2 / 4.0 + ca.trace(ca.mtimes(bent, bent)) / 2.0
+            variance = (GAP**2 + off) * self._samples
+            measured.append((row, gap, variance, is_used * is_closed[j]))
+        change = ca.SX.zeros(num + 2 * self._contacts)
+        for row, error, variance, used in measured:
+            row = ca.densify(row)
+            moved = ca.mtimes(P, row.T)
+            gain = used * moved / (variance + ca.mtimes(row, moved))
+            change += gain * (error - ca.mtimes(row, change))
+            P -= ca.mtimes(gain, moved.T)
+        before = ca.vertcat(theta, self._compliances)
+        values = self._bounded(before + change, P)
+        change = values - before
+        remaining = ca.sumsqr(rest - ca.mtimes(rows, change)) / rest.numel()
+        gained = is_used * min(self._period / _SETTLING, 1.0)
+        spread = self._spread + gained * (ca.fmax(remaining, _LEAST) - self._spread)
+        triangle = ca.vertcat(*(P[j:, j] for j in range(P.shape[0])))
+        return ca.vertcat(change[:num], values[num:], triangle, spread)
+
+    def _forgotten(self) -> ca.SX:
+        """P a sample later."""
+        fades, P = self._fades, self._covariance
+        share = (1.0 - fades) * self._period / MEMORY
+        kept = ca.SX(np.outer(fades, fades)) * P
+        grown = kept - ca.mtimes([kept, ca.DM(np.diag(1.0 / self._prior)), kept])
+        keep = 1.0 - share / 2.0
+        changing = np.outer(keep, keep) * P + ca.DM(np.diag(share * self._prior))
+        return changing + self._period / FADING * grown
+
+    def _bounded(self, values: ca.SX, P: ca.SX) -> ca.SX:
+        """theta with compliances after these projections, and with each parameter in its bounds."""
+        num = self._num
+        for i in range(num):
+            inside = ca.fmin(ca.fmax(values[i], self._low[i]), self._high[i])
+            values = values + P[:, i] / P[i, i] * (inside - values[i])
+        for i in range(num, num + 2 * self._contacts, 2):
+            pair = slice(i, i + 2)
+            values = values + ca.mtimes(P[:, pair], _pushes(values[pair], P[pair, pair]))
+        # A projection may take along another parameter beyond its bound, where the law needs it.
+        inside = ca.fmin(ca.fmax(values[:num], self._low), self._high)
+        return ca.vertcat(inside, values[num:])
+
+
+def _pushes(pair: ca.SX, block: ca.SX) -> ca.SX:
+    """y of the projection c + B y of two numbers c on c >= 0 in the metric of B^-1, shape (2, 1).
+
+    y >= 0, c + B y >= 0, y^T (c + B y) = 0: one of them is pushed, if that raises the other enough,
+    or both are.
+    """
+    alone = ca.fmax(-pair, 0) / ca.diag(block)
+    first, second = ca.vertcat(alone[0], 0), ca.vertcat(0, alone[1])
+    determinant = block[0, 0] * block[1, 1] - block[0, 1] * block[1, 0]
+    adjugate = ca.blockcat([[block[1, 1], -block[0, 1]], [-block[1, 0], block[0, 0]]])
+    both = -ca.mtimes(adjugate, pair) / determinant
+    is_first = (pair + ca.mtimes(block, first))[1] >= 0
+    is_second = (pair + ca.mtimes(block, second))[0] >= 0
+    return ca.if_else(is_first, first, ca.if_else(is_second, second, both))
