@@ -326,7 +326,7 @@ class _Trials:
                 }
             )
         chosen = int(np.argmax(across)), int(np.argmax(along))
-        self.slides = max(across) > 0.0
+        self.slides = not slides or max(across) > 0.0  # Without friction nothing sticks.
         self.path = [
             (
                 round(times[i] / self.period) * self.period,
