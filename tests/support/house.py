@@ -33,7 +33,6 @@ FLOORS = (
     ("compiler",),
     ("diagrams",),
     ("analysis",),
-    ("analysis",),
     ("running",),
     ("pictures",),
     ("scenario",),
