@@ -92,9 +92,9 @@ from .scene import start_meshcat as start_meshcat
 from .analysis import analyze as analyze
 from .analysis import contact_gains as contact_gains
 from .running.simulate import simulate as simulate
-from .running.rollout.rollout import rollout as rollout
+from .running.rollout import rollout as rollout
 from .running import export_controller as export_controller
-from .running import write_page as write_page
+from .pictures import write_page as write_page
 from .pictures import plot_runs as plot_runs
 from .pictures import make_animation as make_animation
 from .scenario import Scenario as Scenario

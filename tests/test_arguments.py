@@ -259,7 +259,6 @@ NONSENSE: tuple[Any, ...] = (
 SIDE_EFFECTS = {
     "start_meshcat": "it opens a port",
     "write_page": "it writes to the given path",
-    "export_code": "it writes to the given path",
     "sweep": "it writes to the given path",
 }
 

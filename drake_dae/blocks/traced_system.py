@@ -27,8 +27,6 @@ from pydrake.systems.framework import (
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed
-from drake_dae.blocks import computations
-from drake_dae.blocks.as_computations import computations_of
 from drake_dae.blocks.block import Block, BlockFunction, stacked
 from drake_dae.blocks.failures import off_manifold, simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
@@ -180,10 +178,6 @@ class TracedSystem(LeafSystem):
             return _UNCHANGED
         state.get_mutable_continuous_state().SetFromVector(projected)
         return _CHANGED
-
-    def traced(self) -> computations.Computations:
-        """The computations of the block."""
-        return computations_of(self, self.block)
 
 
 def check_context(system: System, context: Context) -> None:

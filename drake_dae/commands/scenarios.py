@@ -2,7 +2,6 @@
 
 import argparse
 import logging
-import re
 import shlex
 import sys
 import time
@@ -109,14 +108,16 @@ def _check(scenario: Scenario, end: float) -> str:
 
 def _tip(text: str) -> tuple[str, Vector]:
     """The frame and the point in a text "LINK" or "LINK:x,y,z"."""
-    match = re.fullmatch(r"(.*[^:]):([^:]*,[^:]*)", text)
-    if match is None:
+    frame, comma, y_and_z = text.partition(",")
+    if not comma:
         return text, (0.0, 0.0, 0.0)
-    numbers = [number for word in match[2].split(",") if (number := number_in(word)) is not None]
-    if len(numbers) != 3 or match[2].count(",") != 2:
+    frame, _, x = frame.rpartition(":")
+    words = x, *y_and_z.split(",")
+    point = [number for word in words if (number := number_in(word)) is not None]
+    if not frame or not len(words) == len(point) == 3:
         form = "LINK or LINK:x,y,z with three numbers in m"
         raise ScenarioError(("--tip", f"expected {form}, got '{text}'"))
-    return match[1], (numbers[0], numbers[1], numbers[2])
+    return frame, (point[0], point[1], point[2])
 
 
 def _analyze_options(parser: Parser) -> None:
@@ -140,6 +141,10 @@ def _analyze(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return 2 if report.problems else 0, {"scenario": path.stem, **report.to_dict()}
 
 
+LONGEST = 2.0
+"""The longest run to which exported code is compared, in s."""
+
+
 def _page_options(parser: Parser) -> None:
     parser.scenario(DEFAULT_SCENARIO)
     parser.out("FILE", "the page (default: <scenario>.html)")
@@ -150,16 +155,17 @@ def _page(options: argparse.Namespace) -> int:
     """Writes a scenario as one HTML file in which it runs, without server and network.
 
     There are sliders, a target and surfaces that are dragged, links that are pushed, and plots of
-    force and error with the prediction. It needs drake_dae[compiler].
+    force and error with the prediction. It needs zig: pip install ziglang.
     """
-    from drake_dae.running.bench.page import write_page
+    from drake_dae.pictures.page.page import write_page
     from drake_dae.scenario.commanded import build_commanded
 
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
     file = options.out or Path(f"{path.stem}.html")
     check_unwritten([file], options.force)
-    with waiting(f"compiling {path.stem} for a page"):
+    print(f"compiling {path.stem} for a page; the first page on a machine takes longer", flush=True)
+    with waiting(f"compiling {path.stem}"):
         built = build_commanded(scenario)
         title, notes = scenario.description or path.stem, built.left_out
         try:
@@ -179,36 +185,32 @@ def _export_options(parser: Parser) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    """Writes the law, the plant and the projection of a scenario as plain C99.
+    """Writes a scenario as plain C99: the whole loop, and its sampled controller as one step.
 
-    There are no dependencies; sizes, names and units stand in the code. Of a sampled law the whole
-    controller is written as one step, with a class of C++ over it. `make` in the folder compiles
-    programs that compare all with Python and with a run of Drake's Simulator.
+    There are no dependencies; sizes, names and units stand in the code. `make` in the folder
+    compiles programs that compare with runs of Drake's Simulator.
     """
-    path = find_scenario(options.scenario)
-    from drake_dae.running.export.export import export_code
-    from drake_dae.running.export.steps.controller import export_controller
+    from drake_dae.running.export.controller import export_controller
+    from drake_dae.running.export.loop import export_loop
 
+    path = find_scenario(options.scenario)
     folder = options.out or Path(f"{path.stem}_c99")
     check_folder(folder)
-    scenario, missing = load_scenario(path, options.settings), ""
+    scenario, files, missing = load_scenario(path, options.settings), list[Path](), list[str]()
     with waiting(f"exporting {path.stem}"), complete(folder) as place:
         made = *build_scenario(scenario), path.stem, place
-        run = scenario.integrator, scenario.duration
-        if scenario.task is not None:
-            files = export_controller(*made, *run)
-            missing = "functions of law and plant: a task has two laws"
-        else:
-            files = export_code(*made)
+        for what, export in {"controller": export_controller, "loop": export_loop}.items():
             try:
-                files += export_controller(*made, *run)
+                files += export(*made, scenario.integrator, min(scenario.duration, LONGEST))
             except ModelError as error:
-                missing = f"the whole controller as one step: {error}"
+                missing.append(f"the {what}: {error}")
+        if not files:
+            raise ModelError(f"{path.stem} cannot be exported; {'; '.join(missing)}")
         names = list(dict.fromkeys(file.name for file in files))
         check_unwritten((folder / name for name in names), options.force)
     print(f"written to {folder}/: {', '.join(names)}")
-    if missing:
-        print(f"not among them: {missing}")
+    for reason in missing:
+        print(f"not among them: {reason}")
     return 0
 
 

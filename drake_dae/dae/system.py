@@ -226,6 +226,18 @@ class DaeSystem:
         return parameter_symbol(self.parameters)
 
     @property
+    def parameter_signals(self) -> list[Signal]:
+        """Names and units of the entries of `parameter_symbol`."""
+        moving = self.exogenous.moving
+        rates = [
+            signal.derivative(order)
+            for p in moving
+            for order in range(1, len(p.derivatives) + 1)
+            for signal in p.signals
+        ]
+        return [*(signal for p in self.parameters for signal in p.signals), *rates]
+
+    @property
     def parameter_values(self) -> FloatArray:
         """The default parameter vector, as `parameter_symbol`; derivatives are zero."""
         return self._defaults.copy()

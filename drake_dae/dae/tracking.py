@@ -216,6 +216,15 @@ class TrackingLaw:
         return np.concatenate([values, entries])
 
     @property
+    def parameter_signals(self) -> list[Signal]:
+        """Names and units of the model's parameters, then of the gains, as `all_parameters`."""
+        return self.system.parameter_signals + [
+            Signal(f"K of {self.system.output_signals[i].name} for {coordinate.name}")
+            for j, coordinate in enumerate(self.coordinate_signals)
+            for i in np.flatnonzero(self.gains.matrix[:, j])
+        ]
+
+    @property
     def coordinate_signals(self) -> list[Signal]:
         """Names and units of the error coordinates."""
         integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))

@@ -11,7 +11,6 @@ from .constraint_wrenches import ConstraintWrenches as ConstraintWrenches
 from .constraint_wrenches import Wrenches as Wrenches
 from .constraint_wrenches import contact_normals as contact_normals
 from .constraint_wrenches import own_values as own_values
-from .constraints.constraint import Application as Application
 from .constraints.constraint import Constraint as Constraint
 from .constraints.constraint import Joint as Joint
 from .constraints.constraint import Touch as Touch
@@ -41,6 +40,7 @@ from .force_outputs import force_rows as force_rows
 from .link_depths import LinkBehind as LinkBehind
 from .link_depths import LinkDepths as LinkDepths
 from .link_depths import links_behind as links_behind
+from .links.links import Application as Application
 from .links.links import Frames as Frames
 from .links.links import Kinematics as Kinematics
 from .links.links import Links as Links

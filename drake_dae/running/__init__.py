@@ -1,4 +1,4 @@
-"""Runs of a diagram: Drake's simulator, rollouts, exports, pages."""
+"""Runs of a diagram: Drake's simulator, rollouts, exports."""
 
 import lazy_loader
 

@@ -1,8 +1,6 @@
 """The names of the room, each with its home."""
 
-from .bench.page import write_page as write_page
-from .export.export import export_code as export_code
-from .export.steps.controller import export_controller as export_controller
-from .export.wasm.wasm import export_wasm as export_wasm
+from .export.controller import export_controller as export_controller
+from .export.loop import export_loop as export_loop
 from .record_writer import RecordWriter as RecordWriter
-from .rollout.problems import start_values as start_values
+from .rollout import start_values as start_values

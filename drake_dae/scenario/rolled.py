@@ -17,8 +17,7 @@ from drake_dae.diagrams.state_feedback import (
 )
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.divergence import DivergenceWatch
-from drake_dae.running.rollout.problems import start_values
-from drake_dae.running.rollout.rollout import Rollout, diagnosed, run_loop
+from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values
 from drake_dae.scenario.scenario import Scenario
 
 ROWS = 1000

@@ -24,9 +24,9 @@ from tqdm import tqdm
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import brief, check_whole_number, positive
+from drake_dae.blocks.machine import num_cores
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running.interruption import end_at_once, ending_signals
-from drake_dae.running.rollout.run import num_cores
 from drake_dae.running.simulate import default_size
 from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.rolled import for_rollout

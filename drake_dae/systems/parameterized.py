@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -11,7 +10,6 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.blocks.block import Block, Requirement
-from drake_dae.blocks.computations import Computations
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import DaeSystem, DerivativeLayout
 from drake_dae.errors import ModelError
@@ -107,13 +105,6 @@ class ParameterizedSystem(TracedSystem):
             if parameter.name == name:
                 parameter.check(values[place])
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
-
-    def traced(self) -> Computations:
-        return replace(super().traced(), moving=tuple(self.exogenous_places), **self._shares())
-
-    def _shares(self) -> dict[str, Any]:
-        """Fields of the computations that plant and law of one model share."""
-        return {}
 
 
 def with_exogenous(block: Block, places: Sequence[int]) -> Block:

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
@@ -41,6 +40,7 @@ machines may share a home, and without Zig's checks for undefined behavior."""
 WEB = (
     *("-m", "ziglang", "cc", "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c99", "-O2"),
     *("-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=undefined", "-Wl,--strip-all"),
+    "-Wl,-z,stack-size=1048576",
 )
 """Options that make Python a compiler of WebAssembly."""
 
@@ -113,8 +113,8 @@ def _find_compiler(named: str, path: str) -> Compiler | str:
     if shutil.which(command[0]) is None:
         where = f"CC names '{command[0]}', which is" if named.strip() else "'cc' is"
         return (
-            f"no C compiler: {where} not found; install gcc or clang, or drake_dae[compiler], or "
-            "name one in CC"
+            f"no C compiler: {where} not found; install gcc or clang, name "
+            "one in CC, or pip install ziglang"
         )
     # The option for this processor, and the target that the compiler derives from it. The target is
     # part of the identity, so that machines with a shared cache each have their own code.
@@ -134,17 +134,12 @@ def _find_compiler(named: str, path: str) -> Compiler | str:
     return Compiler(tuple(command), repr(words), target)
 
 
-def compile_webassembly(sources: Sequence[Path], file: Path) -> None:
-    """Compiles C sources to a WebAssembly module that imports nothing, by the zig of ziglang.
+def compile_webassembly(source: Path, file: Path) -> None:
+    """Compiles C to a WebAssembly module that imports nothing, by the zig of ziglang.
 
     The first call on a machine compiles zig's C library as well, which takes half a minute.
     """
-    if find_spec("ziglang") is None:
-        raise MachineCodeError(
-            "WebAssembly is compiled by zig, which is not installed: pip install "
-            "'drake_dae[compiler]'"
-        )
-    _compile([sys.executable, *WEB, *map(str, sources), "-o", str(file)], file, WEB_PATIENCE)
+    _compile([sys.executable, *WEB, str(source), "-o", str(file)], file, WEB_PATIENCE)
 
 
 def _compile(command: list[str], file: Path, seconds: float) -> None:

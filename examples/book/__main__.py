@@ -19,7 +19,7 @@ from book.pages import pages, run_page  # noqa: E402
 from drake_dae.cli import main as command  # noqa: E402
 from drake_dae.scenario.shipped import shipped_scenarios  # noqa: E402
 
-NO_FIGURE = "<p>This figure needs zig: pip install 'drake_dae[compiler]'; drake-dae page {name}</p>"
+NO_FIGURE = "<p>This figure needs zig: pip install ziglang; drake-dae page {name}</p>"
 """The replacement for the live page of a scenario that could not be written."""
 
 

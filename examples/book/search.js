@@ -1,9 +1,9 @@
 // Sphinx's search finds pages with all words of a question. Here a page is the better the more words it has:
 // rare words count more than common ones, and long pages, which have many words, less than short ones.
-document.addEventListener("DOMContentLoaded", () => {
+const byWords = () => {
   const withAll = Search.performTermsSearch;
   Search.performTermsSearch = (words, excluded) => {
-    const { docnames, terms } = Search._index;
+    const { docnames, terms, titles } = Search._index;
     const lengths = docnames.map(() => 0), found = new Map();
     for (const pages of Object.values(terms)) for (const page of [pages].flat()) lengths[page] += 1;
     const mean = lengths.reduce((sum, length) => sum + length) / lengths.length;
@@ -17,9 +17,19 @@ document.addEventListener("DOMContentLoaded", () => {
         found.set(page[0], sum);
       }
     }
+    // A page whose title has the question as it was written comes first: Sphinx drops words as "own" and "my".
+    const asked = (new URLSearchParams(location.search).get("q") ?? "").trim().toLowerCase();
+    docnames.forEach((name, i) => {
+      const place = titles[i].toLowerCase().indexOf(asked);
+      if (found.has(name) && place >= 0) found.get(name)[4] += place ? 50 : 100;
+    });
     return [...found.values()];
   };
-});
+};
+
+// Before version 9 Sphinx loads its search after this file.
+if (typeof Search === "undefined") document.addEventListener("DOMContentLoaded", byWords);
+else byWords();
 
 // Pages that answer a question come first; the name of an object leads to it.
 var Scorer = {

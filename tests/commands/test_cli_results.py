@@ -12,7 +12,7 @@ from runs import some
 
 from drake_dae import Record, load_scenario
 from drake_dae.cli import main
-from drake_dae.running.export import export
+from drake_dae.running.export import loop as exported
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
@@ -150,7 +150,7 @@ def test_all_commands_start_at_the_same_state(name, tmp_path, monkeypatch):
         found["export"] = own.get_continuous_state_vector().CopyToVector()
         return []
 
-    monkeypatch.setattr(export, "export_code", kept)
+    monkeypatch.setattr(exported, "export_loop", kept)
     settings = ["--set=start={}", "--set=duration=0.01", *BARE]
     assert main(["export", name, *settings, f"--out={tmp_path / 'code'}"]) == 0
     assert main(["simulate", name, *settings, f"--out={tmp_path / 'run'}"]) == 0

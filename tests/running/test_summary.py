@@ -1,7 +1,5 @@
 """What is told about a run, as text, as data and as figures, of a record made by hand."""
 
-import signal
-
 import numpy as np
 import pytest
 from arms import arm
@@ -98,13 +96,6 @@ def test_what_real_contact_explains_is_one_remark():
     found = summary(far, reasons=[])
     assert found.text.startswith("UNDECIDED")
     assert found.missed
-
-
-def test_an_interrupted_run_says_so():
-    run = RunStatistics(simulated_time=1.0, wall_time=0.5, steps=12, interrupted=signal.SIGINT)
-    found = summary(statistics=run, ended="interrupted")
-    assert found.text.startswith("BAD: the run broke off at 1 s: interrupted")
-    assert found.data["interrupted"]
 
 
 def test_cut_off_controls_say_for_how_long():

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from by_inputs import set_inputs
+from by_inputs import parameter_names, set_inputs
 from pydrake.systems.analysis import SimulatorConfig
 from runs import run, scenario
 
 from drake_dae import build_scenario
-from drake_dae.running.bench.inputs import Inputs
 from drake_dae.scenario import build_commanded
 from drake_dae.scenario.shipped import shipped_scenarios
 
@@ -76,7 +75,7 @@ def test_every_shipped_scenario_is_commanded(name):
     if given.plant.carries:
         return  # Drake's own contact.
     built = build_commanded(given)
-    names = Inputs.of(built.loop).names
+    names = parameter_names(built.loop)
     # What is left out has a reason, of which none is an error of the build.
     assert all(": none, since " in sentence for sentence in built.left_out)
     parts = {sentence.partition(":")[0] for sentence in built.left_out}

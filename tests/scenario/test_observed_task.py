@@ -88,23 +88,6 @@ def test_an_observer_makes_a_task_robust_to_friction(file, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_disturbance_is_seen_whether_the_contact_is_open_or_closed(file, tmp_path):
-    """A payload of 0.5 kg at rest: the generalized force J^T m g, by the virtual work of a mass at
-    the tool of a planar arm with links of 1 m."""
-    settings = ["plant.payloads=[{frame: tool, mass: 0.5}]", "sensors.force.noise_deviation=0"]
-    settings += ["plant.friction=0", "estimator={rate: 60}"]
-    resting = "task.phases=[!Move {references: {tool.z: 0.3, wall.distance: 0.02}, duration: 1}]"
-    pressing = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
-    for phases in (resting, pressing):
-        found = rolled(file, tmp_path, *settings, phases)
-        q1, q2 = found["state"][-1, :2]
-        lengths = np.array([np.cos(q1) + np.cos(q1 + q2), np.cos(q1 + q2)])
-        weight = 0.5 * 9.81 * lengths
-        seen = found["disturbance"][-1]
-        assert_allclose(np.abs(seen), np.abs(weight), rtol=0.02)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", some([1, 2, 3]))
 def test_noise_is_no_touch(file, tmp_path, seed):
     """It touches at the wall, within what 0.1 m/s goes in the seven samples of the low-pass."""
@@ -145,15 +128,6 @@ def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys, rol
     assert found["phase"][found.time < 0.8][-1, 2] == 1.0  # It is done.
     assert np.all(found["constraint_force"][found.time > 1.0] == 0.0)
     assert np.max(np.abs(found["state"][-1, 2:])) < 0.05
-
-
-@pytest.mark.slow
-def test_a_contact_that_is_not_there_ends_the_approach(file):
-    settings = ["plant.parameters={wall.position: [1.3, 0, 0]}", "task.phases.0.behind=0.01"]
-    loop, _, found = run_scenario(load_scenario(file, settings))
-    last = loop.changes(found)[-1]
-    assert (last.phase, last.failed) == ("held", True)
-    assert_allclose(last.distance, -0.01, atol=2e-4)
 
 
 @pytest.mark.slow

@@ -99,14 +99,11 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         # Keys.
         ("duratoin=1", ["scenario: ", "'duration'"]),
         ("constraints.0.surface.radius=1", ["constraints.0.surface: ", "!Plane"]),
-        ("constraints.0={frame: tool}", ["constraints.0: ", "'surface'"]),
         # Settings.
         ("duration", ["--set duration: "]),
-        ("start..errors=1", ["--set start..errors=1: "]),
         ("duration=[1", ["duration: ", "line 1: "]),
         ("duration=1\nfoo: 2", ["duration: ", "line 2: "]),
         # Types.
-        ("duration=abc", ["duration: ", "'abc'"]),
         # The robot's file.
         ("robot.file=no.urdf", ["robot.file: ", "/no.urdf"]),
         (
@@ -114,7 +111,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             ["robot.file: ", "two_link_wall.yaml", ".urdf"],
         ),
         # Constraints.
-        ("constraints.0.frame=tol", ["constraints.0: ", "'tol'", "'tool'", "link2"]),
         ("constraints.0.name=''", ["constraints.0.name: "]),
         (f"constraints=[{WALL}, {WALL}]", ["constraints.1.name: ", "'wall'"]),
         (
@@ -145,21 +141,16 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         # Outputs.
         ("outputs.0.axes=xz", ["outputs: ", "1", "2", "(tool.x, tool.z)"]),
         ("outputs.0.axes=x", ["outputs: ", "(5)", "'tool.x'"]),
-        ("outputs.0=!JointPositions {joints: [joint9]}", ["outputs.0: ", "'joint9'", "joint1"]),
         (
             "plant.parameters={wall.position: [[1, 0, 0]]}",
             ["plant.parameters.wall.position: ", "[[1, 0, 0]"],
         ),
         # Gains.
         ("law.gains.all=[1]", ["gains: ", "Hurwitz"]),
-        ("law.gains.all=[-1, -2, -3]", ["gains: ", "'tool.z'", "3"]),
-        ("law.gains=!Poles {outputs: {tool.q: [-1]}}", ["gains: ", "tool.q"]),
         ("law.gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),
         # References.
         ("references={}", ["references: ", "tool.z", "wall.force"]),
         ("references={tool.z: a}", ["references.tool.z: ", "!C"]),
-        ("references.wall.forc=1", ["references.wall.forc: ", "'wall.force'"]),
-        ("references.tool=1", ["references: ", "'tool.z'", "'tool'"]),
         (
             "references.tool.z=!Constant {values: [1, 2, 3]}",
             ["references.tool.z: ", "3", "1", "tool.z"],
@@ -187,7 +178,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         (f"{SPRINGS} [[1, 0], [0]]}}]", ["actuation.0.stiffness: ", "[[1, 0]", "[0]"]),
         (f"{SPRINGS} [[1, 2], [2, 1]]}}]", ["actuation.0: ", "-1"]),
         (f"{SPRINGS} [[1, 0, 0], [0, 1, 0]]}}]", ["actuation.0: ", "(2,)", "(2, 2)"]),
-        ("sensors.force=!MeasuredForce", ["sensors.force: ", "!MeasuredForce", "{}"]),
         ("sensors.force={gain: 1}", ["sensors.force: ", "'gain'", "bias"]),
         (
             "sensors.force={time_constant: 1, seed: -1}",
@@ -195,18 +185,15 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ),
         ("plant.parameters={link9.mass: [1]}", ["plant.parameters: ", "link9.mass", "link2.mass"]),
         # The start.
-        ("start.positions.joint9=1", ["start.positions: ", "'joint9'"]),
         (
             "start.positions.joint1=9",
             ["start.positions: ", "9", "-3.1416", "3.1416"],
         ),
         ("start.errors.tool.x=1", ["start.errors: ", "'tool.x'", "tool.z"]),
-        ("start.errors.wall.force=1", ["start.errors: ", "'wall.force'"]),
         ("start.errors.tool.z=5", ["start: ", "tool.z", "5.3"]),
         # The run.
         ("duration=0", ["duration: ", "positive", "0"]),
         ("integrator.integration_scheme=runge_kuta5", ["integrator: ", "'runge_kutta5'"]),
-        ("integrator.integration_scheme=runge_kutta2", ["integrator: ", "use_error_control"]),
     ],
 )
 def test_refused_with_key_value_and_remedy(settings, words):

@@ -1,54 +1,20 @@
 """Blocks that a user wrote: traced ones, and one that Drake converts to expressions."""
 
 import casadi as ca
-from pydrake.systems.framework import BasicVector_, LeafSystem, LeafSystem_
+from pydrake.systems.framework import BasicVector_, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from drake_dae.blocks.computations import HELD, Computation, Computations, Update
-from drake_dae.trace.functions import TracedFunction
+from drake_dae import Block, TracedSystem
+from drake_dae.blocks.block import Requirement
 
 
-class Guarded(LeafSystem):
+def Guarded():
     """y = 2 u, a value that is of use only where u > 0, though it is finite everywhere."""
-
-    def __init__(self):
-        super().__init__()
-        self.DeclareVectorInputPort("u", 1)
-        self.DeclareVectorOutputPort("y", 1, self._calc)
-        u = ca.SX.sym("u")
-        self._function = TracedFunction("guarded", {"u": u}, {"y": 2.0 * u}, pivot=u)
-
-    def _calc(self, context, output):
-        output.SetFromVector(2.0 * self.GetInputPort("u").Eval(context))
-
-    def traced(self):
-        return Computations(self, (Computation.of(self._function, ("u",), ("y",)),))
-
-
-class Latch(LeafSystem):
-    """Holds its input "u" from sample to sample, and at the start its input "first"."""
-
-    def __init__(self, period):
-        super().__init__()
-        self.period = period
-        self.DeclareVectorInputPort("u", 1)
-        self.DeclareVectorInputPort("first", 1)
-        self._state = self.DeclareDiscreteState([float("nan")])
-        self.DeclareStateOutputPort("y", self._state)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._read)
-
-    def _read(self, context, state):
-        state.set_value(self._state, self.GetInputPort("u").Eval(context))
-
-    def traced(self):
-        value = ca.SX.sym("value")
-        same = ca.Function("same", [value], [value])
-        return Computations(
-            self,
-            (Computation(same, (HELD,), ("y",)),),
-            (Update(Computation(same, ("u",), (HELD,)), self.period),),
-            initial=Computation(same, ("first",), (HELD,)),
-        )
+    u = ca.SX.sym("u")
+    positive = Requirement.regular(u, "u")
+    return TracedSystem(
+        Block("guarded", {"u": u}, {"y": positive.of(2.0 * u)}, requirements=(positive,))
+    )
 
 
 @TemplateSystem.define("Counter_")

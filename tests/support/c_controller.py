@@ -6,14 +6,13 @@ import subprocess
 
 import numpy as np
 
-STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror", "-pedantic"]
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 
 
 def compile_c(folder, sources, target, *flags: str, compiler: str = "cc") -> str:
     """Compiles as strictly as can be, and links; returns the path of what it made."""
-    strict = STRICT if compiler == "cc" else ["-Wall", "-Wextra", "-Werror"]
     given = [str(folder / source) for source in sources]
-    words = [compiler, *strict, "-ffp-contract=off", *(flags or ("-O1",)), *given]
+    words = [compiler, *STRICT, "-ffp-contract=off", *(flags or ("-O1",)), *given]
     done = subprocess.run(
         [*words, "-o", str(folder / target), "-lm"], capture_output=True, text=True, check=False
     )
@@ -31,7 +30,6 @@ class CController:
             key: int(value)
             for key, value in re.findall(rf"  {guard}_CONTROLLER_(\w+) = (\d+)", header)
         }
-        memory = re.search(r"double held\[(\d+)\];\n  double given\[(\d+)\]", header)
         inputs, outputs, controls = (sizes[key] for key in ("INPUTS", "OUTPUTS", "CONTROLS"))
 
         def numbers(size: int) -> type:
@@ -39,13 +37,13 @@ class CController:
 
         class Controller(ctypes.Structure):
             _fields_ = (
-                ("parameters", numbers(sizes["PARAMETERS"] + inputs + 1)),
+                ("parameters", numbers(sizes["PARAMETERS"] + inputs)),
                 ("stop_control", numbers(controls)),
                 ("stop_time", ctypes.c_double),
                 ("max_age", ctypes.c_double),
                 ("patience", ctypes.c_int),
-                ("held", numbers(int(memory[1]))),
-                ("rest", numbers(int(memory[2]) + outputs + controls + 10)),
+                ("held", numbers(sizes["HELD"] + 1)),
+                ("rest", numbers(outputs + 10)),
             )
 
         class Outputs(ctypes.Structure):

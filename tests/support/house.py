@@ -30,7 +30,6 @@ FLOORS = (
     ("blocks",),
     ("systems",),
     ("scene",),
-    ("compiler",),
     ("diagrams",),
     ("analysis",),
     ("running",),

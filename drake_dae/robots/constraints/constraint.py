@@ -1,11 +1,11 @@
 """The contract of a constraint.                                                 (38)"""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -16,36 +16,8 @@ from pydrake.multibody.tree import MultibodyConstraintId
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.links import Frames, Kinematics, Reaction
+from drake_dae.robots.links.links import Application, Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.surface import Surface, Vector
-
-
-@dataclass(frozen=True, eq=False)
-class Application:
-    """The action of constraint forces: F = force_axes @ lambda + drag, M = moment_axes @ lambda.
-
-    All vectors are in the world. Frame A exerts F and M on frame B at the point; B exerts the
-    opposite on A at the same point.
-
-    Attributes:
-        point: The point of application of F, in m, shape (3, 1).
-        force_axes: The force in N for a unit of each constraint force, shape (3, m).
-        moment_axes: The moment in N m for a unit of each constraint force, shape (3, m).
-        frame_b, frame_a: Names of the frames.
-        drag: The part of F in N that acts without constraint forces, shape (3, 1); None if none.
-    """
-
-    point: ca.SX
-    force_axes: ca.SX
-    moment_axes: ca.SX
-    frame_b: str
-    frame_a: str = "world"
-    drag: ca.SX | None = None
-
-    def force(self, constraint_force: ca.SX) -> ca.SX:
-        """F in N, shape (3, 1), for constraint forces of shape (m, 1)."""
-        force = ca.mtimes(self.force_axes, constraint_force)
-        return force if self.drag is None else force + self.drag
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +89,8 @@ class Constraint(ABC):
     """
 
     name: str
+    force_units: ClassVar[Mapping[str, str]] = {}
+    residual_units: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         _ = self.parameters  # They check themselves.
@@ -142,14 +116,15 @@ class Constraint(ABC):
         return changed
 
     @property
-    @abstractmethod
     def force_signals(self) -> tuple[Signal, ...]:
-        """Names and units of lambda, one per equation."""
+        """Names and units of lambda, one per equation: those of `force_units`, after "<name>."."""
+        return tuple(Signal(f"{self.name}.{key}", unit) for key, unit in self.force_units.items())
 
     @property
-    @abstractmethod
     def residual_signals(self) -> tuple[Signal, ...]:
-        """Names and units of phi, then of the nonholonomic rows of the rate."""
+        """Names and units of phi, then of the nonholonomic rows of the rate; likewise."""
+        units = self.residual_units
+        return tuple(Signal(f"{self.name}.{key}", unit) for key, unit in units.items())
 
     @property
     def is_unilateral(self) -> tuple[bool, ...]:

@@ -10,8 +10,8 @@ import numpy as np
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Parameter, Signal, UnilateralInput
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
-from drake_dae.robots.links.links import Frames, Kinematics, Links, Reaction
+from drake_dae.robots.constraints.constraint import Constraint, Joint
+from drake_dae.robots.links.links import Application, Frames, Kinematics, Links, Reaction
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive
-from drake_dae.dae import Parameter, Signal, signals
+from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Application, Constraint, Touch
-from drake_dae.robots.links.links import Frames, Kinematics, Reaction
+from drake_dae.robots.constraints.constraint import Constraint, Touch
+from drake_dae.robots.links.links import Application, Frames, Kinematics, Reaction
 from drake_dae.robots.surfaces.surface import (
     Surface,
     Vector,
@@ -74,6 +74,8 @@ class PointOnSurface(Constraint):
     stiction_tolerance: float = 1e-3
     viscous_friction: float | None = None
     is_unilateral: ClassVar[tuple[bool, ...]] = (True,)
+    force_units: ClassVar = {"force": "N"}
+    residual_units: ClassVar = {"distance": "m"}
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -95,14 +97,6 @@ class PointOnSurface(Constraint):
     def _form(self) -> tuple[Surface, tuple[Parameter, ...]]:
         """The surface with symbols for the numbers of its shape, and these parameters."""
         return with_parameters(self.name, self.surface)
-
-    @property
-    def force_signals(self) -> tuple[Signal, ...]:
-        return (Signal(f"{self.name}.force", "N"),)
-
-    @property
-    def residual_signals(self) -> tuple[Signal, ...]:
-        return (Signal(f"{self.name}.distance", "m"),)
 
     @property
     def coordinate_signals(self) -> tuple[Signal, ...]:
@@ -240,6 +234,8 @@ class AxisNormalToSurface(Constraint):
     axis: Vector = (0.0, 0.0, 1.0)
     point: Vector = (0.0, 0.0, 0.0)
     name: str = "normal"
+    force_units: ClassVar = {"moment_b": "N m", "moment_c": "N m"}
+    residual_units: ClassVar = {"tilt_b": "rad", "tilt_c": "rad"}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axis", unit_vector("axis", self.axis))
@@ -253,14 +249,6 @@ class AxisNormalToSurface(Constraint):
     @cached_property
     def _form(self) -> tuple[Surface, tuple[Parameter, ...]]:
         return with_parameters(self.name, self.surface)
-
-    @property
-    def force_signals(self) -> tuple[Signal, ...]:
-        return signals([f"{self.name}.moment_b", f"{self.name}.moment_c"], "N m")
-
-    @property
-    def residual_signals(self) -> tuple[Signal, ...]:
-        return signals([f"{self.name}.tilt_b", f"{self.name}.tilt_c"], "rad")
 
     def residual(self, frames: Frames) -> ca.SX:
         a, b, c = self._axes(frames)

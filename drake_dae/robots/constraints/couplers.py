@@ -14,9 +14,9 @@ from pydrake.solvers import LinearEqualityConstraint, MathematicalProgram
 from drake_dae.arguments import checked
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Application, Constraint
+from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.points import FixedDistance
-from drake_dae.robots.links.links import Frames, Kinematics, Links, position_index
+from drake_dae.robots.links.links import Application, Frames, Kinematics, Links, position_index
 from drake_dae.robots.links.plant_frames import frame_name, joint_names
 from drake_dae.robots.surfaces.surface import triple
 
@@ -97,8 +97,8 @@ class JointCoupler(Constraint):
             axis = kinematics.joint_axis(name)
             if axis is None:
                 return ()
-            axes = share * axis.force, share * axis.moment
-            applications.append(Application(axis.point, *axes, axis.child, axis.parent))
+            axes = share * axis.force_axes, share * axis.moment_axes
+            applications.append(Application(axis.point, *axes, axis.frame_b, axis.frame_a))
         return tuple(applications)
 
 

@@ -14,9 +14,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import brief
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Application, Constraint, Joint
+from drake_dae.robots.constraints.constraint import Constraint, Joint
 from drake_dae.robots.constraints.points import rotation_error
-from drake_dae.robots.links.links import Frames, Kinematics
+from drake_dae.robots.links.links import Application, Frames, Kinematics
 from drake_dae.robots.links.plant_frames import without_round_off
 from drake_dae.robots.surfaces.surface import Vector
 

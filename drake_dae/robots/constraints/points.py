@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -13,8 +14,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Application, Constraint
-from drake_dae.robots.links.links import Frames, Kinematics
+from drake_dae.robots.constraints.constraint import Constraint
+from drake_dae.robots.links.links import Application, Frames, Kinematics
 from drake_dae.robots.links.plant_frames import body_with_frame, constant_pose
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.trace.expressions import length_of
@@ -49,18 +50,12 @@ class FixedDistance(Constraint):
     point_b: Vector
     length: float
     name: str = "rod"
+    force_units: ClassVar = {"thrust": "N"}
+    residual_units: ClassVar = {"stretch": "m"}
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter(f"{self.name}.length", np.array([self.length]), "m", positive=True),)
-
-    @property
-    def force_signals(self) -> tuple[Signal, ...]:
-        return (Signal(f"{self.name}.thrust", "N"),)
-
-    @property
-    def residual_signals(self) -> tuple[Signal, ...]:
-        return (Signal(f"{self.name}.stretch", "m"),)
 
     def residual(self, frames: Frames) -> ca.SX:
         return length_of(self._apart(frames)) - self.parameters[0].symbol
@@ -165,6 +160,8 @@ class WeldedFrames(Constraint):
     frame_b: str
     pose: RigidTransform = field(default_factory=RigidTransform)
     name: str = "weld"
+    force_units: ClassVar = dict(fx="N", fy="N", fz="N", mx="N m", my="N m", mz="N m")
+    residual_units: ClassVar = dict(x="m", y="m", z="m", rx="rad", ry="rad", rz="rad")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "pose", RigidTransform(self.pose))
@@ -173,16 +170,6 @@ class WeldedFrames(Constraint):
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter(f"{self.name}.position", self.pose.translation(), "m"),)
-
-    @property
-    def force_signals(self) -> tuple[Signal, ...]:
-        forces, moments = ([f"{self.name}.{kind}{axis}" for axis in "xyz"] for kind in "fm")
-        return (*signals(forces, "N"), *signals(moments, "N m"))
-
-    @property
-    def residual_signals(self) -> tuple[Signal, ...]:
-        shifts, turns = ([f"{self.name}.{kind}{axis}" for axis in "xyz"] for kind in ("", "r"))
-        return (*signals(shifts, "m"), *signals(turns, "rad"))
 
     def residual(self, frames: Frames) -> ca.SX:
         R_AW = frames.rotation(self.frame_a).T

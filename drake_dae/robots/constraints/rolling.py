@@ -12,8 +12,8 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
-from drake_dae.robots.constraints.constraint import Application, Constraint
-from drake_dae.robots.links.links import Frames, Kinematics
+from drake_dae.robots.constraints.constraint import Constraint
+from drake_dae.robots.links.links import Application, Frames, Kinematics
 from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
 from drake_dae.trace.expressions import length_of
 
@@ -43,17 +43,11 @@ class Blade(Constraint):
     axis: Vector = (0.0, 1.0, 0.0)
     point: Vector = (0.0, 0.0, 0.0)
     name: str = "blade"
+    force_units: ClassVar = {"side_force": "N"}
+    residual_units: ClassVar = {"side_speed": "m/s"}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "axis", unit_vector("axis", self.axis))
-
-    @property
-    def force_signals(self) -> tuple[Signal, ...]:
-        return (Signal(f"{self.name}.side_force", "N"),)
-
-    @property
-    def residual_signals(self) -> tuple[Signal, ...]:
-        return (Signal(f"{self.name}.side_speed", "m/s"),)
 
     def rate(self, kinematics: Kinematics) -> ca.SX:
         return ca.dot(self._side(kinematics), kinematics.velocity(self.frame, self.point))
@@ -187,6 +181,8 @@ class RollingBall(Constraint):
     center: Vector = (0.0, 0.0, 0.0)
     along: Vector = (1.0, 0.0, 0.0)
     name: str = "ball"
+    force_units: ClassVar = {"force": "N", "friction_1": "N", "friction_2": "N"}
+    residual_units: ClassVar = {"distance": "m", "slip_1": "m/s", "slip_2": "m/s"}
     is_unilateral: ClassVar[tuple[bool, ...]] = (True, False, False)
 
     def __post_init__(self) -> None:
@@ -204,16 +200,6 @@ class RollingBall(Constraint):
             Parameter(f"{self.name}.position", np.array(self.surface.position), "m"),
             Parameter(f"{self.name}.radius", np.array([self.radius]), "m", positive=True),
         )
-
-    @property
-    def force_signals(self) -> tuple[Signal, ...]:
-        kinds = ("force", "friction_1", "friction_2")
-        return signals([f"{self.name}.{kind}" for kind in kinds], "N")
-
-    @property
-    def residual_signals(self) -> tuple[Signal, ...]:
-        slips = signals([f"{self.name}.slip_1", f"{self.name}.slip_2"], "m/s")
-        return (Signal(f"{self.name}.distance", "m"), *slips)
 
     @property
     def coordinate_signals(self) -> tuple[Signal, ...]:

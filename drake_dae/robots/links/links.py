@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import casadi as ca
 import numpy as np
@@ -18,23 +18,20 @@ from drake_dae.robots.links.tree import ArticulatedBodies
 ORIGIN = (0.0, 0.0, 0.0)
 
 
-class Frames(Protocol):
+class Frames(ABC):
     """The poses of frames, as expressions. Frames are given by name; "world" is one.
 
     `Links` and `Kinematics` are both of this kind, so functions of positions accept either.
     """
 
-    @property
-    def q(self) -> ca.SX:
-        """Generalized positions, symbols, shape (nq, 1)."""
+    q: ca.SX  # Generalized positions, symbols, shape (nq, 1).
+    position_signals: tuple[Signal, ...]  # Names and units of q.
 
-    @property
-    def position_signals(self) -> tuple[Signal, ...]:
-        """Names and units of q."""
-
+    @abstractmethod
     def rotation(self, frame: Any) -> ca.SX:
         """R_WF, shape (3, 3): the orientation of a frame in the world."""
 
+    @abstractmethod
     def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
         """p_W in m, shape (3, 1): the position of a point that is fixed in a frame."""
 
@@ -47,17 +44,32 @@ def position_index(frames: Frames, name: str) -> int:
     return names.index(name)
 
 
-class JointAxis(NamedTuple):
-    """Force and moment of a unit generalized force of a joint, in the world, shapes (3, 1).
+@dataclass(frozen=True, eq=False)
+class Application:
+    """The action of forces lambda: F = force_axes @ lambda + drag, M = moment_axes @ lambda.
 
-    They act on the frame `child`, the force in N at `point`; the opposite acts on `parent`.
+    All vectors are in the world. Frame A exerts F and M on frame B at the point; B exerts the
+    opposite on A at the same point.
+
+    Attributes:
+        point: The point of application of F, in m, shape (3, 1).
+        force_axes: The force in N for a unit of each lambda, shape (3, m).
+        moment_axes: The moment in N m for a unit of each lambda, shape (3, m).
+        frame_b, frame_a: Names of the frames.
+        drag: The part of F in N that acts without constraint forces, shape (3, 1); None if none.
     """
 
-    child: str
-    parent: str
     point: ca.SX
-    force: ca.SX
-    moment: ca.SX
+    force_axes: ca.SX
+    moment_axes: ca.SX
+    frame_b: str
+    frame_a: str = "world"
+    drag: ca.SX | None = None
+
+    def force(self, constraint_force: ca.SX) -> ca.SX:
+        """F in N, shape (3, 1), for constraint forces of shape (m, 1)."""
+        force = ca.mtimes(self.force_axes, constraint_force)
+        return force if self.drag is None else force + self.drag
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +98,7 @@ class Reaction:
         return Reaction(function(self.generalized), wrenches)
 
 
-class Kinematics(ABC):
+class Kinematics(Frames):
     """The frames of a robot in motion, in which constraints are expressed.
 
     1. Its expressions contain q, v, the robot's parameters, and symbols of its own for poses and
@@ -98,27 +110,12 @@ class Kinematics(ABC):
        expression e of positions and velocities.
     4. `reaction(power)` are the forces with a given power, linear in velocities: tau . v = power
        with the generalized force tau that `Links` computes from them.
-    5. `joint_axis` of a position is the force and moment of its joint; None if the joint has
-       several positions, or if it is not known.
-
-    Attributes:
-        q, v: Positions and velocities, shapes (nq, 1) and (nv, 1).
-        position_signals: Names and units of q.
-        acceleration: v', shape (nv, 1).
+    5. `joint_axis` of a position is how a unit generalized force of its joint acts; None if the
+       joint has several positions, or if it is not known.
     """
 
-    q: ca.SX
-    position_signals: tuple[Signal, ...]
-    v: ca.SX
-    acceleration: ca.SX
-
-    @abstractmethod
-    def rotation(self, frame: Any) -> ca.SX:
-        """R_WF, shape (3, 3): the orientation of a frame in the world."""
-
-    @abstractmethod
-    def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
-        """p_W in m, shape (3, 1): the position of a point that is fixed in a frame."""
+    v: ca.SX  # Generalized velocities, shape (nv, 1).
+    acceleration: ca.SX  # v', shape (nv, 1).
 
     @abstractmethod
     def angular_velocity(self, frame: Any) -> ca.SX:
@@ -140,8 +137,8 @@ class Kinematics(ABC):
     def value(self, expression: ca.SX) -> ca.SX:
         """The expression in terms of q, v, `acceleration` and parameters alone."""
 
-    def joint_axis(self, position: str) -> JointAxis | None:
-        """The force and moment of the joint of a position, by the position's name."""
+    def joint_axis(self, position: str) -> Application | None:
+        """The action of the joint of a position, by its name, on the child and the parent."""
         return None
 
     def push(self, frame: Any, force: ca.SX, point: ArrayLike = ORIGIN) -> Reaction:
@@ -160,7 +157,7 @@ class Outline(NamedTuple):
     radius: float = 0.0
 
 
-class Links(ABC):
+class Links(Frames):
     """Rigid links without contact: M(q) v' + H(q, v) = B u + R, q' = N(q) v.
 
     R is the generalized force of a reaction. `MultibodyExpressions` are links of a MultibodyPlant,
@@ -181,15 +178,13 @@ class Links(ABC):
        and `velocity_signals` together.
     """
 
-    q: ca.SX  # Generalized positions, symbols, shape (nq, 1).
     v: ca.SX  # Generalized velocities, symbols, shape (nv, 1).
     velocity_map: ca.SX  # N(q) of q' = N(q) v, shape (nq, nv).
     mass_matrix: ca.SX  # M(q), shape (nv, nv).
     bias: ca.SX  # H(q, v), shape (nv, 1).
     actuation_matrix: FloatArray  # B, shape (nv, nu).
     parameters: tuple[Parameter, ...]  # Numbers that a study may change.
-    position_signals: tuple[Signal, ...]  # Names and units of q, and so on.
-    velocity_signals: tuple[Signal, ...]
+    velocity_signals: tuple[Signal, ...]  # Names and units of v.
     actuator_signals: tuple[Signal, ...]
     effort_limits: FloatArray  # Largest |u|, shape (nu,), infinite where there is no limit.
     reflected_inertia: FloatArray  # The part of M from each rotor, kg m^2 (kg), shape (nu,).
@@ -200,14 +195,6 @@ class Links(ABC):
     plant: MultibodyPlant | None = None  # Their MultibodyPlant, for Drake's visualization.
     landmark_names: tuple[str, ...]  # The frames whose origins are landmarks of the robot.
     outlines: tuple[Outline, ...]  # Of the collision geometry of each link, or its origin.
-
-    @abstractmethod
-    def rotation(self, frame: Any) -> ca.SX:
-        """R_WF, shape (3, 3): the orientation of a frame in the world."""
-
-    @abstractmethod
-    def position(self, frame: Any, point: ArrayLike = ORIGIN) -> ca.SX:
-        """p_W in m, shape (3, 1): the position of a point that is fixed in a frame."""
 
     @abstractmethod
     def landmarks(self) -> ca.SX:

@@ -13,7 +13,7 @@ from pydrake.multibody.tree import Frame
 
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.dae import Signal
-from drake_dae.robots.links.links import ORIGIN, JointAxis, Kinematics, Reaction, position_index
+from drake_dae.robots.links.links import ORIGIN, Application, Kinematics, Reaction, position_index
 from drake_dae.robots.links.plant_frames import (
     PlantFrames,
     elementary_joints,
@@ -105,7 +105,7 @@ class TreeKinematics(Kinematics):
             wrenches[frame] = (ca.gradient(power, symbols.velocity), moment)
         return Reaction(ca.sparsify(ca.gradient(power, self.v)), wrenches)
 
-    def joint_axis(self, position: str) -> JointAxis | None:
+    def joint_axis(self, position: str) -> Application | None:
         plant, place = self._frames.plant, position_index(self, position)
         for index in plant.GetJointIndices():
             joint = plant.get_joint(index)
@@ -121,7 +121,7 @@ class TreeKinematics(Kinematics):
             for body in (joint.child_body(), joint.parent_body())
         )
         axes = (along, none) if last.axis is None else (none, along)
-        return JointAxis(child, parent, self.position(frame), *axes)
+        return Application(self.position(frame), *axes, child, parent)
 
     def value(self, expression: ca.SX) -> ca.SX:
         pairs = [pair for entry in self._symbols.values() for pair in self._values(*entry)]

@@ -101,6 +101,6 @@ class CommandedReferences(ReferenceGenerator):
             derivative=stacked(rates),
             parameters=command,
             start={},
-            signals={"commands": self.commands},
+            signals={"parameters": self.commands},
         )
         TracedSystem.__init__(self, block, sees_steps=False)

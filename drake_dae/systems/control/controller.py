@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,7 +11,6 @@ from pydrake.systems.framework import Context
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.blocks.block import Block, Held, Requirement, where_finite
-from drake_dae.blocks.computations import DERIVATIVE, HELD, PARAMETERS, STATE, Computation
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae import FeedbackGains, GainDesign, Signal, TrackingLaw
 from drake_dae.errors import ModelError
@@ -155,12 +152,6 @@ class TrackingController(ParameterizedSystem, Controller):
         rate, *_, valid = motion.function.call([*self.law.inputs.values()])
         return where_finite(rate, valid)
 
-    def _shares(self) -> dict[str, Any]:
-        return {
-            "model": self.dae,
-            "under": partial(_motion_under, self.law, bool(self.sample_period)),
-        }
-
 
 def law_block(law: TrackingLaw, limits: FloatArray, sample_period: float) -> Block:
     """The law (28) with the integrals of its errors, as a block; see `TrackingController`.
@@ -191,6 +182,7 @@ def law_block(law: TrackingLaw, limits: FloatArray, sample_period: float) -> Blo
             "control": system.control_signals,
             "tracking_error": system.output_signals,
             "integral": signals,
+            "parameters": law.parameter_signals,
         },
     )
     if not signals:
@@ -209,14 +201,3 @@ def law_block(law: TrackingLaw, limits: FloatArray, sample_period: float) -> Blo
         return replace(block, state=sigma, derivative=rate)
     summed = Held(sigma, sigma + sample_period * rate, np.zeros(count), sample_period)
     return replace(block, held={"integral": summed})
-
-
-def _motion_under(law: TrackingLaw, is_sampled: bool) -> Computation | None:
-    """x' and v of a plant that is the law's own model, from the desired derivatives."""
-    motion = law.trace_motion()
-    if motion is None:
-        return None
-    memory = HELD if is_sampled else STATE
-    named = {"state": "estimated_state", "integral": memory, "parameters": PARAMETERS}
-    sources = tuple(named.get(name, name) for name in motion.input_names)
-    return Computation.of(motion, sources, (DERIVATIVE, "constraint_input"))

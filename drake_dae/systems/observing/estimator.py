@@ -194,6 +194,7 @@ def _block(law: TrackingLaw, sample: EstimatorSample, period: float) -> Block:
             Signal(f"disturbance of {system.state_signals[i].name}") for i in observation.rows
         ),
         "friction": frictions,
+        "parameters": system.parameter_signals,
     }
     if estimates:
         outputs = {"estimated_state": sample.state, **outputs}

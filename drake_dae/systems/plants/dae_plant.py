@@ -1,7 +1,6 @@
 """Any DaeSystem as a LeafSystem."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -140,9 +139,6 @@ class DaePlant(ParameterizedSystem, Plant):
         derivatives = self.structure.derivatives
         return derivatives.expand(derivatives.constraint_input)  # (25)
 
-    def _shares(self) -> dict[str, Any]:
-        return {"model": self.dae, "check_start": self.check_start}
-
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
         return EventStatus.DidNothing()
@@ -213,6 +209,7 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
             "constraint_force": system.force_signals,
             "constraint_residual": manifold.residual_signals,
             "controlled_output": system.output_signals,
+            "parameters": system.parameter_signals,
         },
     )
 

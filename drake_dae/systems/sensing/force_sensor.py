@@ -12,6 +12,7 @@ from drake_dae.arrays import vector
 from drake_dae.blocks.block import TIME, Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
+from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
 
 
@@ -97,6 +98,7 @@ class ForceSensor(TracedSystem):
             ca.SX.sym(name, size) for name in ("force", "y", "sampled", "noise")
         )
         parts = self.bias, self.noise_deviation, self.drift
+        names = [Signal(f"{p}[{i}]") for p in ("bias", "noise", "drift") for i in range(size)]
         bias, deviation, drift = (ca.SX.sym(name, size) for name in ("bias", "deviation", "drift"))
         inputs = {"force": force}
         measured = (y if self.time_constant else force) + bias + drift * TIME
@@ -109,6 +111,7 @@ class ForceSensor(TracedSystem):
             {"measured_force": sampled if self.sample_period else measured},
             parameters=ca.vertcat(bias, deviation, drift),
             start={"parameters": np.concatenate(parts)},
+            signals={"parameters": names},
         )
         if self.time_constant:
             rate = (force - y) / self.time_constant

@@ -475,6 +475,7 @@ class Automaton:
                 "change": CHANGE,
                 "phase": (Signal("phase"),),
                 "ending": (Signal("ending"),),
+                "parameters": closed.parameter_signals,
             },
         )
 

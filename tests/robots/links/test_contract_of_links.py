@@ -250,10 +250,12 @@ def test_a_joint_axis_is_a_unit_of_the_generalized_force(name):
             continue
         found += 1
         acting = Reaction(ca.SX(links.v.numel(), 1))
-        for frame, sign in ((axis.child, 1.0), (axis.parent, -1.0)):
+        for frame, sign in ((axis.frame_b, 1.0), (axis.frame_a, -1.0)):
             # The force acts at the point, to which the frame's origin has a lever.
-            moment = axis.moment + ca.cross(axis.point - kinematics.position(frame), axis.force)
-            power = ca.dot(axis.force, kinematics.velocity(frame))
+            moment = axis.moment_axes + ca.cross(
+                axis.point - kinematics.position(frame), axis.force_axes
+            )
+            power = ca.dot(axis.force_axes, kinematics.velocity(frame))
             power += ca.dot(moment, kinematics.angular_velocity(frame))
             acting += kinematics.reaction(sign * power)
         tau = links.generalized_force(kinematics, acting)

@@ -29,10 +29,9 @@ from runs import both
 from scipy.linalg import expm
 
 from drake_dae import rollout
-from drake_dae.compiler.compile import compile_diagram
 from drake_dae.errors import ModelError
-from drake_dae.running import export_code, start_values
-from drake_dae.running.rollout import program
+from drake_dae.running import export_loop, start_values
+from drake_dae.running import rollout as module
 
 
 def fixed(step=1e-3):
@@ -69,26 +68,14 @@ def test_a_loop_wired_by_hand_rolls_out(hold, compiled):
 @pytest.mark.slow
 @pytest.mark.parametrize("hold", [0.0, 0.004])
 def test_it_is_exported(hold, tmp_path):
-    """The test program compares law, plant, projection, derivative, outputs and updates."""
+    """The program of the export compares with Drake's Simulator."""
     diagram, context, _ = wired(hold)
-    export_code(diagram, context, "arm", tmp_path)
+    export_loop(diagram, context, "arm", tmp_path, fixed(), 0.2)
     done = subprocess.run(
         ["make", "-s", "-C", str(tmp_path)], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    header = (tmp_path / "arm.h").read_text()
-    wanted = ["law", "plant", "project", "loop_rate", "loop_outputs"]
-    for name in [*wanted, *(["loop_update_0"] if hold else [])]:
-        assert f"int arm_{name}(" in header
-
-
-def test_an_export_needs_one_plant_and_one_law(tmp_path):
-    builder = DiagramBuilder()
-    sine = builder.AddSystem(Sine(1.0, 2.0, 0.0, 1))
-    builder.ExportOutput(sine.get_output_port(0), "sine")
-    diagram = builder.Build()
-    with pytest.raises(ModelError, match=r"0 .* 0 "):
-        export_code(diagram, diagram.CreateDefaultContext(), "sine", tmp_path)
+    assert "played: 200 steps as in Drake" in done.stdout
 
 
 def random_diagram(seed):
@@ -351,11 +338,13 @@ def test_a_diagram_is_compiled_once(monkeypatch):
     """To compile one takes many times as long as a short run; another diagram is another."""
     made = []
 
-    def counted(diagram):
-        made.append(diagram)
-        return compile_diagram(diagram)
+    whole = module.RolloutProgram
 
-    monkeypatch.setattr(program, "compile_diagram", counted)
+    def counted(diagram, *arguments):
+        made.append(diagram)
+        return whole(diagram, *arguments)
+
+    monkeypatch.setattr(module, "RolloutProgram", counted)
     ends = []
     for factor in (1.0, 2.0):
         builder = DiagramBuilder()

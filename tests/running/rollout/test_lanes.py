@@ -12,13 +12,13 @@ import pytest
 from runs import scenario, some
 
 from drake_dae import build_scenario, rollout
+from drake_dae.blocks import machine
+from drake_dae.blocks.emitter import emitted
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import MachineCodeWarning, ModelError
+from drake_dae.running import rollout as module
 from drake_dae.running import start_values
-from drake_dae.running.rollout import rollout as module
-from drake_dae.running.rollout.lanes.emitter import emitted
-from drake_dae.running.rollout.lanes.library import FOLDER, OPTIONS, source
-from drake_dae.running.rollout.program import program_of
+from drake_dae.running.rollout import program_of
 from drake_dae.trace.compiled import library
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
@@ -201,13 +201,13 @@ __attribute__((visibility("default"))) int evaluate(
   real own[3], shared[2], found[ROWS];
   int i, lane;
   for (lane = 0; lane < LANES; lane++) {
-    for (i = 0; i < 3; i++) LANE(own[i], lane) = x[3 * lane + i];
-    for (i = 0; i < 2; i++) LANE(shared[i], lane) = p[i];
+    for (i = 0; i < 3; i++) AT(own[i], lane) = x[3 * lane + i];
+    for (i = 0; i < 2; i++) AT(shared[i], lane) = p[i];
   }
   const mask far = operations(c, own, shared, found);
-  for (lane = 0; lane < LANES; lane++) r[ROWS * LANES + lane] = LANE(far, lane) ? 1.0 : 0.0;
+  for (lane = 0; lane < LANES; lane++) r[ROWS * LANES + lane] = AT(far, lane) ? 1.0 : 0.0;
   for (lane = 0; lane < LANES; lane++) {
-    for (i = 0; i < ROWS; i++) r[ROWS * lane + i] = LANE(found[i], lane);
+    for (i = 0; i < ROWS; i++) r[ROWS * lane + i] = AT(found[i], lane);
   }
   return LANES;
 }
@@ -272,11 +272,11 @@ def test_operations_are_those_of_casadi(options):
     """To two units in the last place; sine and cosine have a series of their own."""
     function = ca.Function("operations", [X, P], [OPERATIONS], {"cse": False})
     rows, constants = function.numel_out(0), list[float]()
-    header = (FOLDER / "lanes.h").read_text()
+    header = (machine.FOLDER / "real.h").read_text()
     text = [header, emitted(function, "operations", constants), f"enum {{ ROWS = {rows} }};", ENTRY]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MachineCodeWarning)
-        path = library("\n".join(text), 100, True, True, (*OPTIONS, options))
+        path = library("\n".join(text), 100, True, True, (*machine.LANES_OPTIONS, options))
     if path is None:
         pytest.skip(f"the C compiler does not know {options}")
     code = ctypes.CDLL(str(path))
@@ -306,7 +306,7 @@ def test_diagrams_that_differ_in_constants_share_their_code(monkeypatch):
     for more in ((), others):
         loop, chosen, starts, rows = problem("two_link_wall", *settings, *more)
         tables.append([])
-        texts.append(source(program_of(loop), tables[-1]))
+        texts.append(machine.source(program_of(loop).functions, tables[-1], several=True))
         times = np.linspace(0.0, 0.1, 6)
         found.append(both_ways(monkeypatch, loop, starts, rows, times, config=chosen.integrator))
         assert_same(*found[-1], 1e-13)

@@ -29,8 +29,7 @@ from drake_dae.errors import (
 )
 from drake_dae.references.polynomials import UNROLLED
 from drake_dae.running import start_values
-from drake_dae.running.rollout.program import program_of
-from drake_dae.running.rollout.rollout import run_loop
+from drake_dae.running.rollout import program_of, run_loop
 from drake_dae.scenario.rolled import roll_scenario
 
 COMPILED = {"boom", "planar_4rrr", "seven_joint_moving_plate", "two_link_hydraulics"}
@@ -396,10 +395,10 @@ def test_a_study_decides_on_machine_code_by_its_length_alone():
     chosen = scenario("two_link_wall", "duration=0.1")
     loop, context = build_scenario(chosen)
     for lasting in (1.0, 1000.0, 1.0):
-        program = program_of(loop).twins
-        before = program.library is not None
+        program = program_of(loop).shared
+        before = program.stepper is not None
         assert roll_scenario(chosen, loop, context, lasting).failure is None
-        assert (program.library is not None) == (before or lasting > 1.0)
+        assert (program.stepper is not None) == (before or lasting > 1.0)
 
 
 def test_without_a_compiler_it_warns_and_goes_on(monkeypatch):

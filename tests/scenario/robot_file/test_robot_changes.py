@@ -15,14 +15,11 @@ from vendors import joint, link, mobile_arm, panda, robot, write_panda
 from drake_dae import load_scenario
 from drake_dae.errors import RobotFileWarning, ScenarioError
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.robot_file.changes import change_robot
 from drake_dae.scenario.robot_file.reading import read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot
 
 # The collision meshes of the panda are left out.
 pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
-
-ARM = [f"panda_joint{k + 1}" for k in range(7)]
 
 # The hand on a wall, the fingers locked, the base on a table that is turned.
 PANDA = """
@@ -178,33 +175,6 @@ def test_what_does_not_fit_is_refused_with_its_key(settings, words, tmp_path):
     assert "\n" not in message
     assert [word for word in words if word not in message] == [], message
     assert not re.search(r"plant\.\w+\(|Finalize", message)
-
-
-@pytest.mark.parametrize(
-    ("actuators", "limits"),
-    [
-        ("all", dict.fromkeys(ARM, 87.0)),
-        (
-            "{panda_joint3: 12.5, panda_joint1: null}",
-            {"panda_joint3": 12.5, "panda_joint1": 87.0},
-        ),
-        ("[panda_joint2]", {"panda_joint2": 87.0}),
-    ],
-)
-@pytest.mark.parametrize("file", ["panda_description/urdf/panda.urdf", "arm.dmd.yaml"])
-def test_effort_limits_are_those_of_the_file_where_none_is_given(actuators, limits, file, tmp_path):
-    path = files(tmp_path, PANDA)
-    (tmp_path / "arm.dmd.yaml").write_text(
-        "directives: [{add_model: {name: arm, file: package://panda_description/urdf/panda.urdf}}]"
-    )
-    settings = [f"robot.actuators={actuators}", f"robot.file={file}"]
-    settings += ["robot.packages.panda_description=panda_description"]
-    chosen = load_scenario(path, settings).robot
-    plant, efforts = read_robot(chosen)
-    change_robot(chosen, plant, efforts)
-    found = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices()]
-    assert {actuator.name(): actuator.effort_limit() for actuator in found} == limits
-    assert [actuator.name() for actuator in found] == list(limits)
 
 
 def test_an_effort_limit_of_0_is_unknown(tmp_path):

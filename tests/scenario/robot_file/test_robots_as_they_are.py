@@ -226,23 +226,6 @@ def test_an_impossible_inertia_is_named_and_the_nearest_taken(name, entries, is_
 # What a URDF means.
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "words"),
-    [
-        (
-            "r.urdf",
-            robot("r", link("a", 1), link("b", 1), joint("j", "a", "b", "0 0 1", kind="spherical")),
-            "spherical",
-        ),
-        ("r.urdf", robot("r", link("a", 1).replace("0.01 -0.02 0.12", "$(arg x)")), "xacro"),
-        ("r.xml", '<mujoco model="m"><compiler coordinate="global"/></mujoco>', "MuJoCo"),
-    ],
-)
-def test_what_drake_cannot_read_is_reported_with_what_to_do(name, text, words, tmp_path):
-    with pytest.raises(ModelError, match=words):
-        plant_of(written(tmp_path, text, name))
-
-
 # Meshes.
 
 

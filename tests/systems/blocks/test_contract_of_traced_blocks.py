@@ -1,4 +1,4 @@
-"""The rules of `Traced`, on every block of ours: against Drake, in the same context."""
+"""The functions of a block against Drake in the same context: of each block, ours and Drake's."""
 
 from dataclasses import replace
 
@@ -9,8 +9,39 @@ import pytest
 from actuated import actuated
 from alone import alone
 from arms import arm, law
+from blocks_of_users import Counter_
 from problems import PROBLEMS
+from pydrake.math import sin
+from pydrake.symbolic import Variable, if_then_else, logical_and
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import (
+    BasicVector_,
+    DiagramBuilder,
+    LeafSystem_,
+)
+from pydrake.systems.primitives import (
+    Adder,
+    AffineSystem,
+    ConstantVectorSource,
+    Demultiplexer,
+    DiscreteDerivative,
+    DiscreteTimeDelay,
+    DiscreteTimeIntegrator,
+    FirstOrderLowPassFilter,
+    Gain,
+    Integrator,
+    LinearSystem,
+    MatrixGain,
+    Multiplexer,
+    PassThrough,
+    Saturation,
+    Sine,
+    StateInterpolatorWithDiscreteDerivative,
+    SymbolicVectorSystem,
+    WrapToSystem,
+    ZeroOrderHold,
+)
+from pydrake.systems.scalar_conversion import TemplateSystem
 from runs import some
 
 from drake_dae import (
@@ -32,10 +63,9 @@ from drake_dae import (
     TrackingLaw,
     poles,
 )
-from drake_dae.blocks.computations import DERIVATIVE, HELD, Traced
-from drake_dae.compiler.compile import compile_diagram
-from drake_dae.compiler.wires import Wires
 from drake_dae.dae import with_disturbance
+from drake_dae.errors import ModelError
+from drake_dae.running.rollout import RolloutProgram
 from drake_dae.systems import CommandedReferences, Observing, PointMaterial
 from drake_dae.systems.control.limits import ControlLimits
 from drake_dae.systems.control.sampling import ControlHold, Sampling
@@ -169,107 +199,168 @@ BLOCKS = {
 }
 
 
+@TemplateSystem.define("Pendulum_")
+def Pendulum_(T):
+    """A user's system, templated on the scalar type."""
+
+    class Impl(LeafSystem_[T]):
+        def _construct(self, length=0.5, converter=None):
+            super().__init__(converter)
+            self.length = length
+            self.DeclareNumericParameter(BasicVector_[T]([9.81]))
+            self.DeclareContinuousState(2)
+            self.DeclareVectorInputPort("torque", 1)
+            self.DeclareVectorOutputPort("angle", 1, self._calc, {self.xc_ticket()})
+
+        def _construct_copy(self, other, converter=None):
+            Impl._construct(self, other.length, converter=converter)
+
+        def DoCalcTimeDerivatives(self, context, derivatives):
+            angle, rate = context.get_continuous_state_vector().CopyToVector()
+            gravity = context.get_numeric_parameter(0)[0]
+            torque = self.GetInputPort("torque").Eval(context)[0]
+            value = [rate, torque - gravity / self.length * sin(angle)]
+            derivatives.get_mutable_vector().SetFromVector(value)
+
+        def _calc(self, context, output):
+            output[0] = context.get_continuous_state_vector()[0]
+
+    return Impl
+
+
+def symbolic_system():
+    x, u, t = Variable("x"), Variable("u"), Variable("t")
+    inside = logical_and(x > -0.5, x <= 0.5)
+    return SymbolicVectorSystem(
+        time=t,
+        state=[x],
+        input=[u],
+        dynamics=[if_then_else(inside, u - x, -x)],
+        output=[x * u + abs(t - 1.0)],
+    )
+
+
+SYSTEMS = {
+    "Gain": lambda: Gain(2.0, 2),
+    "Saturation": lambda: Saturation([-0.5, -0.1], [0.3, 0.2]),
+    "FirstOrderLowPassFilter": lambda: FirstOrderLowPassFilter(0.2, 2),
+    "ZeroOrderHold": lambda: ZeroOrderHold(0.1, 2),
+    "Sine": lambda: Sine(1.0, 2.0, 0.3, 2),
+    "Adder": lambda: Adder(3, 2),
+    "Integrator": lambda: Integrator(2),
+    "DiscreteTimeDelay": lambda: DiscreteTimeDelay(0.1, 3, 2),
+    "DiscreteDerivative": lambda: DiscreteDerivative(2, 0.1),
+    "DiscreteTimeIntegrator": lambda: DiscreteTimeIntegrator(2, 0.1),
+    "LinearSystem": lambda: LinearSystem(
+        A=[[0, 1.0], [-2.0, -0.3]], B=[[0.0], [1.0]], C=[[1.0, 0.0]], D=[[0.7]]
+    ),
+    "LinearSystem with a period": lambda: LinearSystem(
+        A=np.eye(2) * 0.5, B=np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), time_period=0.1
+    ),
+    "AffineSystem": lambda: AffineSystem(D=[[2.0, -1.0]], y0=[0.5]),
+    "ConstantVectorSource": lambda: ConstantVectorSource([1.0, 2.0]),
+    "Multiplexer": lambda: Multiplexer([1, 2]),
+    "Demultiplexer": lambda: Demultiplexer(4, 2),
+    "PassThrough": lambda: PassThrough(2),
+    "MatrixGain": lambda: MatrixGain([[1.0, 2.0], [3.0, 4.0]]),
+    "SymbolicVectorSystem": symbolic_system,
+    "a diagram of primitives": lambda: StateInterpolatorWithDiscreteDerivative(2, 0.1),
+    "a template of the user's": lambda: Pendulum_[None](0.8),
+    "a template whose updates begin later": lambda: Counter_[None](0.1, 0.03),
+}
+
+
 def in_context(name):
-    """A block alone, compiled, and a context in which it has values."""
-    system = BLOCKS[name]()
+    """A block alone, its functions, and a context in which it has values."""
+    system = (BLOCKS | SYSTEMS)[name]()
     diagram, context = alone(system)
     own = system.GetMyMutableContextFromRoot(context)
     if isinstance(system, DaePlant):
-        state = system.structure.states[1]
-        system.set_consistent_state(own, state)
+        system.set_consistent_state(own, system.structure.states[1])
     elif isinstance(system, TrackingController):
-        state = system.law.structure.states[1]
-        system.GetInputPort("estimated_state").FixValue(own, state)
-        if name.endswith("its references"):
-            context = diagram.CreateDefaultContext()
-            context.SetTime(0.4)
-            own = system.GetMyMutableContextFromRoot(context)
-            diagram.GetInputPort("in 0").FixValue(context, state)
-        else:
-            diagram.GetInputPort("in 0").FixValue(context, state)
-    return system, diagram, context, compile_diagram(diagram, context=context)
+        diagram.GetInputPort("in 0").FixValue(context, system.law.structure.states[1])
+    return system, diagram, context, RolloutProgram(diagram, None, name)
 
 
-@pytest.mark.parametrize("name", some(BLOCKS, of=3, first=1))
-def test_outputs_derivatives_and_updates_are_those_of_the_block(name):
-    """Rules 2 to 4, to 1e-12 of the largest value: other common subexpressions are removed."""
-    system, diagram, context, compiled = in_context(name)
-    given = context.get_time(), *compiled.start(context), compiled.values(context)
+def check_functions(diagram, context, program, tolerance):
+    """Outputs and derivative are those of the diagram, to a share of the largest value."""
+    functions, given = program.functions, (context.get_time(), *program.values_in(context))
+    wanted = [diagram.GetOutputPort(output).Eval(context) for output in program.signals]
+    pairs = [(functions.row(*given), np.concatenate([np.zeros(0), *wanted]))]
+    if program.num_states:
+        derivative = diagram.EvalTimeDerivatives(context).CopyToVector()
+        pairs.append((functions.rate(*given), derivative))
+    for found, wanted in pairs:
+        scale = max(1.0, np.abs(wanted).max(initial=0.0))
+        np.testing.assert_allclose(found.full()[:, 0], wanted, rtol=0.0, atol=tolerance * scale)
 
-    def assert_same(found, wanted):
-        scale = max(1.0, np.max(np.abs(wanted), initial=0.0))
-        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * scale)
 
-    wanted = [diagram.GetOutputPort(output).Eval(context) for output in compiled.outputs]
-    row, valid = compiled.row(*given)
-    assert_same(row.full()[:, 0], np.concatenate(wanted))
-    assert np.isfinite(float(valid))
-    rate, valid = compiled.rate(*given)
-    assert_same(rate.full()[:, 0], diagram.EvalTimeDerivatives(context).CopyToVector())
-    assert np.isfinite(float(valid))
-    for update in compiled.rates:
-        held = compiled.start(context)[1]
-        held[list(update.places)] = update.function(*given, [])[0].full()[:, 0]
+@pytest.mark.parametrize("name", [*some(BLOCKS, of=3, first=1), *SYSTEMS])
+def test_outputs_derivatives_and_updates_are_those_of_the_system(name):
+    """To 1e-12 of the largest value: other common subexpressions are removed."""
+    _, diagram, context, program = in_context(name)
+    check_functions(diagram, context, program, 1e-12)
+    given = context.get_time(), *program.values_in(context)
+    noise = np.zeros(program.functions.sizes[4])
+    for rate in program.functions.rates:
+        if rate.offset:
+            context.SetTime(rate.offset + rate.period)
+            given = context.get_time(), *given[1:]
+        held = program.values_in(context)[1]
+        held[rate.places] = rate.function(*given, noise).full()[:, 0]
         # The events of this instant, a multiple of the period.
         simulator = Simulator(diagram, context.Clone())
         simulator.Initialize()
         simulator.AdvancePendingEvents()
-        own = system.GetMyContextFromRoot(simulator.get_context())
-        groups = range(own.num_discrete_state_groups())
-        assert_same(held, np.concatenate([own.get_discrete_state(i).value() for i in groups]))
+        found = program.values_in(simulator.get_context())[1]
+        scale = max(1.0, np.abs(found).max(initial=0.0))
+        np.testing.assert_allclose(held, found, rtol=0.0, atol=1e-12 * scale)
 
 
-@pytest.mark.parametrize("name", some(BLOCKS, of=3, first=2))
-def test_a_block_reports_the_same_each_time_and_all_of_it(name):
-    """Rules 1 and 6."""
-    system = BLOCKS[name]()
-    assert isinstance(system, Traced)
-    one, other = system.traced(), system.traced()
-    assert [c.sources for c in one.computations] == [c.sources for c in other.computations]
-    told = {output for each in one.computations for output in each.outputs}
-    context = system.CreateDefaultContext()
-    ports = {system.get_output_port(i).get_name() for i in range(system.num_output_ports())}
-    assert ports <= told
-    assert (DERIVATIVE in told) == bool(context.num_continuous_states())
-    updated = [HELD in update.computation.outputs for update in one.updates]
-    assert all(updated)
-    assert bool(updated) == bool(context.num_discrete_state_groups())
-
-
-@pytest.mark.parametrize("name", some(BLOCKS, of=3))
-def test_feedthrough_is_that_of_the_block(name):
-    """Rule 5: so an algebraic loop is one for both."""
-    system, diagram, _context, compiled = in_context(name)
-    depends = np.zeros((compiled.row.numel_out(0), compiled.sizes["parameters"]), dtype=bool)
-    depends[tuple(np.array(compiled.row.jac_sparsity(0, 3).get_triplet(), dtype=int))] = True
-    columns = {port: part for _, port, part in compiled.fixed}
-    wires = Wires.of(diagram)
-    first = 0
-    for output, signals in compiled.signals.items():
-        rows = depends[first : first + len(signals)]
-        first += len(signals)
-        _, j = wires.outputs[output]
+@pytest.mark.parametrize(
+    "name", [*some(BLOCKS, of=3), *(each for each in SYSTEMS if each != "a diagram of primitives")]
+)
+def test_feedthrough_is_that_of_the_system(name):
+    """So an algebraic loop is one for both."""
+    system, _, _, program = in_context(name)
+    block = program.composed.block
+    for j, output in enumerate(program.signals):
+        value = block.outputs[output]
         for i in range(system.num_input_ports()):
-            port = system.get_input_port(i).get_name()
-            part = columns.get(port, slice(0, 0))
-            if rows[:, part].any():
-                assert system.HasDirectFeedthrough(i, j), (output, port)
+            symbol = block.inputs.get(f"in {i}")
+            if symbol is not None and symbol.numel():
+                assert ca.depends_on(value, symbol) <= system.HasDirectFeedthrough(i, j)
+                if name in SYSTEMS:
+                    assert ca.depends_on(value, symbol) == system.HasDirectFeedthrough(i, j)
 
 
 @pytest.mark.parametrize("name", sorted(PROBLEMS))
 def test_any_plant_of_equations_is_traced(name):
     """To 1e-12 of the largest value, at a state on N*."""
-    system = PROBLEMS[name]().system
-    plant = DaePlant(system)
+    plant = DaePlant(PROBLEMS[name]().system)
     diagram, context = alone(plant)
-    plant.set_consistent_state(
-        plant.GetMyMutableContextFromRoot(context), plant.structure.states[0]
-    )
-    compiled = compile_diagram(diagram, context=context)
-    given = context.get_time(), *compiled.start(context), compiled.values(context)
-    wanted = [diagram.GetOutputPort(output).Eval(context) for output in compiled.outputs]
-    wanted += [diagram.EvalTimeDerivatives(context).CopyToVector()]
-    found = [compiled.row(*given)[0].full()[:, 0], compiled.rate(*given)[0].full()[:, 0]]
-    wanted_column = np.concatenate(wanted)
-    scale = max(1.0, np.abs(wanted_column).max(initial=0.0))
-    np.testing.assert_allclose(np.concatenate(found), wanted_column, rtol=0.0, atol=1e-12 * scale)
+    own = plant.GetMyMutableContextFromRoot(context)
+    plant.set_consistent_state(own, plant.structure.states[0])
+    check_functions(diagram, context, RolloutProgram(diagram, None, name), 1e-12)
+
+
+def test_a_system_that_cannot_be_traced_is_named():
+    builder = DiagramBuilder()
+    system = builder.AddNamedSystem("my block", WrapToSystem(1))
+    builder.ExportInput(system.get_input_port(0), "in")
+    builder.ExportOutput(system.get_output_port(0), "out")
+    with pytest.raises(ModelError, match="'my block'"):
+        RolloutProgram(builder.Build(), None, "")
+
+
+def test_an_input_without_connection_or_value_is_named():
+    builder = DiagramBuilder()
+    gain = builder.AddNamedSystem("my gain", Gain(0.5, 2))
+    builder.ExportInput(gain.get_input_port(), "in")
+    builder.ExportOutput(gain.get_output_port(), "out")
+    diagram = builder.Build()
+    program, context = RolloutProgram(diagram, None, ""), diagram.CreateDefaultContext()
+    with pytest.raises(ModelError, match="'u0' of 'my gain'"):
+        program.values_in(context)
+    diagram.get_input_port().FixValue(context, [1.0, -2.0])
+    np.testing.assert_array_equal(program.values_in(context)[2], [1.0, -2.0])

@@ -211,6 +211,7 @@ def compliant_block(
             "constraint_residual": structure.manifold.residual_signals,
             "controlled_output": dae.output_signals,
             "contact_force": forces,
+            "parameters": [*dae.parameter_signals, *material.signals],
         },
     )
     if not material.time_step:

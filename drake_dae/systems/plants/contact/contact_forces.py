@@ -10,11 +10,13 @@ from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.block import Block
+from drake_dae.blocks.block import Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
-from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.robots import RobotModel, contact_normals
+from drake_dae.systems.plants.contact.contact_material import ContactMaterial
+from drake_dae.systems.plants.contact.point_contact import ball_normals, point_contacts
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
 
 class ContactForces(LeafSystem):
@@ -95,19 +97,23 @@ class ContactForces(LeafSystem):
         return np.array(self.contact_force(self._results.Eval(context)))
 
 
-def contact_signals(
-    model: RobotModel, structure: ConstraintStructure, parameters: FloatArray
-) -> TracedSystem:
-    """The signals of a `RobotModel` from its state and contact forces, as a system.
+def contact_block(
+    model: RobotModel, structure: ConstraintStructure, values: FloatArray, material: ContactMaterial
+) -> Block:
+    """The signals of a `RobotModel` in Drake's contact, as a block.
 
-    A constraint force is the contact force along the normal of its surface, lambda = n(q) . F,
-    where n is the gradient of phi. An open contact has lambda = 0 and phi > 0.
+    The contact forces F follow from Drake's generalized ones, tau = J^T F with J of the contact
+    points in the configuration of the sample before, for which Drake's solver found them:
+    F = (J J^T)^-1 J tau. Where J has no full row rank, they are an input, as of `ContactForces`.
+    A constraint force is the one along the normal of its surface, lambda = n(q) . F, where n is the
+    gradient of phi. An open contact has lambda = 0 and phi > 0.
 
     Input ports:
         state: x, shape (n,).
-        contact_force: F as of `ContactForces`, shape (3 m,).
+        generalized_contact_force: tau, shape (nv,); or contact_force: F, shape (3 m,).
 
     Output ports:
+        contact_force: F, N, shape (3 m,).
         constraint_force: lambda, N, shape (m,).
         constraint_residual: phi and phi', as for `DaePlant`; not zero, since compliant surfaces are
             penetrated.
@@ -116,21 +122,44 @@ def contact_signals(
     Args:
         model: The robot; each constraint is a contact with one force.
         structure: The structure of its system.
-        parameters: Values of all parameters.
+        values: Values of all parameters.
+        material: The material.
     """
-    dae, contact = model.dae, ca.SX.sym("contact_force", 3 * len(model.constraints))
-    values = ca.DM(parameters)
-    normals = contact_normals(model).function(dae.state, values)[0]
+    dae, numbers = model.dae, ca.DM(values)
+    given, held = ca.SX.sym("contact_force", 3 * len(model.constraints)), dict[str, Held]()
+    inputs, contact = {"state": dae.state, "contact_force": given}, given
+    nominal = structure.manifold.project(dae.nominal_state, values)
+    jacobian = _contact_jacobian(model, nominal, numbers, material.radius)
+    rows = ca.Function("J", [dae.state], [jacobian])(nominal).full()
+    if np.linalg.matrix_rank(rows, tol=1e-6 * np.linalg.norm(rows)) == len(rows):
+        tau, before = ca.SX.sym("tau", rows.shape[1]), ca.SX.sym("before", dae.num_states)
+        held["before"] = Held(before, dae.state, nominal, material.time_step)
+        J = ca.substitute(jacobian, dae.state, before)
+        contact = PositiveDefiniteFactorization(J @ J.T).solve(J @ tau)
+        inputs = {"state": dae.state, "generalized_contact_force": tau}
+    normals = contact_normals(model).function(dae.state, numbers)[0]
     force = ca.sum1(ca.reshape(normals * contact, 3, -1)).T
     shown = [dae.outputs(force), structure.manifold.residual_expression]
-    output, residual = ca.substitute(shown, [dae.parameter_symbol], [values])
+    output, residual = ca.substitute(shown, [dae.parameter_symbol], [numbers])
     outputs = {
+        "contact_force": contact,
         "constraint_force": force,
         "constraint_residual": residual,
         "controlled_output": output,
     }
-    inputs = {"state": dae.state, "contact_force": contact}
-    return TracedSystem(Block("contact_signals", inputs, outputs), compiled=dae.compiled)
+    return Block("contact_signals", inputs, outputs, held=held)
+
+
+def _contact_jacobian(
+    model: RobotModel, nominal: FloatArray, values: ca.DM, radius: float
+) -> ca.SX:
+    """J of the velocities of all contact points, shape (3 m, nv)."""
+    dae, normals = model.dae, ca.SX.sym("normals", 3 * len(model.constraints))
+    contacts = point_contacts(model, normals, ca.SX(radius), None)
+    J = ca.vertcat(*(contact.jacobian for contact in contacts))
+    at = ca.Function("n", [dae.state, dae.parameter_symbol], [ball_normals(model)])
+    (J,) = ca.substitute([J], [normals, dae.parameter_symbol], [at(nominal, values), values])
+    return J
 
 
 def contact_force_signals(model: RobotModel) -> tuple[Signal, ...]:

@@ -19,13 +19,14 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import Frame
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.multibody.tree import Frame, ModelInstanceIndex
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import MatrixGain, Multiplexer
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.computations import Computations
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
+from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots import ConstraintWrenches, RobotModel, frame_named, own_values
@@ -37,7 +38,11 @@ from drake_dae.systems.plants.contact.contact_checks import (
     set_masses,
     solids_of,
 )
-from drake_dae.systems.plants.contact.contact_forces import ContactForces, contact_signals
+from drake_dae.systems.plants.contact.contact_forces import (
+    ContactForces,
+    contact_block,
+    contact_force_signals,
+)
 from drake_dae.systems.plants.contact.contact_material import (
     ContactMaterial,
     ball_properties,
@@ -47,13 +52,30 @@ from drake_dae.systems.plants.contact.disturbance_forces import (
     AppliedDisturbances,
     DisturbanceForce,
 )
-from drake_dae.systems.plants.contact.traced_contact import traced_contact
 from drake_dae.systems.plants.contract import Plant
 
 
 def _is_relevant(record: logging.LogRecord) -> bool:
     """Filters Drake's message on half spaces in deformable contact, which is not used here."""
     return "half spaces are not currently supported for deformable" not in record.getMessage()
+
+
+def _generalized_forces(builder: DiagramBuilder, plant: MultibodyPlant) -> OutputPort:
+    """Drake's generalized contact forces of all joints, in the order of the velocities."""
+    instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
+    moving = [instance for instance in instances if plant.num_velocities(instance)]
+    ports = [plant.get_generalized_contact_forces_output_port(each) for each in moving]
+    if len(ports) == 1:
+        return ports[0]
+    order = np.concatenate(
+        [plant.GetVelocitiesFromArray(each, np.arange(plant.num_velocities())) for each in moving]
+    )
+    stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
+    for i, port in enumerate(ports):
+        builder.Connect(port, stacked.get_input_port(i))
+    sorted_ = builder.AddSystem(MatrixGain(np.eye(order.size)[np.argsort(order)]))
+    builder.Connect(stacked.get_output_port(), sorted_.get_input_port())
+    return sorted_.get_output_port()
 
 
 @checked(ModelError)
@@ -79,8 +101,8 @@ class ContactPlant(Diagram, Plant):
         state: x = (q, v), and the states of the stages; shape (n,).
         link_state: (q, v), shape (nq + nv,). joint_torque, and the ports of the stages such as
         `motor_state`: as for `RobotPlant`.
-        contact_force: As of `ContactForces`. constraint_force, constraint_residual,
-            controlled_output: As of `contact_signals`.
+        contact_force, constraint_force, constraint_residual, controlled_output: As of
+            `contact_block`.
         contact_results: Drake's.
         query_object: Drake's, of the scene with the contact geometry.
 
@@ -140,19 +162,23 @@ class ContactPlant(Diagram, Plant):
             frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
             applied = builder.AddSystem(AppliedDisturbances(plant, disturbances, frames))
             builder.Connect(applied.get_output_port(), plant.get_applied_spatial_force_input_port())
-        forces = ContactForces(model, pairs)
-        self._forces = builder.AddSystem(forces)
-        signals = builder.AddSystem(contact_signals(model, structure, self._values))
-        self.contact_force_signals = forces.contact_force_signals
-        results = plant.get_contact_results_output_port()
-        builder.Connect(results, forces.GetInputPort("contact_results"))
-        state = plant.get_state_output_port()
+        block = contact_block(model, structure, self._values, material)
+        signals = builder.AddSystem(TracedSystem(block, compiled=model.dae.compiled))
+        self.contact_force_signals = contact_force_signals(model)
+        results, state = plant.get_contact_results_output_port(), plant.get_state_output_port()
         builder.Connect(state, signals.GetInputPort("state"))
-        builder.Connect(forces.get_output_port(), signals.GetInputPort("contact_force"))
+        if "generalized_contact_force" in block.inputs:
+            builder.Connect(
+                _generalized_forces(builder, plant),
+                signals.GetInputPort("generalized_contact_force"),
+            )
+        else:
+            forces = builder.AddSystem(ContactForces(model, pairs))
+            builder.Connect(results, forces.GetInputPort("contact_results"))
+            builder.Connect(forces.get_output_port(), signals.GetInputPort("contact_force"))
         builder.ExportInput(plant.get_actuation_input_port(), "control")
         builder.ExportOutput(state, "state")
         builder.ExportOutput(state, "link_state")
-        builder.ExportOutput(forces.get_output_port(), "contact_force")
         for name in signals.block.outputs:
             builder.ExportOutput(signals.GetOutputPort(name), name)
         builder.ExportOutput(results, "contact_results")
@@ -250,18 +276,7 @@ class ContactPlant(Diagram, Plant):
         Raises:
             ModelError: The shape is wrong.
         """
-        self._put(context, self.dae.state_vector(state))
-
-    def _put(self, context: Context, values: FloatArray) -> None:
-        """Sets x, the first of some values, and changed masses."""
         multibody_context = self.GetMutableSubsystemContext(self.multibody, context)
-        self.multibody.SetPositionsAndVelocities(multibody_context, values[: self.dae.num_states])
+        values = self.dae.state_vector(state)
+        self.multibody.SetPositionsAndVelocities(multibody_context, values)
         set_masses(multibody_context, self._masses)
-
-    def traced(self) -> Computations:
-        return traced_contact(self, self._forces, self._held, self._put, self._values)
-
-    def _held(self, context: Context) -> FloatArray:
-        """(q, v), and the contact forces."""
-        forces = self.GetOutputPort("contact_force").Eval(context)
-        return np.concatenate([self.state(context), forces])

@@ -1,0 +1,247 @@
+"""The sliders and pushes by which a person changes the parameters of a running diagram."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
+from pydrake.systems.framework import System
+
+from drake_dae.arrays import FloatArray
+from drake_dae.dae import Signal, poles
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import GainError
+from drake_dae.systems.control.commanded import CommandedReferences
+from drake_dae.systems.control.contract import SIGNAL, Controller
+from drake_dae.systems.plants.contract import Plant
+
+MAX_SURFACE_SPEED = 0.05
+"""The largest speed, in m/s, of a surface whose motion is not in the law's model."""
+
+PUSH = "push."
+"""The prefix of the names of the wrenches that push links."""
+
+_ORDER = ("N", "m")
+"""The units of the first sliders of references; all others follow."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """A slider, or an object that a person drags, and the parameters that it sets.
+
+    Attributes:
+        kind: "reference", "surface", "signal", "plant" or "pole".
+        label, unit: Its name and unit.
+        low, high, value: The smallest, the largest and the initial value.
+        inputs: The places of the parameters that it sets.
+        known: The places of the same parameters in the law's model, which it sets, too, if the
+            person so chooses.
+        factors, powers: For poles: it sets parameter i to `factors[i] * |value| ** powers[i]`.
+        rate: The largest rate of change, in its unit per s; 0 for no limit.
+    """
+
+    kind: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    value: float
+    inputs: tuple[int, ...]
+    known: tuple[int, ...] = ()
+    factors: tuple[float, ...] = ()
+    powers: tuple[int, ...] = ()
+    rate: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """All parameters of a page in one column, with their values at the start."""
+
+    signals: Sequence[Signal]
+    values: FloatArray
+    systems: Mapping[System, slice]
+    """System -> the place of its parameters."""
+    inputs: Mapping[str, slice]
+    """Name of a free input port -> the place of its value."""
+
+    def of(self, system: Any) -> dict[str, int]:
+        """Name of a parameter of a block -> its place."""
+        part = self.systems.get(system)
+        if part is None:
+            return {}
+        named = system.block.signals.get("parameters", ())
+        return {signal.name: part.start + i for i, signal in enumerate(named)}
+
+
+def controls_of(loop: ClosedLoop, numbers: Numbers, time: float, size: float) -> list[Control]:
+    """The controls of a loop with a robot of some size in m, from a time in s on."""
+    signals = [
+        Control("signal", name.removeprefix(SIGNAL), "", 0.0, 1.0, 0.0, (place.start,))
+        for name, place in numbers.inputs.items()
+        if name.startswith(SIGNAL)
+    ]
+    return [
+        *_commands(loop, numbers, time, size),
+        *_moving_surfaces(loop, numbers, rounded(0.2 * size)),
+        *_compliant_surfaces(loop.plant, numbers, rounded(0.2 * size)),
+        *signals,
+        *_controls_of_plant(loop, numbers),
+        *_control_of_pole(loop.controller, numbers),
+    ]
+
+
+def pushes_of(plant: Plant, numbers: Numbers) -> dict[str, int]:
+    """Name of a link that can be pushed -> the place of the first of six parameters."""
+    end = ".force[0]"
+    return {
+        name.removeprefix(PUSH).removesuffix(end): place
+        for name, place in numbers.of(plant).items()
+        if name.startswith(PUSH) and name.endswith(end)
+    }
+
+
+def _controls_of_plant(loop: ClosedLoop, numbers: Numbers) -> list[Control]:
+    """Sliders of frictions, then those of masses, from the tool to the base."""
+    plant, known = loop.plant, numbers.of(loop.controller)
+    used = {*plant.further_parameters, *(signal.name for signal in plant.dae.parameter_signals)}
+    frictions, masses = list[Control](), list[Control]()
+    for name, place in reversed(numbers.of(plant).items()):
+        unit, value = numbers.signals[place].unit, float(numbers.values[place])
+        places = (place,), (known[name],) if name in known else ()
+        if name.endswith((".friction", ".viscous_friction")) and name in used:
+            high = rounded(max(0.6, 2.0 * value))
+            frictions.append(Control("plant", name, unit, 0.0, high, value, *places))
+        elif name.endswith(".mass") and unit == "kg":
+            high = rounded(max(3.0 * value, 1.0))
+            masses.append(Control("plant", name, unit, 0.5 * value, high, value, *places))
+    return frictions + masses
+
+
+def _commands(loop: ClosedLoop, numbers: Numbers, time: float, size: float) -> list[Control]:
+    """Sliders for a change of each reference."""
+    if not isinstance(loop.generator, CommandedReferences):
+        return []
+    reference = loop.generator.reference(time)[loop.controller.law.layout.lowest]
+    controls = []
+    for r, (name, place) in zip(np.abs(reference), numbers.of(loop.generator).items(), strict=True):
+        unit = numbers.signals[place].unit
+        ranges = {"m": 0.15 * size, "N": max(r, 10.0), "N m": max(r, 1.0)}
+        high = rounded(ranges.get(unit, 0.5))
+        controls.append(Control("reference", name, unit, -high, high, 0.0, (place,)))
+    return sorted(controls, key=lambda s: _ORDER.index(s.unit) if s.unit in _ORDER else 2)
+
+
+def _moving_surfaces(loop: ClosedLoop, numbers: Numbers, high: float) -> list[Control]:
+    """Sliders for the positions of surfaces, which move in the plant and in the law."""
+    places = dict[str, list[int]]()
+    for generator in dict.fromkeys((loop.plant_exogenous, loop.exogenous)):
+        if isinstance(generator, CommandedReferences):
+            for name, place in numbers.of(generator).items():
+                places.setdefault(name, []).append(place)
+    return [
+        Control("surface", name, "m", -high, high, 0.0, tuple(every))
+        for name, every in places.items()
+        if ".position" in name and numbers.signals[every[0]].unit == "m"
+    ]
+
+
+def _compliant_surfaces(plant: Plant, numbers: Numbers, reach: float) -> list[Control]:
+    """Sliders for the positions of the surfaces of a compliant contact.
+
+    They are parameters of the plant and not of the law, and change in steps. The limited rate makes
+    the steps small.
+    """
+    if plant.is_ideal or plant.model is None:
+        return []
+    places, controls = numbers.of(plant), list[Control]()
+    exogenous = {signal.name for signal in plant.dae.exogenous.signals}
+    for constraint in plant.model.constraints:
+        for k in range(3):
+            name = f"{constraint.name}.position[{k}]"
+            if name in places and name not in exogenous:
+                place, value = places[name], float(numbers.values[places[name]])
+                limits = value - reach, value + reach, value
+                rate = MAX_SURFACE_SPEED
+                controls.append(Control("surface", name, "m", *limits, (place,), rate=rate))
+    return controls
+
+
+def _control_of_pole(controller: Controller, numbers: Numbers) -> list[Control]:
+    """A slider for the pole of all errors; none if the gains do not have a single pole."""
+    law, part = controller.law, numbers.systems.get(controller)
+    if not controller.follows or part is None:
+        return []
+    size = law.system.parameter_symbol.numel()
+    try:
+        gains = {p: law.all_parameters(None, poles(-p))[size:] for p in (1.0, 2.0, 3.0)}
+    except GainError:
+        return []
+    factors, first = gains[1.0], part.start + size
+    indices = list(range(first, first + factors.size))
+    powers = np.round(np.log2(np.where(factors, gains[2.0] / np.where(factors, factors, 1.0), 1.0)))
+    if not indices or not np.allclose(factors * 3.0**powers, gains[3.0], rtol=1e-9):
+        return []
+    # The mean of all poles, since the computed eigenvalues of a multiple pole are not exact.
+    pole = -float(np.trace(law.gains.error_matrix)) / law.gains.layout.chain_size
+    if not np.allclose(numbers.values[indices], factors * pole**powers, rtol=1e-9):
+        return []
+    sets = tuple(indices), (), tuple(factors.tolist()), tuple(powers.astype(int).tolist())
+    fastest = rounded(max(4.0 * pole, 20.0))
+    return [Control("pole", "pole of all errors", "1/s", -fastest, -0.5, -pole, *sets)]
+
+
+def strongest_pushes(
+    plant: Plant, state: FloatArray, links: Sequence[str], rate: float
+) -> dict[str, float]:
+    """Link -> the force of the strongest push on it, in N.
+
+    A law with poles at -p acts on a mass m like a spring of stiffness m p^2, and the effective mass
+    at the link's origin, where it is smallest, is 1 / (J M^-1 J^T). So a force m p^2 d moves the
+    link by d; `rate` is p^2 d.
+    """
+    robot, forces = plant.robot("a page").links.plant, dict[str, float]()
+    if robot is None:
+        return forces
+    context = robot.CreateDefaultContext()
+    robot.SetPositions(context, state[: robot.num_positions()])
+    M, world = robot.CalcMassMatrix(context), robot.world_frame()
+    bodies = [robot.get_body(BodyIndex(i)) for i in range(1, robot.num_bodies())]
+    for body in (body for body in bodies if body.scoped_name().get_full() in links):
+        J = robot.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kV, body.body_frame(), np.zeros(3), world, world
+        )
+        # The bound covers links whose origin cannot move.
+        mobility = float(np.linalg.eigvalsh(J @ np.linalg.solve(M, J.T))[-1])
+        mass = 1.0 / max(mobility, 1.0 / float(np.trace(M)))
+        forces[body.scoped_name().get_full()] = mass * rate
+    return forces
+
+
+def rounded(value: float) -> float:
+    """A value with one significant digit."""
+    return float(f"{value:.1g}")
+
+
+def prediction(loop: ClosedLoop, part: slice | None) -> dict[str, Any] | None:
+    """The data for the prediction of the error: E of e' = E e (30), and its outputs.
+
+    "size" is the number of error coordinates, "ends" are the rows of E that contain gains, "gains"
+    (row, column, place) of each gain, "shown" (output, coordinate, whether the derivative is
+    shown), without outputs whose error is zero. None if the errors do not form a linear system.
+    """
+    law = loop.controller.law
+    if not loop.controller.follows or loop.generator is None or part is None:
+        return None
+    if law.system.num_states != loop.plant.dae.num_states:
+        return None
+    layout, first = law.gains.layout, part.start + law.system.parameter_symbol.numel()
+    row_of = dict(zip(layout.dynamic.tolist(), layout.ends.tolist(), strict=True))
+    entries = [(row_of[i], j) for j, i in np.argwhere(law.gains.matrix.T).tolist()]
+    shown = [(i, int(layout.starts[i]), i in law.integral.outputs) for i in layout.dynamic.tolist()]
+    return {
+        "size": layout.chain_size,
+        "ends": layout.ends.tolist(),
+        "gains": [(row, j, first + k) for k, (row, j) in enumerate(entries)],
+        "shown": shown,
+    }

@@ -1,0 +1,244 @@
+"""Writes a loop as one HTML file in which it runs as WebAssembly."""
+
+import base64
+import html
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import Context, PortDataType
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import FloatArray
+from drake_dae.blocks.compose import compose
+from drake_dae.dae import DaeSystem
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.pictures.page.controls import (
+    Control,
+    Numbers,
+    controls_of,
+    prediction,
+    pushes_of,
+    strongest_pushes,
+)
+from drake_dae.pictures.page.scene import RobotScene, meshcat_page, scene_size
+from drake_dae.pictures.page.wasm import check_compiler, compiled_loop
+from drake_dae.running.export.c_code import BlockCode
+from drake_dae.running.export.loop import check_traced, write_loop
+
+WEB = Path(__file__).with_name("web")
+
+SCRIPTS = ("engine.js", "prediction.js", "view.js", "drag.js", "plots.js", "panel.js", "bench.js")
+"""The scripts, in the order in which the page contains them."""
+
+SHOWN = ("controlled_output", "reference", "desired_output", "change")
+"""The output ports of a loop that the page reads as they are."""
+
+PUSHED_FRACTION = 0.15
+"""The distance by which the strongest push moves a robot, as a fraction of the robot's size."""
+
+USUAL_POLE = 4.0
+"""The assumed rate of decay of the errors where there is no law with poles, in 1/s."""
+
+TICK = 1.0 / 120.0
+"""Commands take effect at multiples of this time after the start, in s."""
+
+_CONTENT_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; worker-src data: blob:; "
+    "connect-src data: blob:"
+)
+"""The Content-Security-Policy of the page, which loads nothing from the network."""
+
+
+@checked(ModelError)
+def write_page(
+    loop: ClosedLoop,
+    context: Context | None,
+    file: str | Path,
+    config: SimulatorConfig | None = None,
+    title: str = "",
+    notes: Sequence[str] = (),
+) -> Path:
+    """Writes a loop of a robot as one HTML file in which it runs, without server and network.
+
+    Plant, law and references run in real time as WebAssembly, by the stepper of rollouts. The page
+    draws the robot by the bundle of Drake's Meshcat, and a person pushes its links with the
+    pointer. Sliders change the masses and the friction of the plant, and the poles; in a loop with
+    `LoopSettings.commanded` also the references and the positions of surfaces. Plots show forces
+    and errors, with the predicted error over the actual one.
+
+    Args:
+        loop: The loop.
+        context: The initial context of its diagram, which is not changed; the default one if None.
+        file: The path of the page.
+        config: Drake's settings, of which the fixed steps apply; with error control, or for None,
+            steps of at most 1 ms by `runge_kutta5`.
+        title: The title; the robot's name if empty.
+        notes: Sentences that the page shows, for example which changes are not possible.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        ModelError: The plant is not a robot, or the loop cannot be traced, with the reason.
+        MachineCodeError: zig is not installed (`pip install ziglang` adds it), or it fails.
+        OSError: A file cannot be written.
+    """
+    check_compiler()
+    bench, file = Bench.of(loop, context), Path(file)
+    with tempfile.TemporaryDirectory() as folder:
+        start = bench.context.get_time()
+        _, source = write_loop(bench.code, start, "page", folder, config)
+        code = base64.b64encode(compiled_loop(source)).decode()
+    data = bench.data() | {"title": title or loop.plant.dae.name, "notes": list(notes)}
+    page = meshcat_page(bench.robot, bench.state, loop.scene_graph)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(_page_of(page, data, code), encoding="utf-8")
+    return file
+
+
+def _page_of(page: str, data: Mapping[str, Any], code: str) -> str:
+    """Meshcat's page with the bench over it."""
+    texts = (WEB / name for name in SCRIPTS)
+    scripts = "\n".join(
+        [f"const data = {as_script(data)};", f'const code = "{code}";']
+        + [text.read_text("utf-8") for text in texts]
+    )
+    style, body = ((WEB / f"bench.{end}").read_text("utf-8") for end in ("css", "html"))
+    added = f'<style>\n{style}</style>\n{body}<script type="module">\n{scripts}</script>\n'
+    head = (
+        f'<meta http-equiv="Content-Security-Policy" content="{_CONTENT_POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(data['title'])}</title>"
+    )
+    before, mark, after = page.rpartition("</body>")
+    before = before.replace("<title>Drake MeshCat</title>", head, 1)
+    return before.replace("<html>", '<html lang="en">', 1) + added + mark + after
+
+
+def as_script(data: Any) -> str:
+    """Data as JSON for a script element, escaped so that no text in it ends the script.
+
+    Raises:
+        ModelError: A number is not finite.
+    """
+    try:
+        text = json.dumps(data, allow_nan=False)
+    except ValueError:
+        raise ModelError("a page needs finite numbers") from None
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What a page shows and changes of a loop, from a context on; `size` is that of the scene in m.
+
+    `code` computes the outputs and their desired values, "change" of the phases of a task, "scene",
+    and "coordinates" of the errors.
+    """
+
+    loop: ClosedLoop
+    context: Context
+    code: BlockCode
+    numbers: Numbers
+    controls: Sequence[Control]
+    robot: RobotScene
+    state: FloatArray
+    size: float
+    predicted: dict[str, Any] | None
+
+    @classmethod
+    def of(cls, loop: ClosedLoop, context: Context | None) -> "Bench":
+        """The bench of a loop, whose free inputs are 0 where they have no value."""
+        diagram, plant, law = loop.diagram, loop.plant, loop.controller.law
+        context = (context or diagram.CreateDefaultContext()).Clone()
+        for port in map(diagram.get_input_port, range(diagram.num_input_ports())):
+            if port.get_data_type() == PortDataType.kVectorValued and not port.HasValue(context):
+                port.FixValue(context, np.zeros(port.size()))
+        robot = RobotScene.of(plant, loop.scene_graph)
+        names = "state", "constraint_force", "integral", "exogenous", "known_exogenous", *SHOWN
+        ports = {name: diagram.GetOutputPort(name) for name in names if diagram.HasOutputPort(name)}
+        composed = compose(diagram, ports, context=context, shares=False)
+        check_traced(composed, "the loop")
+        values = composed.block.outputs
+
+        def parameters_of(system: Any, dae: DaeSystem, exogenous: str) -> ca.SX:
+            """Its parameters, with the present values of exogenous signals."""
+            count, place = dae.parameter_symbol.numel(), composed.parameters.get(system)
+            own = ca.SX(dae.parameter_values)
+            if place is not None:
+                own = ca.SX(composed.block.parameters[place.start : place.start + count, 0])
+            if exogenous in values:
+                own[list(system.exogenous_places)] = values[exogenous]
+            return own
+
+        state, force = values["state"], values["constraint_force"]
+        scene = robot.columns(state, force, parameters_of(plant, plant.dae, "exogenous"))
+        outputs = {name: values[name] for name in SHOWN if name in values} | {"scene": scene}
+        predicted = prediction(loop, composed.parameters.get(loop.controller))
+        if predicted is not None:
+            outputs["coordinates"] = law.coordinates_function.function(
+                state,
+                values["reference"],
+                values.get("integral", ca.SX(0, 1)),
+                parameters_of(loop.controller, law.system, "known_exogenous"),
+            )[0]
+        composed = replace(composed, block=replace(composed.block, outputs=outputs))
+        code = BlockCode.of(composed, context, {}, loop.signals)
+        numbers = Numbers(code.parameters, code.values, composed.parameters, code.places)
+        start = plant.state(plant.GetMyContextFromRoot(context))
+        size = scene_size(robot, start, loop.scene_graph)
+        controls = controls_of(loop, numbers, context.get_time(), size)
+        return cls(loop, context, code, numbers, controls, robot, start, size, predicted)
+
+    def data(self) -> dict[str, Any]:
+        """What the browser knows, as JSON represents it."""
+        loop, numbers, law = self.loop, self.numbers, self.loop.controller.law
+        sliders = {(control.kind, control.label): i for i, control in enumerate(self.controls)}
+        ends = np.cumsum([0, *map(len, self.code.outputs.values())]).tolist()
+        first = dict(zip(self.code.outputs, ends, strict=False))
+        signals, places = loop.plant.dae.output_signals, law.layout.lowest.tolist()
+        if "reference" in first:
+            r = [first["reference"] + k for k in places]
+        else:  # A task desires distances, too, while its contact is open.
+            r = [first["desired_output"] + k for k in range(len(signals))]
+        slowest = float(np.min(-law.gains.poles.real)) if law.gains.poles.size else USUAL_POLE
+        pushes = pushes_of(loop.plant, numbers)
+        rate = PUSHED_FRACTION * self.size * slowest**2
+        strongest = strongest_pushes(loop.plant, self.state, list(pushes), rate)
+        return {
+            **self.robot.data(self.state, lambda *which: sliders.get(which)),
+            "start": self.context.get_time(),
+            "tick": TICK,
+            "size": self.size,
+            "outputs": [asdict(signal) for signal in signals],
+            "places": {
+                "z": [first["controlled_output"] + i for i in range(len(signals))],
+                "r": r,
+                "scene": first["scene"],
+                "coordinates": first.get("coordinates", ends[-1]),
+                "phase": first["change"] + 1 if "change" in first else -1,
+                "end": ends[-1],
+            },
+            "controls": [asdict(control) for control in self.controls],
+            # A payload of the plant alone is not drawn.
+            "pushes": {
+                name: {"input": place, "most": strongest[name]}
+                for name, place in pushes.items()
+                if name in strongest
+            },
+            "prediction": self.predicted,
+            "phase_names": list(loop.controller.phase_names),
+            "inputs": [
+                {**asdict(signal), "value": value}
+                for signal, value in zip(numbers.signals, numbers.values.tolist(), strict=True)
+            ],
+        }

@@ -1,0 +1,212 @@
+"""A block as C99: functions that CasADi generates, and the texts of the templates around them."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from string import Template
+from typing import Self
+
+import casadi as ca
+import numpy as np
+from pydrake.systems.framework import Context
+
+from drake_dae.arrays import FloatArray
+from drake_dae.blocks.block import stacked
+from drake_dae.blocks.compose import Composed
+from drake_dae.blocks.stepping import StepFunctions
+from drake_dae.dae import Signal
+from drake_dae.errors import ModelError
+from drake_dae.trace.compiled import generate, renamed, without_branches
+
+TEMPLATES = Path(__file__).with_name("c99")
+
+Vectors = Mapping[str, Sequence[Signal]]
+"""Name of a vector -> names and units of its entries."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockCode:
+    """A block as functions in C, and its numbers at a start.
+
+    Each input of the block is a parameter of these functions: first come the parameters of the
+    block, then inputs that keep their value in the context, and last those of each step.
+
+    Attributes:
+        steps: The functions; with "begin", the held values at the start, if some of `held` are nan.
+        inputs: Names of inputs that come with each step, with their signals.
+        outputs: Names of outputs, with their signals.
+        parameters: Names and units of the parameters, without inputs of each step.
+        values: Their defaults.
+        places: Name of an input that keeps its value -> its place among the parameters.
+        held: The held values at the start; nan where "begin" has them.
+    """
+
+    steps: StepFunctions
+    inputs: Vectors
+    outputs: Vectors
+    parameters: Sequence[Signal]
+    values: FloatArray
+    places: Mapping[str, slice]
+    held: FloatArray
+
+    @classmethod
+    def of(cls, composed: Composed, context: Context, inputs: Vectors, known: Vectors) -> Self:
+        """The code of a part of a diagram; `known` names outputs whose blocks do not name them."""
+        block, named = composed.block, composed.block.signals
+        parameters, values = [*named["parameters"]], [block.default("parameters")]
+        columns, places = [block.parameters], dict[str, slice]()
+        for name in [name for name in block.inputs if name not in inputs]:
+            system, index = composed.fixed[name]
+            port, local = system.get_input_port(index), system.GetMyContextFromRoot(context)
+            if not port.HasValue(local):
+                raise ModelError(f"the input port '{name}' has no value in this context: fix one")
+            places[name] = slice(len(parameters), len(parameters) + port.size())
+            parameters += signals_of({}, name, port.size())
+            values.append(port.Eval(local))
+            columns.append(block.inputs[name])
+        columns += [block.inputs[name] for name in inputs]
+        # Values of one rate are neighbours.
+        held = {name: block.held[name] for names in block.rates().values() for name in names}
+        steps = StepFunctions(
+            replace(block, inputs={}, parameters=stacked(columns), held=held, defaults={})
+        )
+        starts = [np.asarray(each.start, float).ravel() for each in held.values()]
+        if any(np.isnan(start).any() for start in starts):
+            begun = [
+                each.symbol if each.begin is None or np.isfinite(start).all() else each.begin
+                for each, start in zip(held.values(), starts, strict=True)
+            ]
+            value = ca.densify(stacked(begun))
+            steps.functions["begin"] = ca.Function("begin", steps.columns, [value])
+        outputs = {
+            name: signals_of({**known, **named}, name, value.numel())
+            for name, value in block.outputs.items()
+        }
+        at_start = np.concatenate([np.zeros(0), *starts])
+        own = np.concatenate(values)
+        return cls(steps, inputs, outputs, parameters, own, places, at_start)
+
+    def words(self, name: str) -> dict[str, str]:
+        """The texts of a block for the templates, and those that all templates have."""
+        prefix = prefix_of(name)
+        return {
+            "title": comment(name),
+            "name": file_of(name),
+            "prefix": prefix,
+            "guard": prefix.upper(),
+            "version": version("drake_dae"),
+            "casadi": ca.__version__,
+            "inputs": members(self.inputs),
+            "outputs": members(self.outputs),
+            "num_parameters": str(len(self.parameters)),
+            "num_inputs": str(sum(map(len, self.inputs.values()))),
+            "num_outputs": str(sum(map(len, self.outputs.values()))),
+            "num_held": str(self.held.size),
+            "num_rates": str(len(self.steps.rates)),
+            "parameters": numbers(self.values),
+            "held": numbers(self.held),
+            "parameter_names": strings(s.name for s in self.parameters),
+            "parameter_units": strings(s.unit for s in self.parameters),
+        }
+
+
+def generated(functions: Mapping[str, ca.Function]) -> str:
+    """C code of functions, as generated_name."""
+    named = (renamed(function, f"generated_{name}") for name, function in functions.items())
+    return without_branches(generate(*named))
+
+
+def written(folder: str | Path, files: Mapping[str, str], words: Mapping[str, str]) -> list[Path]:
+    """Writes files from templates, name -> template, with words, placeholder -> text."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, template in files.items():
+        text = Template((TEMPLATES / template).read_text("utf-8")).substitute(words)
+        (folder / name).write_text(text, "utf-8")
+    return [folder / name for name in files]
+
+
+def prefix_of(name: str) -> str:
+    """A valid C identifier for a name, the prefix of all exported C names."""
+    if not re.search("[A-Za-z]", name):
+        raise ModelError(f"a name of C has letters of A to Z, got {name!r}")
+    prefix = re.sub("[^A-Za-z0-9]+", "_", name).strip("_").lower()
+    return f"dae_{prefix}" if prefix[0].isdigit() else prefix
+
+
+def file_of(name: str) -> str:
+    """A file name of letters, digits and "_.-" only."""
+    return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII)
+
+
+def signals_of(known: Vectors, name: str, size: int) -> list[Signal]:
+    """The known signals of a vector if their number is right, otherwise numbered ones."""
+    signals = list(known.get(name, ()))
+    numbered = [Signal(f"{name}[{i}]" if size > 1 else name) for i in range(size)]
+    return signals if len(signals) == size else numbered
+
+
+def identifiers(vectors: Vectors) -> dict[str, Sequence[Signal]]:
+    """Vectors under valid C names; empty ones are left out, as C has no empty arrays."""
+    by_word: dict[str, Sequence[Signal]] = {}
+    for name, signals in vectors.items():
+        word = re.sub(r"\W+", "_", name, flags=re.ASCII)
+        word = f"v_{word}" if not word or word[0].isdigit() else word
+        while word in by_word:
+            word += "_"
+        if signals:
+            by_word[word] = signals
+    return by_word
+
+
+def members(vectors: Vectors) -> str:
+    """C code that declares vectors as members of a struct, with names and units in comments."""
+    lines = []
+    for name, signals in identifiers(vectors).items():
+        width = max(len(comment(signal.name)) for signal in signals)
+        rows = [
+            f"{i:3d}  {comment(s.name).ljust(width)}  {comment(s.unit)}".rstrip()
+            for i, s in enumerate(signals)
+        ]
+        lines.append(
+            f"  double {name}[{len(signals)}];\n    /* " + "\n       ".join(rows) + " */\n"
+        )
+    return "".join(lines)
+
+
+def numbers(values: FloatArray) -> str:
+    """A C initializer list, with an entry more, as C has no empty arrays; nan becomes NAN."""
+    return braced([*(repr(x) if np.isfinite(x) else "NAN" for x in values.tolist()), "0.0"])
+
+
+def strings(texts: Iterable[str]) -> str:
+    """A C initializer list of strings, with a null pointer at its end."""
+    return braced([*map(string, texts), "0"])
+
+
+def braced(items: Sequence[str]) -> str:
+    """A C initializer list, wrapped to short lines."""
+    lines, last = [], ""
+    for item in items:
+        if last and len(last) + len(item) > 96:
+            lines.append(last.rstrip())
+            last = ""
+        last += f"{item}, "
+    text = "\n  ".join([*lines, last]).rstrip(", ")
+    return f"{{{text}}}"
+
+
+def comment(text: str) -> str:
+    """Text for a C comment, without characters that could end the comment."""
+    return re.sub(r"[^\w .,:;()\[\]'/^+-]|/(?=[/*])", "_", text, flags=re.ASCII)
+
+
+def string(text: str) -> str:
+    """A C string literal; special characters, and "?" because of trigraphs, are octal escapes."""
+    plain = (
+        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"?\\' else f"\\{byte:03o}"
+        for byte in text.encode()
+    )
+    return f'"{"".join(plain)}"'

@@ -1,0 +1,293 @@
+"""The controller of a loop, all between what is measured and the control, as one step in C99."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from math import ceil, floor, gcd, lcm
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    OutputPort,
+    PortDataType,
+    System,
+)
+
+from drake_dae.arguments import checked
+from drake_dae.blocks.block import Block, stacked
+from drake_dae.blocks.compose import Composed, Leaves, Port, compose, leaf_inputs, leaf_port
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.errors import ModelError
+from drake_dae.running.export.c_code import (
+    BlockCode,
+    Vectors,
+    file_of,
+    generated,
+    signals_of,
+    written,
+)
+from drake_dae.running.export.replay import MOST, recorded_run, write_replay
+from drake_dae.systems.plants.contract import Plant
+
+CONTROL = "control"
+"""The name of a controller's output port and a plant's input port."""
+
+FINEST = 1000
+"""The largest ratio of the shortest sample period to the common period."""
+
+STEP = """
+static int step(int k, double *found) {{
+  {prefix}_controller_inputs in;
+  {prefix}_controller_outputs out;
+  double given[2 + INPUTS];
+  given[0] = given[1] = rows[k][0];
+  memcpy(given + 2, rows[k] + 1, sizeof(double) * INPUTS);
+  memcpy(&in, given, sizeof(given));
+  {prefix}_controller_step(&own, &in, &out);
+  memcpy(found, &out, sizeof(double) * OUTPUTS); /* They come first. */
+  return out.status;
+}}
+"""
+"""A step of the program that plays a run."""
+
+SAMPLING = "give the loop a sampling, in a scenario `sampling: {period: 0.001}`"
+
+
+@checked(ModelError)
+def export_controller(
+    loop: ClosedLoop | Diagram,
+    context: Context,
+    name: str,
+    folder: str | Path,
+    config: SimulatorConfig | None = None,
+    duration: float = 2.0,
+) -> list[Path]:
+    """Writes the whole controller of a loop as one step function in C99.
+
+    The controller consists of all blocks between measurements and control: law, references,
+    observer, integrals, samplers, delays, limits, and user blocks between them. Sensors belong to
+    the machine: their outputs are inputs of the controller. name_controller.h describes the
+    reaction to inputs that are not finite, too old or too late. The program play_name_controller.c
+    feeds a recorded run of Drake's Simulator, name_controller_run.csv, to the controller, compares
+    its outputs, and measures the time of a step; `make` in the folder runs it.
+
+    Args:
+        loop: The closed loop, or any diagram with one `Plant`.
+        context: Its context at the start; not changed.
+        name: The name of the files, and, as a C identifier, the prefix of the functions.
+        folder: The folder to write to; created if it does not exist. Files are overwritten.
+        config: Drake's settings of the run; None for defaults.
+        duration: The largest duration of the run, in s. The run has at most 2000 steps.
+
+    Returns:
+        The paths of the files.
+
+    Raises:
+        ModelError: The controller acts continuously, or has a block that cannot be exported.
+        OSError: A file cannot be written.
+    """
+    part, file, start = controller_of(loop, context), file_of(name), context.get_time()
+    ticks, first = part.ticks, part.ticks.at(start)
+    count = max(1, min(MOST, floor(duration / ticks.period + 1e-9)))
+    times = [ticks.time(tick) for tick in range(first, first + count)]
+    code, ports = part.code, (part.inputs, part.outputs)
+    given = context, config or SimulatorConfig(), times, code, *ports, part.acts_at_once
+    run = recorded_run(part.diagram, *given)
+    words = part.words(name, start)
+    files = {f"{file}_controller.{end}": f"controller.{end}" for end in ("h", "c")}
+    step = {"step": STEP.format(prefix=words["prefix"]), "calls": "1000000"}
+    written_files = written(folder, files, words)
+    return [*written_files, *write_replay(code, "controller", name, folder, run, step)]
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """The instants of a controller's steps: tick k is at k period, k = 0, 1, ...; times in s."""
+
+    period: float
+    rates: Mapping[tuple[float, float], tuple[int, int]]
+    """(period, offset) -> the number of ticks between its updates, and the tick of the first."""
+
+    @classmethod
+    def of(cls, rates: list[tuple[float, float]], alone: float = 0.0) -> "Ticks":
+        """The fewest ticks for which each update is at one; without any rate, each `alone`."""
+        if not rates:
+            return cls(alone, {})
+        # Without the round-off of computed times.
+        exact = {rate: [Fraction(t).limit_denominator(10**9) for t in rate] for rate in rates}
+        times = [time for pair in exact.values() for time in pair]
+        denominator = lcm(*(time.denominator for time in times))
+        tick = Fraction(gcd(*(int(time * denominator) for time in times)), denominator)
+        if tick * FINEST < min(period for period, _ in exact.values()):
+            known = ", ".join(f"{float(time):g} s" for time in sorted({*times} - {0}))
+            raise ModelError(
+                f"periods and delays have no common tick above {float(tick):g} s: {known}. Choose "
+                "multiples of one period"
+            )
+        counts = {rate: (int(p / tick), int(first / tick)) for rate, (p, first) in exact.items()}
+        return cls(float(tick), counts)
+
+    def at(self, time: float) -> int:
+        """The first tick at or after a time in s; times that differ by 1e-9 periods are equal."""
+        return ceil(time / self.period - 1e-9)
+
+    def time(self, tick: int) -> float:
+        """The time of a tick in s, equal to Drake's to the last bit: offset + k period."""
+        time = tick * self.period
+        for (period, offset), (every, first) in self.rates.items():
+            if tick >= first and (tick - first) % every == 0:
+                time = offset + (tick - first) // every * period
+        return time
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerPart:
+    """The controller of a diagram, and the ports of its inputs and outputs in the diagram."""
+
+    diagram: Diagram
+    code: BlockCode
+    ticks: Ticks
+    inputs: Mapping[str, Port]
+    outputs: Mapping[str, Port]
+    acts_at_once: bool
+    """Whether the control has direct feedthrough from measurements; else updates change it."""
+
+    def words(self, name: str, start: float) -> dict[str, str]:
+        """The texts for the templates."""
+        code, ticks = self.code, self.ticks
+        first = ticks.at(start)
+        moments, updates = list[str](), list[str]()
+        for is_unrestricted in (True, False):  # In Drake's order.
+            calls = list[str]()
+            for i, rate in enumerate(code.steps.rates):
+                every, begins = ticks.rates[rate.period, rate.offset]
+                due = f"if (tick >= {begins} && (tick - {begins}) % {every} == 0)"
+                if rate.is_unrestricted is is_unrestricted:
+                    count = f"(double)((tick - {begins}) / {every})"
+                    moments.append(f"  {due} time = {rate.offset!r} + {count} * {rate.period!r};\n")
+                    given = f"generated_update_{i}, c, time, before, held + {rate.places[0]}"
+                    calls.append(f"  {due} {{\n    evaluate({given});\n  }}\n")
+            updates += ["  memcpy(before, held, sizeof(before));\n", *calls] if calls else []
+        shown = ["  evaluate(generated_row, c, time, held, row);\n"]
+        steps = [*moments, *(shown + updates if self.acts_at_once else updates + shown)]
+        begin = ""
+        if "begin" in code.steps.functions:
+            at = f"{ticks.time(first)!r}"
+            begin = "  double held[HELD + 1];\n  memcpy(held, c->held, sizeof(held));\n"
+            begin += f"  evaluate(generated_begin, c, {at}, held, c->held);\n"
+        unused = "rate", "newton"  # There is no continuous state.
+        functions = {key: f for key, f in code.steps.functions.items() if key not in unused}
+        return code.words(name) | {
+            "generated": generated(functions),
+            "period": repr(ticks.period),
+            "start": repr(ticks.time(first)),
+            "first": str(first),
+            "num_controls": str(len(code.outputs[CONTROL])),
+            "steps": "".join(steps),
+            "begin": begin,
+        }
+
+
+def controller_of(loop: ClosedLoop | Diagram, context: Context) -> ControllerPart:
+    """The controller of a loop, or of any diagram with one `Plant`."""
+    diagram = loop if isinstance(loop, Diagram) else loop.diagram
+    machine = list(_machine(diagram))
+    plants = [system for system in machine if isinstance(system, Plant)]
+    if len(plants) != 1:
+        raise ModelError(
+            f"an export cuts a diagram at its plant, and this one has {len(plants)}: a Plant, as "
+            "RobotPlant, DaePlant or ContactPlant"
+        )
+    (plant,), leaves, measured = plants, Leaves.of(diagram), dict[str, OutputPort]()
+    for system in machine:
+        for port in map(system.get_output_port, range(system.num_output_ports())):
+            own = port.get_name()
+            measured[f"{system.get_name()}_{own}" if own in measured else own] = port
+    place = leaf_inputs(plant, int(plant.GetInputPort(CONTROL).get_index()))[0]
+    control = leaves.sources.get(place)
+    if control is None:
+        raise ModelError(f"nothing leads to the control of '{plant.get_name()}'")
+    upstream = _upstream(leaves, control, {leaf_port(port) for port in measured.values()})
+    outputs = {CONTROL: control[0].get_output_port(control[1])}
+    for port in map(diagram.get_output_port, range(diagram.num_output_ports())):
+        is_vector = port.get_data_type() == PortDataType.kVectorValued and port.size()
+        if is_vector and leaf_port(port)[0] in upstream and leaf_port(port) != control:
+            outputs.setdefault(port.get_name(), port)
+    composed = compose(diagram, outputs, cuts=measured, context=context)
+    block, acts_at_once = _checked(composed, measured)
+    if acts_at_once and not plant.time_step:
+        raise ModelError(
+            f"the controller acts continuously, and as one step it needs samples: {SAMPLING}"
+        )
+    known: Vectors = {
+        **plant.port_signals,
+        **plant.further_signals,
+        "estimated_state": plant.dae.state_signals,
+        "measured_force": plant.dae.constraint_input_signals,
+    }
+    inputs = {
+        name: signals_of(known, name, symbol.numel()) for name, symbol in block.inputs.items()
+    }
+    inputs = {name: signals for name, signals in inputs.items() if name in measured}
+    code = BlockCode.of(replace(composed, block=block), context, inputs, known)
+    return ControllerPart(
+        diagram,
+        code,
+        Ticks.of([(rate.period, rate.offset) for rate in code.steps.rates], plant.time_step),
+        {name: leaf_port(measured[name]) for name in inputs},
+        {name: leaf_port(outputs[name]) for name in block.outputs},
+        acts_at_once,
+    )
+
+
+def _machine(diagram: Diagram) -> Iterator[Any]:
+    """The plants and the sensors in a diagram."""
+    for system in diagram.GetSystems():
+        if isinstance(system, Plant) or getattr(system, "measures", False):
+            yield system
+        elif isinstance(system, Diagram):
+            yield from _machine(system)
+
+
+def _upstream(leaves: Leaves, port: Port, ends: set[Port]) -> set[System]:
+    """The systems between some ports and a port."""
+    found, todo = set[System](), [port]
+    while todo:
+        port = todo.pop()
+        if port not in ends and port[0] not in found:
+            found.add(port[0])
+            todo += [source for place, source in leaves.sources.items() if place[0] is port[0]]
+    return found
+
+
+def _checked(composed: Composed, measured: Mapping[str, OutputPort]) -> tuple[Block, bool]:
+    """A controller's block without outputs that act at once, and whether its control does."""
+    block = composed.block
+    for system in composed.states:
+        raise ModelError(
+            f"'{system.get_name()}' has a continuous state, as integrals of a law without samples: "
+            f"{SAMPLING}"
+        )
+    for name in composed.cuts.keys() - measured.keys():
+        raise ModelError(
+            f"the controller reads '{name}', which cannot be traced: put it behind a sensor, as "
+            "random numbers, or leave it out"
+        )
+    if not composed.cuts:
+        raise ModelError("the controller reads nothing that is measured, so that none is needed")
+    given = stacked([block.inputs[name] for name in composed.cuts])
+    outputs = {
+        name: value
+        for name, value in block.outputs.items()
+        if name == CONTROL or not ca.depends_on(value, given)
+    }
+    held = [each for one in block.held.values() for each in (one.next, one.begin)]
+    used = block.sources(*outputs.values(), *(each for each in held if each is not None))
+    left_out = [name for name in composed.cuts if f"input {name}" not in used]
+    inputs = {name: symbol for name, symbol in block.inputs.items() if name not in left_out}
+    acts_at_once = bool(ca.depends_on(outputs[CONTROL], given))
+    return replace(block, inputs=inputs, outputs=outputs), acts_at_once
