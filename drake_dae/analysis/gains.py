@@ -56,7 +56,7 @@ RESTING = 0.5
 """The factor of gains for references that rest: a contact sticks, and estimates are held, so that
 no linear model tells a margin."""
 
-FINER, TRIES = 0.5, 6
+FINER, TRIES = 0.5, 4
 """What a factor that is too large is multiplied by, and how many pairs are tried."""
 
 SLIDING = ((1.0, 0.8, 0.5), (0.5, 0.8, 2.0), (2.0, 0.8, 1.0))
@@ -147,7 +147,8 @@ def contact_gains(
     - the slowest mode decays at 1/s or faster (poles at 0 left out: counters, held estimates),
     - modes below half the Nyquist rate have a damping ratio of 0.1 or more,
     - noise changes the controls by at most `roughness` from sample to sample, in rms,
-    - half a second from a start at rest, with friction of 0.8 unknown, ends in contact.
+    - half a second from a start at rest, with friction of 0.8 unknown, keeps the control limits and
+      ends in contact.
 
     Where references rest, friction holds the contact, no linear model tells a margin, and half of
     the rates of the directions are returned.
@@ -445,13 +446,17 @@ class _Trials:
         return rough, float(squares[self.points].sum() ** 0.5), float(np.max(forces) ** 0.5)
 
     def starts(self) -> bool:
-        """Whether the last loop is in contact half a second after a start from rest."""
+        """Whether the last loop keeps its control limits from rest on, and ends in contact."""
         moment, state, force = self.begin
-        run = self.run
+        run, limits = self.run, self.model.control_limits[:, None]
         x, p = run.begun(state, force, 0.0)[:, None], run.parameters(1.0, 0.8)[:, None]
-        x = run.advanced(moment, x, p, round(BEGIN / self.period))
-        shown = run.sampled.shown(moment + BEGIN, x, p)["controlled_output"]
-        return bool(np.isfinite(x).all() and np.all(shown[len(self.positions) :] > 0.0))
+        x = run.sampled.begun(moment, x, p)
+        for i in range(round(BEGIN / self.period)):
+            x = run.sampled.after(moment + i * self.period, x, p)
+            shown = run.sampled.shown(moment + i * self.period, x, p)
+            if not np.all(np.abs(shown["control"]) <= limits):  # Also where it is not finite.
+                return False
+        return bool(np.all(shown["controlled_output"][len(self.positions) :] > 0.0))
 
 
 class _Run:
