@@ -6,7 +6,6 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -21,7 +20,6 @@ from drake_dae.dae import (
     RankMargin,
     Region,
     Stability,
-    Structure,
     Violation,
     ZeroDynamics,
     why_no_law,
@@ -263,10 +261,7 @@ def _examine(
             margin = find_margin(samples, matrix, structure.round_off, search)
             structure = replace(structure, control_margin=margin)
             judge(margin, control_violation(structure), 5)
-            results |= {
-                "output_degrees": structure.output_degrees,
-                "independence": _independence(structure, samples),
-            }
+            results["output_degrees"] = structure.output_degrees
             if is_regular(samples, matrix, structure.round_off):
                 results["structure"] = structure
     assumptions = _assumptions(satisfied, violations, margins, without_law)
@@ -294,14 +289,6 @@ def _assumptions(
         violation = violated.get(number)
         result.append(Assumption(number, statement, finding, margin, reason, violation))
     return tuple(result)
-
-
-def _independence(structure: Structure, samples: Samples) -> RankMargin | None:
-    """Returns the margin of the row vectors of Theorem 2.1."""
-    functions = ca.vertcat(structure.manifold.residual_expression, structure.chain)
-    if not functions.numel():
-        return None
-    return find_margin(samples, ca.jacobian(functions, structure.system.state))
 
 
 @dataclass(frozen=True, eq=False)

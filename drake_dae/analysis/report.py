@@ -38,7 +38,6 @@ class Finding(StrEnum):
     VIOLATED = "violated"
     UNDECIDED = "not decided"
     NOT_EXAMINED = "not examined"
-    FAILS = "does not hold"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +76,6 @@ class Analysis:
         assumptions: Assumptions (1), ..., (5), in this order.
         constraint_degrees: r_1, ..., r_m.
         output_degrees: mu_1, ..., mu_p in the order of the system's outputs.
-        independence: Margin of the gradients of all chains, which are linearly independent by
-            Theorem 2.1; None also where there are no chains.
         zero_dynamics: Assumption 2.2, by linearization at an equilibrium.
         equilibria: All equilibria of the zero dynamics with the same outputs that were found from
             the examined states.
@@ -100,7 +97,6 @@ class Analysis:
     assumptions: tuple[Assumption, ...]
     constraint_degrees: tuple[int, ...] | None = None
     output_degrees: tuple[int, ...] | None = None
-    independence: RankMargin | None = None
     zero_dynamics: Stability | None = None
     equilibria: tuple[Stability, ...] = ()
     zero_dynamics_along: StabilityAlong | None = None
@@ -173,13 +169,6 @@ class Analysis:
         """One text for each violation; empty if there are none."""
         sentences = [a.reason for a in self.assumptions if a.finding is Finding.VIOLATED]
         signals = self.system.state_signals
-        # Where an assumption is violated, the theorem adds nothing.
-        if not sentences and self.independence is not None and self.independence.is_singular:
-            place = named_values(signals, self.independence.state)
-            sentences.append(
-                "Theorem 2.1: the gradients of the constraints, the outputs and their derivatives "
-                f"depend on each other at {place}"
-            )
         # Along a reference the motion decides: elsewhere there may be no contact.
         contact = self.contact_margin_along or self.contact_margin
         if contact is not None and contact.is_paradoxical:
@@ -274,7 +263,6 @@ class Analysis:
                 }
                 for a in self.assumptions
             ],
-            "independence": _margin(self.independence),
             "zero_dynamics": zero and {**_stability(zero), "reason": zero.reason},
             "equilibria": [_stability(equilibrium) for equilibrium in self.equilibria],
             "zero_dynamics_along": along
@@ -378,7 +366,7 @@ def _parts(found: Analysis) -> Iterator[Part]:
             "computed by least squares, and any other gives the same motion."
         ]
     yield _table_of_assumptions(found)
-    if found.independence is not None or any(a.margin for a in found.assumptions):
+    if any(a.margin for a in found.assumptions):
         yield [
             "margin: smallest singular value after rows and columns are scaled to about length "
             f"one; below {system.least_margin:.0e} it counts as singular."
@@ -396,17 +384,11 @@ def _parts(found: Analysis) -> Iterator[Part]:
 def _table_of_assumptions(found: Analysis) -> Table:
     free = "" if found.system.num_constraints else ": m = 0"
     none = ": the system has none" if found.zero_dynamics_dimension == 0 else ""
-    chains = Finding.NOT_EXAMINED
-    if found.output_degrees is not None:
-        singular = found.independence is not None and found.independence.is_singular
-        chains = Finding.FAILS if singular else Finding.SATISFIED
-    theorem = "2.1  theorem: gradients of all chains are independent"
     entries = [
         *(
             (f"({a.number})  {a.statement}{free if a.number <= 3 else ''}", a.finding, a.margin)
             for a in found.assumptions
         ),
-        (theorem, chains, found.independence),
         (f"2.2  zero dynamics are stable{none}", found.zero_dynamics_finding, None),
     ]
     rows = [

@@ -51,43 +51,33 @@ class PainleveOutcome(Enum):
     OPENING = "opening: without a force the contact opens, and no compressive force maintains it"
 
 
-@dataclass(frozen=True, eq=False)
 class Contacts:
-    """The unilateral contacts of a system in which at least one contact has friction."""
+    """The unilateral contacts of a system in which at least one contact has friction.
 
-    owner: str
-    inputs: Sequence[Signal]
-    parameters: Sequence[Parameter]
-    contacts: Sequence[UnilateralInput]
+    `rows` are their constraint inputs, and `frictions` the coefficient of each, or None.
+    """
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        owner: str,
+        inputs: Sequence[Signal],
+        parameters: Sequence[Parameter],
+        contacts: Sequence[UnilateralInput],
+    ) -> None:
+        names = [signal.name for signal in inputs]
+        by_name = {parameter.name: parameter for parameter in parameters}
+        chosen = [contact for contact in contacts if contact.force in names]
+        self.rows = [names.index(contact.force) for contact in chosen]
+        self.frictions = [by_name[c.friction] if c.friction else None for c in chosen]
         if len(self.rows) > MOST:
             raise ModelError(
-                f"{self.owner}: {len(self.rows)} unilateral forces, one of them with friction; "
+                f"{owner}: {len(self.rows)} unilateral forces, one of them with friction; "
                 f"with friction at most {MOST} are possible, since all their subsets are "
                 "examined. Remove the friction, or some contacts"
             )
 
     def __bool__(self) -> bool:
         return any(self.frictions)
-
-    @property
-    def rows(self) -> list[int]:
-        return list(self._friction_of_rows)
-
-    @property
-    def frictions(self) -> list[Parameter | None]:
-        return list(self._friction_of_rows.values())
-
-    @property
-    def _friction_of_rows(self) -> dict[int, Parameter | None]:
-        names = [signal.name for signal in self.inputs]
-        by_name = {parameter.name: parameter for parameter in self.parameters}
-        return {
-            names.index(contact.force): by_name[contact.friction] if contact.friction else None
-            for contact in self.contacts
-            if contact.force in names
-        }
 
     def without_friction(self, matrix: ca.SX) -> ca.SX:
         """Returns an expression with all coefficients of friction set to zero."""

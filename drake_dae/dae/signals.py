@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -269,7 +268,6 @@ class Exogenous:
         return places
 
 
-@dataclass(frozen=True)
 class DerivativeLayout:
     """The indices of p signals and their derivatives in the stacked vectors of section 2.
 
@@ -278,76 +276,35 @@ class DerivativeLayout:
         chain     = (z_1, z_1', ..., z_1^(mu_1 - 1), z_2, ...)    sum mu_i numbers
         reference = (r_1, r_1', ..., r_1^(mu_1),     r_2, ...)    sum (mu_i + 1) numbers
 
-    The constraint chains of (4) are stacked likewise, with r_i in place of mu_i. `more` further
-    derivatives of each signal may be in a reference.
+    The constraint chains of (4) are stacked likewise, with r_i in place of mu_i.
+
+    Args:
+        degrees: mu_1, ..., mu_p.
+        more: The number of further derivatives of each signal in a reference; none if empty.
     """
 
-    degrees: tuple[int, ...]
-    more: tuple[int, ...] = ()
-
-    @property
-    def chain_size(self) -> int:
-        return sum(self.degrees)
-
-    @cached_property
-    def reference_size(self) -> int:
-        return sum(self.reference_degrees) + len(self.degrees)
-
-    @cached_property
-    def reference_degrees(self) -> tuple[int, ...]:
-        """The number of derivatives of each r_i in a reference, mu_i without further ones."""
-        more = self.more or (0,) * len(self.degrees)
-        return tuple(degree + added for degree, added in zip(self.degrees, more, strict=True))
-
-    @cached_property
-    def lowest(self) -> Indices:
-        """The indices of r_1, ..., r_p in a reference vector, shape (p,)."""
-        return np.cumsum([0, *[d + 1 for d in self.reference_degrees]], dtype=np.intp)[:-1]
-
-    @cached_property
-    def highest(self) -> Indices:
-        """The indices of r_1^(mu_1), ..., r_p^(mu_p) in a reference vector, shape (p,)."""
-        return self.lowest + np.array(self.degrees, dtype=np.intp)
-
-    @cached_property
-    def chained(self) -> Indices:
-        """The index in a reference vector of the target of each chain entry, shape (sum mu_i,)."""
-        return np.repeat(self.lowest, self.degrees) + self.orders
-
-    @cached_property
-    def owners(self) -> Indices:
-        """The index of the signal of each chain entry, shape (sum mu_i,)."""
-        return np.repeat(np.arange(len(self.degrees)), self.degrees)
-
-    @cached_property
-    def orders(self) -> Indices:
-        """The order of the derivative of each chain entry, shape (sum mu_i,)."""
-        return np.concatenate([np.zeros(0, dtype=np.intp), *map(np.arange, self.degrees)])
-
-    @cached_property
-    def starts(self) -> Indices:
-        """The index of the first chain entry of each signal, shape (p,)."""
-        return np.cumsum([0, *self.degrees], dtype=np.intp)[:-1]
-
-    @cached_property
-    def heads(self) -> Indices:
-        """The chain index of the zeroth derivative of each signal with mu_i >= 1."""
-        return np.flatnonzero(self.orders == 0)
-
-    @cached_property
-    def ends(self) -> Indices:
-        """The chain index of the highest derivative of each signal with mu_i >= 1."""
-        return self.heads + np.array(self.degrees, dtype=np.intp)[self.dynamic] - 1
-
-    @cached_property
-    def dynamic(self) -> Indices:
-        """The indices of the signals with mu_i >= 1."""
-        return np.flatnonzero(self.degrees)
-
-    @cached_property
-    def direct(self) -> Indices:
-        """The indices of the signals with mu_i = 0, which have no chain."""
-        return np.flatnonzero(np.array(self.degrees) == 0)
+    def __init__(self, degrees: Sequence[int], more: Sequence[int] = ()) -> None:
+        self.degrees = tuple(degrees)
+        self.chain_size = sum(self.degrees)
+        count, orders = len(self.degrees), np.array(self.degrees, dtype=np.intp)
+        further = np.array(more or [0] * count, dtype=np.intp)
+        #: The number of derivatives of each r_i in a reference, mu_i without further ones.
+        self.reference_degrees: tuple[int, ...] = tuple((orders + further).tolist())
+        self.reference_size = sum(self.reference_degrees) + count
+        #: The signals with mu_i >= 1, and those with mu_i = 0, which have no chain.
+        self.dynamic, self.direct = np.flatnonzero(orders > 0), np.flatnonzero(orders == 0)
+        #: Of each chain entry its signal, and the order of its derivative, shape (sum mu_i,).
+        self.owners = np.repeat(np.arange(count), orders)
+        #: The first chain entry of each signal, shape (p,); its highest one where mu_i >= 1.
+        self.starts: Indices = np.cumsum(orders) - orders
+        self.orders: Indices = np.arange(self.chain_size) - self.starts[self.owners]
+        self.heads = np.flatnonzero(self.orders == 0)
+        self.ends: Indices = self.heads + orders[self.dynamic] - 1
+        #: r_1, ..., r_p and r_1^(mu_1), ..., r_p^(mu_p) in a reference vector, shape (p,).
+        self.lowest: Indices = np.cumsum(orders + further + 1) - (orders + further + 1)
+        self.highest: Indices = self.lowest + orders
+        #: The target of each chain entry in a reference vector, shape (sum mu_i,).
+        self.chained: Indices = self.lowest[self.owners] + self.orders
 
     def chain_signals(self, signals: Sequence[Signal]) -> tuple[Signal, ...]:
         """Returns names and units of the entries of a chain."""

@@ -19,7 +19,7 @@ def test_text_is_aligned_and_not_too_wide(problem):
     assert max(map(len, lines)) <= 100
     assert all(line == line.rstrip() for line in lines)
     start = next(i for i, line in enumerate(lines) if line.startswith("assumption"))
-    rows = lines[start : start + 8]
+    rows = lines[start : start + 7]
     for row in rows[1:]:
         assert row[rows[0].index("finding") - 1] == " "
         assert row[rows[0].index("finding") :].startswith(tuple(map(str, Finding)))

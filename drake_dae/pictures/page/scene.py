@@ -11,11 +11,13 @@ from pydrake.multibody.tree import Frame
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import stacked
-from drake_dae.robots.constraint_wrenches import ConstraintWrenches
-from drake_dae.robots.constraints.constraint import Constraint
-from drake_dae.robots.model import RobotModel
-from drake_dae.robots.outputs import PointCoordinates
-from drake_dae.robots.surfaces.surface import rotation_of
+from drake_dae.robots import (
+    Constraint,
+    ConstraintWrenches,
+    PointCoordinates,
+    RobotModel,
+    rotation_of,
+)
 from drake_dae.scene.arrows import path_of
 from drake_dae.scene.surroundings import scene_points
 from drake_dae.scene.view import draw_scene, start_unwatched_meshcat, view_of_links

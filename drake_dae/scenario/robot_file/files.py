@@ -8,6 +8,7 @@ Drake's renderer draws .obj and .gltf; its Meshcat draws .dae as well. So a .dae
 with its own colors and textures, and any other mesh an .obj, by the optional package trimesh.
 """
 
+import atexit
 import json
 import os
 import re
@@ -234,7 +235,9 @@ def _converted(mesh: Path, kind: str, changed: int, size: int) -> Path:
 
 @cache
 def _folder() -> "TemporaryDirectory[str]":
-    return TemporaryDirectory(prefix="drake_dae_meshes_")
+    folder = TemporaryDirectory(prefix="drake_dae_meshes_")
+    atexit.register(folder.cleanup)
+    return folder
 
 
 def _obj(mesh: Path) -> bytes:

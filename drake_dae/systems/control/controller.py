@@ -27,8 +27,7 @@ class TrackingController(ParameterizedSystem, Controller):
         estimated_state: x, shape (n,).
         reference: R, output-major, r_i, ..., r_i^(mu_i); shape (sum (mu_i + 1),).
         measured_force: The constraint force from a sensor, shape (m,); if the law takes it.
-        exogenous: The signals w with their derivatives, if the system has any; see
-            `ParameterizedSystem`.
+        exogenous: The signals w with their derivatives, if there are any.
 
     Output ports:
         control: u, shape (p,).

@@ -1,6 +1,5 @@
 """The equations of a `StateEstimator` at a sample, as expressions."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Self
@@ -13,8 +12,9 @@ from drake_dae.blocks.block import TIME, where_finite
 from drake_dae.dae import Lags, Observation, TrackingLaw
 from drake_dae.dae.beyond.chain_filter import ChainFilter
 from drake_dae.dae.beyond.disturbance import DISTURBANCE
-from drake_dae.dae.beyond.friction_share import Metric, beside, shares
+from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.errors import ModelError
+from drake_dae.systems.observing.contacts import LITTLE, Contacts, ContactTerms
 from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.observing.parameters import ParameterFilter
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -22,34 +22,8 @@ from drake_dae.trace.factorization import PositiveDefiniteFactorization
 PARAMETER_PERIOD = 0.01
 """The time in s, in whole samples, between samples of the filter of parameters."""
 
-BREAK_RATE = 12.0
-"""The rate in 1/s at which a coefficient of friction rises until its contact breaks away."""
-
-STICKS = 0.5
-"""A contact sticks below this share of the wanted speed."""
-
-LEAST_SHARE = 0.06
-"""The least wanted speed for which this is tested, relative to `Observing.least_speed`."""
-
-EARLY = 2.0
-"""The number of samples that the first value of a coefficient counts for."""
-
-CLEAR = 4.0
-"""A displacement is no noise from this multiple of its standard deviation on: one angle that passes
-to the next value of its encoder makes sqrt(12)."""
-
-_SHARP = 10.0
-"""Friction of a contact that gives way is taken as that of a motion faster by this factor: it is
-fully developed from v_s / 10 on. An ideal contact has the friction of the model."""
-
-_FAST = 1e6
-"""A displacement of 1 m is tested as a speed of this many m/s: friction is then fully developed."""
-
 _DEVELOPED = 0.9
 """A joint moves where its Coulomb friction has this share of its full size."""
-
-_LITTLE = 1e-9
-"""The least normal force, in N, by which is divided."""
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""
@@ -101,32 +75,6 @@ class Memory:
         return ca.vertcat(*vars(self).values())
 
 
-@dataclass(frozen=True, eq=False)
-class ContactTerms:
-    """The directions of friction and constraints at a state.
-
-    Attributes:
-        friction: C, the friction force per unit of each coefficient, shape (k, c).
-        metric: W of `Observation`, as a function of columns.
-        free: Q of `Observation`.
-        planes: T of `Observation`, of each contact.
-        held: T of the contacts that stick, side by side; zero for others.
-        velocity: The velocities, shape (k, 1).
-        slides, sticks: 1 for each contact that certainly slides, or may stick, shape (c,).
-        valid: Finite if all of these are valid.
-    """
-
-    friction: ca.SX
-    metric: Metric
-    free: ca.SX
-    planes: Sequence[ca.SX]
-    held: ca.SX
-    velocity: ca.SX
-    slides: ca.SX
-    sticks: ca.SX
-    valid: ca.SX
-
-
 def disturbance_degree(law: TrackingLaw) -> int:
     """The number of derivatives of the disturbance that a law needs."""
     degrees = iter(law.exogenous_degrees)
@@ -165,11 +113,9 @@ class EstimatorSample:
     ) -> None:
         self.observation = observation = Observation.of(law.structure, law.layout)
         self._law, self._system, self._observing, self._period = law, law.system, observing, period
-        self._lag, self._delay, self._step, self._deviations = lag, delay, step, deviations
+        self._lag, self._step = lag, step
         estimates = observing.state_rate is not None
         system, k, c = law.system, len(observation.rows), len(observation.frictions)
-        self._sharpness = 1.0 if is_ideal and not estimates else _SHARP
-        self._stops = [0, *accumulate(observation.widths)]
         degree, n = disturbance_degree(law), system.num_states
         if estimates:
             _check_rigid(law, observation.rows)
@@ -223,6 +169,16 @@ class EstimatorSample:
         self.inputs = {name: ca.SX.sym(name, size) for name, size in ports.items()}
         if not self.measures:
             del self.inputs["measured_force"]
+        self._contacts = Contacts(
+            observation,
+            observing,
+            period,
+            delay,
+            is_ideal and not estimates,
+            deviations[0],
+            self.inputs["reference"],
+            self.inputs["hold"],
+        )
         self.memory = Memory.of(ca.SX.sym("held", sum(self.sizes.values())), self.sizes)
         self._before = self._adopted()
         self.start = np.zeros(sum(self.sizes.values()))
@@ -233,6 +189,8 @@ class EstimatorSample:
 
         sample = ca.floor(TIME / period + _SAME)
         after = self._estimated() if estimates else self._observed(sample)
+        # What blocks share is found again later; once here saves a fifth of the operations.
+        after = Memory.of(ca.cse(after.column), self.sizes)
         if estimates:
             # The state before the first sample is zero, where a contact may have no direction.
             given = {"state": self._measured, "control": self.inputs["control"]}
@@ -247,7 +205,7 @@ class EstimatorSample:
             self.now, self.state, known_now = after, self._measured, self.memory
         self.force = self._measured_force if self.measures else known_now.force
         self.exogenous = self._compensated(self.state, self.force, known_now)
-        lost = self._is_lost(self.force)
+        lost = self._contacts.is_lost(self.force)
         self.hold = ca.fmax(self.inputs["hold"] != 0, ca.mmax(lost) if c else 0)
 
     def place(self, name: str) -> slice:
@@ -263,11 +221,6 @@ class EstimatorSample:
     def _measured_force(self) -> ca.SX:
         return self.inputs["measured_force"]
 
-    def _is_lost(self, v: ca.SX) -> ca.SX:
-        """1 for each contact that is lost, shape (c, 1)."""
-        pressing = [v[i] for i in self.observation.frictions.values()]
-        return ca.vertcat(ca.SX(0, 1), *pressing) < self._observing.least_force
-
     def _parameters(self, friction: ca.SX | None = None, theta: ca.SX | None = None) -> ca.SX:
         """The model's parameters with estimates, and with given or no friction."""
         parameters = ca.SX(self._system.parameter_symbol)
@@ -276,39 +229,6 @@ class EstimatorSample:
             value = 0 if friction is None else friction[j]
             parameters[self._system.parameter_slice(name)] = value
         return parameters
-
-    def _contact(self, state: ca.SX, v: ca.SX, parameters: ca.SX) -> ContactTerms:
-        """The directions of friction and constraints at a state."""
-        observation = self.observation
-        friction = observation.friction.function(self._faster(state), v, parameters)
-        directions = observation.directions.function(state, v, parameters)
-        free, planes = directions[0], ca.horzsplit(directions[1], self._stops)
-
-        def metric(columns: ca.SX) -> ca.SX:
-            function = observation.metric.function
-            moved = [function(state, d, parameters)[0] for d in ca.horzsplit(columns)]
-            return ca.horzcat(ca.SX(columns.shape[0], 0), *moved)
-
-        is_slow = friction[1] < self._sharpness * self._observing.least_speed
-        is_lost = self._is_lost(v)
-        sticks = ca.logic_and(is_slow, ca.logic_not(is_lost))
-        held = self._side_by_side(planes, sticks)
-        slides = ca.logic_not(ca.logic_or(is_slow, is_lost))
-        velocity, valid = state[list(observation.rows)], friction[-1] + directions[-1]
-        return ContactTerms(
-            friction[0], metric, free, planes, held, velocity, slides, sticks, valid
-        )
-
-    def _side_by_side(self, planes: Sequence[ca.SX], of_contacts: ca.SX) -> ca.SX:
-        """T of all contacts side by side, each times its entry of a column."""
-        scaled = [plane * of_contacts[j] for j, plane in enumerate(planes)]
-        return ca.horzcat(ca.SX(len(self.observation.rows), 0), *scaled)
-
-    def _faster(self, state: ca.SX) -> ca.SX:
-        """The state in whose motion the model's friction is that of the contact."""
-        faster, rows = ca.SX(state), list(self.observation.rows)
-        faster[rows] = self._sharpness * faster[rows]
-        return faster
 
     # The exact state.
 
@@ -320,7 +240,7 @@ class EstimatorSample:
         late = self._lag * has_sample
         acted = late * memory.control + (1.0 - late) * u
         momentum = self.observation.momentum.function(x, acted, v, parameters)
-        contact = self._contact(x, v, parameters)
+        contact = self._contacts.terms(x, v, parameters)
         p, drift, inputs = momentum[:3]
         d = (p - memory.momentum) / self._period - (memory.drift + drift) / 2.0 - inputs
         d -= ca.mtimes(contact.friction, mu)
@@ -330,7 +250,9 @@ class EstimatorSample:
         chain = ca.horzcat(ca.reshape(memory.lags, size, -1), memory.disturbance)
         chain = self._passed(contact, chain, d)
         chain, change = self._shared(chain, contact)
-        early, slid = self._early(contact, x, v, parameters, d)
+        early, slid = 0 * mu, memory.slid
+        if self._breaks_away:  # Springs answer jumps by swings.
+            early, slid = self._contacts.early(slid, contact, x, v, parameters, d)
         moves, (fast, slow) = ca.mtimes(contact.free, chain), self._lags
         rates = fast.derivatives(moves) + slow.derivatives(chain - moves)
         valid = momentum[-1] + contact.valid
@@ -479,7 +401,7 @@ class EstimatorSample:
             force = share * v + (1.0 - share) * old.measured_force
         else:
             force = v = self._model_force(middle, r, mu, acted)
-        contact = self._contact(middle, v, parameters)
+        contact = self._contacts.terms(middle, v, parameters)
         friction_force = ca.mtimes(contact.friction, mu)
         pushed = ca.SX(parameters)
         pushed[system.parameter_slice(DISTURBANCE)] = r + friction_force
@@ -494,10 +416,10 @@ class EstimatorSample:
         through = ca.SX.eye(count) if self.measures else contact.free
         moved = qd + period * stepping.solve(push - ca.mtimes(through, friction_force))
         moved += self._rubbed(q, moved, v, stepping, through, parameters)
-        unused = ca.logic_or(self._is_lost(v), self.inputs["hold"] != 0)
+        unused = ca.logic_or(self._contacts.is_lost(v), self.inputs["hold"] != 0)
         if self._breaks_away:  # What has not slid yet sticks, with any friction that this needs.
             sticks = ca.logic_not(ca.logic_or(unused, old.slid > 0))
-            stuck = self._side_by_side(contact.planes, sticks)
+            stuck = self._contacts.side_by_side(contact.planes, sticks)
             metric = factors.solve if self.measures else contact.metric
             momentum = ca.mtimes(mass, moved)
             stopped = momentum - beside(stuck, metric, momentum)
@@ -523,7 +445,8 @@ class EstimatorSample:
         new_r, change = self._shared(new_r, contact)
         slid = old.slid
         if self._breaks_away:
-            early, slid, jumps, is_early = self._slipped(
+            early, slid, jumps, is_early = self._contacts.slipped(
+                old.slid,
                 contact,
                 middle,
                 new_v,
@@ -533,8 +456,9 @@ class EstimatorSample:
                 errors[0],
                 factors,
                 unused,
+                [float(gain[0, 0]) for gain in self._gains[0][:2]],
             )
-            forces = self._developed(ca.vertcat(q, new_v), v, parameters)
+            forces = self._contacts.developed(ca.vertcat(q, new_v), v, parameters)
             terms = forces, contact.planes, new_v, contact.metric
             taken = ca.mtimes(contact.free, forces)
             new_r -= ca.mtimes(taken, is_early * shares(*terms, new_r - r))
@@ -556,11 +480,6 @@ class EstimatorSample:
         after = {name: where_finite(value, contact.valid) for name, value in after.items()}
         return Memory(**{**vars(old), **after})
 
-    def _developed(self, state: ca.SX, v: ca.SX, parameters: ca.SX) -> ca.SX:
-        """The friction force per unit of each coefficient, fully developed, shape (k, c)."""
-        friction = self.observation.friction.function
-        return friction(self._faster(state), v, parameters)[0]
-
     def _rubbed(
         self,
         q: ca.SX,
@@ -575,9 +494,9 @@ class EstimatorSample:
         It is implicit: against the velocity that there would be without it, which it at most stops.
         Otherwise it would turn a light tool about from sample to sample.
         """
-        forces = self._developed(ca.vertcat(q, moved), v, parameters)
+        forces = self._contacts.developed(ca.vertcat(q, moved), v, parameters)
         made = self._period * mass.solve(ca.mtimes(through, forces))
-        stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, _LITTLE)
+        stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, LITTLE)
         # The noise of a force sensor may be less than zero.
         return ca.mtimes(made, ca.fmin(self._before.friction, ca.fmax(stopping, 0.0)))
 
@@ -607,116 +526,6 @@ class EstimatorSample:
         outputs = [system.mass_matrix[rows, rows], push[rows], ca.sparsify(ca.simplify(damping))]
         return ca.Function("balance", inputs, outputs)
 
-    # The first break-away of a contact.
-
-    def _early(
-        self, contact: ContactTerms, x: ca.SX, v: ca.SX, parameters: ca.SX, d: ca.SX
-    ) -> tuple[ca.SX, ca.SX]:
-        """The change of friction at the first break-away, and the samples of sliding after it.
-
-        While a contact sticks where it should slide, its coefficient rises with `BREAK_RATE`, so
-        that it breaks away before the reference is far. Then samples of d are averaged, without a
-        low-pass, until `friction_rate` is faster. Not with a law that needs derivatives of d.
-        """
-        memory, observation, least = self._before, self.observation, self._least_speed
-        if not self._breaks_away:  # Springs answer jumps by swings.
-            return 0.0 * memory.friction, memory.slid
-        wanted, actual = (
-            observation.friction.function(state, v, parameters)[1]
-            for state in (self._goal(x, parameters)[0], x)
-        )
-        follows = actual >= STICKS * wanted
-        weight = 1.0 / (memory.slid + EARLY)
-        is_early = weight > EARLY * self._observing.friction_rate * self._period
-        unused = ca.logic_or(self._is_lost(v), self.inputs["hold"] != 0)
-        used = is_early * (wanted > least) * ca.logic_not(unused)
-        slides = used * follows * (actual > least)
-        terms = contact.friction, contact.planes, contact.velocity, contact.metric
-        change = slides * weight * shares(*terms, d)
-        change += used * ca.logic_not(follows) * BREAK_RATE * self._period
-        return change, memory.slid + slides
-
-    @property
-    def _least_speed(self) -> float:
-        return LEAST_SHARE * self._observing.least_speed
-
-    def _goal(self, x: ca.SX, parameters: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """The state with the wanted velocities when the control acts, and its check."""
-        wanted, reference = self.observation.wanted, self.inputs["reference"]
-        assert wanted is not None
-        values = wanted.function(x, reference, self._delay, parameters)
-        return values[0], values[-1]
-
-    def _slipped(
-        self,
-        contact: ContactTerms,
-        middle: ca.SX,
-        speed: ca.SX,
-        v: ca.SX,
-        parameters: ca.SX,
-        momentum: ca.SX,
-        error: ca.SX,
-        factors: PositiveDefiniteFactorization,
-        unused: ca.SX,
-    ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """The same as `_early` by measured positions.
-
-        A contact has broken away where positions leave the predicted ones by more than noise, by S.
-        While its coefficient rises with the rate k, a unit of friction makes s'' = b: so this takes
-        the time t = (6 S / (k |b|))^(1/3), from s = k |b| t^3 / 6; the speed is then 3 S / t, and
-        the coefficient less by k t than it has risen to. From there on the gains along the friction
-        are those of the least squares of all positions since it broke away, a parabola.
-
-        Returns:
-            The change of mu, the samples of sliding, the change of the state, and the samples in
-            which friction explains all of r along it.
-        """
-        memory, T = self.memory, self._period
-        least = self._least_speed * T / CLEAR
-        squares = ca.DM(np.square(np.maximum(self._deviations[0], least)))
-        goal = self._goal(middle, parameters)[0]
-        now = ca.vertcat(middle[: error.numel()], speed)
-        friction = self.observation.friction.function
-        wanted, actual = (friction(each, v, parameters)[1] for each in (goal, now))
-        towards, forces = (self._developed(each, v, parameters) for each in (goal, now))
-        pressing = [v[i] for i in self.observation.frictions.values()]
-        pressing = ca.fmax(ca.fabs(ca.vertcat(*pressing)), _LITTLE)
-        is_moved, sticks = wanted > self._least_speed, memory.slid == 0
-        ahead = -ca.mtimes(towards.T, error) > CLEAR * ca.sqrt(ca.sum1(towards**2 * squares).T)
-        aside = [
-            ca.sumsqr(ca.mtimes(plane.T, error)) > CLEAR**2 * ca.dot(ca.sum2(plane**2), squares)
-            for plane in contact.planes
-        ]
-        leaves = ca.logic_or(ca.logic_and(is_moved, ahead), ca.vertcat(*aside))
-        most = max(round(1.0 / (EARLY * self._observing.friction_rate * T)), 1)
-        is_early = (memory.slid < most) * ca.logic_not(unused)
-        stuck = is_early * sticks
-        breaks = stuck * leaves
-        slides = is_early * ca.logic_not(sticks)
-
-        along = factors.solve(ca.mtimes(contact.free, forces))
-        b = ca.fmax(ca.fabs(ca.sum1(forces * along).T) / pressing, _LITTLE)
-        distance = CLEAR * ca.sqrt(ca.sum1(forces**2 * squares).T) / pressing
-        since = (6.0 * distance / (BREAK_RATE * b)) ** (1.0 / 3.0)
-        since = ca.fmin(ca.fmax(since, 2.0 * T), 30.0 * T)
-        rests = slides * (memory.slid > EARLY) * is_moved * (actual <= self._least_speed)
-        kick = ca.mtimes(along, breaks * 3.0 * distance / (since * b))
-
-        n = memory.slid
-        share = slides * shares(forces, contact.planes, speed, contact.metric, momentum)
-        by_all = 60.0 / ((n + 1.0) * (n + 2.0) * (n + 3.0))
-        by_q = by_all * (3.0 * n * (n + 1.0) + 2.0) / 20.0
-        by_v = by_all * (2.0 * n + 1.0) * 0.3
-        usual = [float(gain[0, 0]) for gain in self._gains[0][:2]]
-        moved = [
-            ca.mtimes(along, share * (by_q - usual[0])),
-            ca.mtimes(along, share * (by_v / T - usual[1])) - kick,
-        ]
-        change = share * by_all / T**2 - breaks * BREAK_RATE * since
-        change += stuck * is_moved * ca.logic_not(breaks) * BREAK_RATE * T
-        slid = ca.if_else(rests, 0, n + slides + breaks * ca.floor(since / T))
-        return change, slid, ca.vertcat(*moved), slides
-
     # What the law takes.
 
     def _compensated(self, x: ca.SX, v: ca.SX, known: Memory) -> ca.SX:
@@ -726,10 +535,10 @@ class EstimatorSample:
         if mu.numel() or self._system.dry:
             goal = x
             if observation.wanted is not None:
-                goal, valid = self._goal(x, parameters)
+                goal, valid = self._contacts.goal(x, parameters)
             friction, goal_friction = (
                 observation.friction.function(state, v, parameters)[0]
-                for state in (x, self._faster(goal))
+                for state in (x, self._contacts.faster(goal))
             )
             r = r + ca.mtimes(goal_friction - friction, mu)
             r = r + self._dry(goal, parameters) - self._dry(x, parameters)

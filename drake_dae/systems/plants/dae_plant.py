@@ -34,41 +34,25 @@ class DaePlant(ParameterizedSystem, Plant):
     start of the next step, so a log or a monitor sees it before its projection;
     `Simulator.AdvancePendingEvents()` projects the last state of a run.
 
-    Only Assumptions (1)-(3) are needed: the numbers of controls and controlled outputs may differ
-    or be zero, and the control need not affect the outputs. A port of size 0 needs no wire.
+    Only Assumptions (1)-(3) are needed: there may be other numbers of controls than of outputs, or
+    none. The default state is the consistent one next to `system.nominal_state`.
 
     Input ports:
         control: u, shape (p,).
-        exogenous: The signals w with their derivatives, if the system has any; see
-            `ParameterizedSystem`.
+        exogenous: The signals w with their derivatives, if there are any.
 
     Output ports:
         state: x, shape (n,).
         constraint_force: v, shape (m,); direct feedthrough from `control` where beta is not zero.
-            With shared forces of redundant constraints it has all forces, in the order of
-            `system.force_signals`: their sum is determined, the split is by least squares; see
-            `share_forces`.
-        constraint_residual: k_i, L_f k_i, ..., L_f^(r_i - 1) k_i, constraint-major, shape
-            (sum r_i,); zero on N*.
-        controlled_output: z, one entry per output; direct feedthrough where n* = m beta is not
-            zero.
+            With `share_forces` it has all forces of `system.force_signals`.
+        constraint_residual: k_i, L_f k_i, ..., L_f^(r_i - 1) k_i, shape (sum r_i,); zero on N*.
+        controlled_output: z, shape (p,); direct feedthrough where n* = m beta is not zero.
 
-    A run ends at a singular configuration, where gradients of constraints become dependent; the
-    error names them.
-
-    At a trial state of an integrator, missing values are nan, and error control takes a shorter
-    step. At an accepted state, or if no step is short enough, an error is raised.
-
-    The context holds all parameters of the system as one numeric parameter; see `set_parameter`.
-    The default state is the consistent one next to `system.nominal_state`.
-
-    The block converts to AutoDiffXd, for Drake's Linearize and DirectCollocation; it then has no
-    projection.
+    A converted plant (AutoDiffXd, for Linearize or DirectCollocation) has no projection.
 
     Args:
         system: The system (1)-(3).
-        structure: The structure of the system, by `find_constraint_structure` or
-            `find_structure`; the former if None.
+        structure: Its structure; found if None.
         project: False leaves the drift off N* uncorrected, to study it.
 
     Attributes:
@@ -79,10 +63,8 @@ class DaePlant(ParameterizedSystem, Plant):
         AssumptionError: The system violates one of Assumptions (1)-(3).
         ModelError: It is not a system, or the structure is that of another one.
         InconsistentStateError: A simulation starts from a state that is off N*.
-        SingularityError: A(x) is singular during a run; the exception has time and state. In a
-            Painleve paradox it is a PainleveError with the outcome.
-        NonFiniteError: A value is not finite during a run, likewise.
-        SimulationError: The state cannot be projected onto N* during a run, likewise.
+        SingularityError, NonFiniteError, SimulationError: During a run A(x) is singular (a
+            PainleveError in a paradox), a value is not finite, or the state cannot be projected.
     """
 
     __slots__ = SHARED_DICTIONARY

@@ -33,21 +33,15 @@ class TaskController(ParameterizedSystem, Controller):
 
     In contact, the law (28) of the robot with the contact is active and tracks the contact force;
     otherwise the law of the robot without it, which tracks the distance in place of the force. A
-    phase ends at a sample; see `Phase`. The control may jump when the law changes, since both laws
-    explain the same motion by different forces. When a robot touches a frictionless surface and the
-    free law presses with lambda, that is, it commands phi'' = -A lambda there, the jump is
-
-        B (u_c - u_f) = lambda (A M [P; J]^-1 (0, 1) - J^T),
-
-    where P is the Jacobian of the other outputs. It is zero if pressing moves none of them, P M^-1
-    J^T = 0. A slow touch, and small gains of the free law for the distance, keep it small.
+    phase ends at a sample; see `Phase`. The control may jump when the law changes, by
+    lambda (A M [P; J]^-1 (0, 1) - J^T) at a frictionless touch where the free law presses with
+    lambda; P is the Jacobian of the other outputs. A slow touch keeps it small.
 
     Input ports:
         estimated_state: x, shape (n,).
         measured_force: All constraint forces, shape (m,). The control does not depend on it in the
             same instant, unless a law takes a measured force.
-        exogenous: The exogenous signals of the laws with their derivatives, as of a surface that
-            moves, or an observer's estimates; see `ParameterizedSystem`.
+        exogenous: The exogenous signals of the laws with their derivatives.
         hold: While it is not 0, no integral is updated, shape (1,); 0 without a wire.
         signal_<name>: A signal that phases wait for, shape (1,); 0 without a wire.
 
@@ -63,20 +57,14 @@ class TaskController(ParameterizedSystem, Controller):
         tared_force: The measured forces minus the bias of the sensor; only with a tare_time.
         change: The last change of phase, shape (10,); `changes` reads it from a record.
         integral, free_integral: The integrals of each law, if it has any. They are not updated
-            while the other law is active; those in contact also not while no force is measured, and
-            during the transition after a touch, so that the force of an impact is not integrated.
+            while the other law is active, no force is measured, or just after a touch.
 
     Args:
         task: The phases.
-        law: The law in contact. Its force, "wall.force" for example, is one of its outputs. A
-            contact may have several points, which open and close together: then as many outputs
-            are forces, one of them their sum.
+        law: The law in contact; one of its outputs is the force, such as "wall.force". Several
+            points open and close together: then as many outputs are forces, one of them their sum.
         free_law: The law of the free robot, for `open_contact(law.system, "wall.force")`.
         sample_period: The period of guards and integrals of errors, in s.
-
-    Attributes:
-        task, law, free_law, sample_period: The arguments.
-        output_signals: Names and units of `desired_output`.
 
     Raises:
         ModelError: The laws do not belong together, or a phase has a reference that does not fit.

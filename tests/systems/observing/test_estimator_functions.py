@@ -188,3 +188,25 @@ def test_a_force_below_zero_by_noise_is_hardly_a_friction():
     q, v = predicted(V, noise, control, 0.0)
     state, _, _ = sample(q, V, (noise, noise), (control, control), mu=0.4)
     assert_allclose(state, [*q, *v], atol=1e-4)
+
+
+def test_the_first_sample_takes_what_is_measured():
+    """Also where nothing is held yet: the arm at zero angles is stretched against its wall."""
+    system = law().system
+    block = StateEstimator(law(), RATES, T, 0.0, 0.0, 0.0, 1e-4).block
+    memory = block.held["memory"]
+    given = {
+        "time": [0.0],
+        "held memory": memory.start,
+        "input measured_state": [*Q, *V],
+        "input measured_force": [20.0],
+        "input control": [60.0, 40.0],
+        "input hold": [0.0],
+        "input reference": np.zeros(law().layout.reference_size),
+        "parameters": system.parameter_values,
+    }
+    outputs = [block.outputs["estimated_state"], memory.next]
+    function = ca.Function("first", [*block.columns().values()], outputs)
+    state, after = (v.full().ravel() for v in function(*(given[n] for n in block.columns())))
+    assert_allclose(state, [*Q, *V], rtol=0, atol=0)
+    assert np.all(np.isfinite(after))

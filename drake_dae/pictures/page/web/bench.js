@@ -81,7 +81,7 @@ function draw() {
   view.show(last);
   const actual = { value: ({ z }) => z[chosen], color: COLORS[1], name: "actual" };
   const desired = { value: ({ r }) => r[chosen], color: DESIRED, dashed: true, name: "desired" };
-  plots.signal.draw(bench.samples, [actual, desired], unitOf(chosen));
+  plots.signal.draw(bench.samples, [actual, desired], unitOf(chosen), []);
   plots.error.draw(bench.samples, errors.flatMap((i, k) => {
     const color = COLORS[k % COLORS.length];
     const own = { value: ({ error }) => error[i], color, name: k ? "" : "error" };

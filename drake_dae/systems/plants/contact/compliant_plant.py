@@ -28,10 +28,8 @@ from drake_dae.trace.functions import FailureKind
 class CompliantPlant(ParameterizedSystem, Plant):
     """A robot whose contacts are compliant, by Drake's equations of point contact.
 
-    It is like a `ContactPlant` without a MultibodyPlant: its equations are traced, so that it works
-    in rollouts, exports and linear models, surfaces may have any shape and move, and studies change
-    its parameters in a context. Each `PointOnSurface` touches with a ball;
-    nothing else of the robot collides.
+    It is like a `ContactPlant` of traced equations: surfaces may have any shape and move. Each
+    `PointOnSurface` touches with a ball; nothing else of the robot collides.
 
     With `time_step` > 0 it is discrete: at t_n = n time_step, with the control of that instant,
 
@@ -44,26 +42,19 @@ class CompliantPlant(ParameterizedSystem, Plant):
         M v' + H = tau + J^T F,
 
     with the forces F of `contact_force`, those of a continuous MultibodyPlant. Torques beyond the
-    effort limits of the actuators are cut to them, as Drake does. Drake stops a joint at its
-    limits; this plant has no such stops, and a run that reaches one ends with an error. After
-    `set_consistent_state` the robot touches without force, and penetrates when the run starts.
+    effort limits are cut to them, as Drake does; a joint that reaches its limit ends the run.
 
     Input ports:
         control: u, shape (p,).
-        exogenous: The signals w with their derivatives, if the system has any; see
-            `ParameterizedSystem`.
+        exogenous: The signals w with their derivatives, if there are any.
 
     Output ports:
         state, link_state, joint_torque, and the ports of the stages: as for `RobotPlant`.
         contact_force: The force F of each contact on the robot in the world, in N, including
-            friction, shape (3 m,); of a discrete plant the mean force of the step to t_n.
+            friction, shape (3 m,); if discrete, the mean force of the step to t_n.
         constraint_force: lambda = n(q) . F, N, shape (m,).
-        constraint_residual: phi and phi' of the point of the constraint, as for `DaePlant`; not
-            zero, since compliant surfaces are penetrated.
+        constraint_residual: phi and phi', as for `DaePlant`; not zero in compliant contact.
         controlled_output: z = l(x) + m(x) lambda.
-
-    The context holds all parameters of the system as one numeric parameter, followed by those of
-    `set_contact`.
 
     Args:
         model: The robot; each constraint a `PointOnSurface`.
@@ -71,14 +62,10 @@ class CompliantPlant(ParameterizedSystem, Plant):
         structure: The structure of the model's system; found if None.
         parameters: Parameter name -> the default of the plant; that of the model if left out.
 
-    Attributes:
-        material: The contact material.
-
     Raises:
         ModelError: A constraint is no contact of a point with a surface, a ball does not fit its
             surface, or the step is too long for the stages.
-        SimulationError: A joint reaches its limit during a run, or a step has no solution; the
-            exception has time and state.
+        SimulationError: A joint reaches its limit during a run, or a step has no solution.
     """
 
     __slots__ = SHARED_DICTIONARY

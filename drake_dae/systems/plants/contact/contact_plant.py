@@ -90,17 +90,11 @@ class ContactPlant(Diagram, Plant):
     which uses the control at t_n. The force is that of the step to t_n. After
     `set_consistent_state` the robot touches without force, and penetrates when the run starts.
 
-    Stages of actuation step with it and drive its joints: see `SteppedStages`. Rotors that belong
-    to a stage do not move with the links.
-
     Input port:
-        control: u, shape (p,): the torques and forces of the actuators, N m (N), or the drive of
-            the last stage.
+        control: u, shape (p,): the torques and forces of the actuators, N m (N).
 
     Output ports:
-        state: x = (q, v), and the states of the stages; shape (n,).
-        link_state: (q, v), shape (nq + nv,). joint_torque, and the ports of the stages such as
-        `motor_state`: as for `RobotPlant`.
+        state, link_state: x = (q, v), shape (n,).
         contact_force, constraint_force, constraint_residual, controlled_output: As of
             `contact_block`.
         contact_results: Drake's.
