@@ -22,76 +22,45 @@ from drake_dae.systems.parameterized import ParameterizedSystem
 class StateEstimator(ParameterizedSystem):
     """Estimates what a law does not know: disturbance, friction, parameters, and the state.
 
-    **Disturbance** r, in E x' = f + S d + g v + h u. It is corrected by the momentum p = S^T E x
-    that the model did not predict over a sample T,
+    **Disturbance** r, in E x' = f + S d + g v + h u, by the momentum p = S^T E x that the model did
+    not predict over a sample T: r_k = r_(k-1) + gain (p_k - predicted p_k) / T, with
+    gain = 1 - e^(-k_o T); k_n along the constrained directions. Velocity noise n leaves k_o M n.
 
-        r_k = r_(k-1) + gain (p_k - predicted p_k) / T,    gain = 1 - e^(-k_o T),
-
-    so a constant d is reached as 1 - e^(-k_o t), and velocity noise n leaves some k_o M n in r. Its
-    part along the constrained directions has the rate k_n. With flexible joints or motors the law
-    needs derivatives of r, which is then the output of several lags in series, see `Lags`.
-
-    **State.** With exact velocities x is as measured, and p_k - predicted p_k is the difference of
-    two samples without what the model knows. With a `state_rate` w it is predicted by
-    q' = v, M v' = f + C mu + r + g lambda + h u, with the control that acted and the measured
-    force, and corrected by measured positions,
+    **State.** With exact velocities x is as measured. With a `state_rate` (rigid joints) it is
+    predicted by the model with r, the applied control and the measured force, and corrected by
 
         q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,    e = qm - q,
 
-    by the gains (K_1, K_2, K_3) of the stationary Kalman filter of each position, `ChainFilter`:
-    M K_2 e / T is the momentum that was not predicted, and K_3 is about k_o K_2. Viscous friction
-    in joints and friction of contacts are implicit. This is for rigid joints.
+    with the gains of the stationary Kalman filter of each position, `ChainFilter`.
 
-    **Friction.** With c = S^T dg/dmu v it takes its share of r,
-
-        mu' = k_f (c . r) / (c . c),    r' = ... - c mu',
-
-    so that r + c mu follows d for any k_f. At its first break-away see `EstimatorSample`.
-
-    **Parameters** that `with_disturbance` made exogenous are estimated together with friction by a
-    Kalman filter of r, `ParameterFilter`.
+    **Friction** takes its share of r, mu' = k_f (c . r) / (c . c) with c = S^T dg/dmu v.
+    **Parameters** that `with_disturbance` made exogenous come from a filter of r, `ParameterFilter`.
 
     Input ports:
-        measured_state: x, shape (n,). With a state_rate velocities are used at the first sample;
-            later only if their noise is given.
+        measured_state: x, shape (n,). With a state_rate velocities count if their noise is given.
         control: The applied u, shape (p,).
         measured_force: v, shape (m,); with a state_rate only if the law measures it.
-        hold: Not 0 while a drive is at its limit, shape (1,); 0 without a wire. Then mu and
-            parameters are not updated; r is, since it depends on the applied u.
-        reference: R of the controller; without a wire the current outputs and rates.
+        hold: Not 0 while a drive is at its limit: mu and parameters then rest.
+        reference: R of the controller; the current outputs and rates without a wire.
 
     Output ports:
-        estimated_state: The estimate at the present sample, shape (n,); with a state_rate.
-        exogenous: The disturbance to compensate, mu and parameters, each with the derivatives that
-            the law needs, for the port of a `TrackingController` with the same law.
+        estimated_state: x, shape (n,); with a state_rate.
+        exogenous: Disturbance, mu and parameters with the derivatives that the law needs.
         disturbance, friction: r, shape (k,), and mu, shape (c,).
-        hold: 1 while the input `hold` is not 0 or a frictional contact is lost, else 0, shape (1,):
-            for the integrals of the controller.
-        identified, identified_deviation: All estimated parameters with friction, and their standard
-            deviations, shape (c,) each; only with such parameters.
-        estimated_force: That of the model, v = alpha(x) + beta(x) u (25), with r and mu, shape
-            (m,); only with a state_rate, if the law measures none.
-
-    Estimates are held between samples; r starts at 0, and mu at the model's coefficients.
+        hold: 1 while the input `hold` is not 0 or a frictional contact is lost, else 0.
+        identified, identified_deviation: Parameters with friction, and their deviations.
+        estimated_force: v by the model (25), shape (m,); with a state_rate, if none is measured.
 
     Args:
         law: The law, for a system that `with_disturbance` made.
-        observing: The rates, and the thresholds for friction.
-        sample_period: T in s.
-        control_lag: The fraction of T for which the plant uses the previous control, from 0 to 1: 1
-            for a discrete plant of that step, 0 for a `ControlHold` without delay before a
-            continuous plant.
-        control_delay: The mean time in s from a sample until its control acts: the delay, and half
-            of T, for which it is held.
-        plant_step: The step of a discrete plant in s; 0 for a continuous plant.
-        position_deviation, velocity_deviation: The standard deviations of measured positions and
-            velocities, numbers or of shape (k,); 0 for velocities that are not measured.
-        is_ideal: Whether contacts are ideal, with the friction of the model. On a contact that
-            gives way friction is fully developed at a tenth of the speed.
+        observing, sample_period: The rates, with thresholds for friction; T in s.
+        control_lag: The share of T for which the previous control acts: 1 for a discrete plant.
+        control_delay, plant_step: The mean time in s until a control acts; that of a plant's step.
+        position_deviation, velocity_deviation: Of measurements; 0 for velocities not measured.
+        is_ideal: Whether contacts are ideal, with the friction of the model.
 
     Raises:
-        ModelError: The law's system has no disturbance, or is none with rigid joints where the
-            state is to be estimated, or a number is not valid.
+        ModelError: The law's system has no disturbance, or no rigid joints with a state_rate.
     """
 
     __slots__ = SHARED_DICTIONARY

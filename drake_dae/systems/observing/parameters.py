@@ -32,8 +32,7 @@ class ParameterFilter:
 
         -phi(x) = c_1 lambda + c_2 lambda^(1/2),    c_1, c_2 >= 0.
 
-    A spring has c_1 alone, and a ball on a compliant layer, as in Drake's hydroelastic contact, c_2
-    alone; one of Hertz is between them. With the low-pass filtered regressor Y of the estimator
+    A spring has c_1 alone, hydroelastic contact c_2. With the filtered regressor Y of the estimator
 
         r = Y (theta* - theta) + noise,
         -phi - c_1 lambda - c_2 lambda^(1/2) = dphi/dtheta (theta* - theta) + noise.
@@ -45,21 +44,18 @@ class ParameterFilter:
 
         (tr H P)^2 / 4 + tr (H P H P) / 2,
 
-    which is 0.7 mm for a plane within 10 mm and 0.15 rad of where it is drawn, and nothing once its
-    place is known. Without it the first samples count for too much, and their errors stay.
+    without which the first samples count for too much.
 
-    P_0 is the variance of numbers that are equally likely within their bounds. Between samples
-    masses and frictions change: their P returns to P_0 in `MEMORY`. Places and compliances do not
-    change, but what was measured of them fades with the time constant F = `FADING`, since no model
-    of a surface is exact. So the information P^-1 returns to that of the bounds,
+    P_0 is the variance of numbers that are equally likely within their bounds. Masses and frictions
+    change: their P returns to P_0 in `MEMORY`. What was measured of places and compliances fades
+    with the time constant F = `FADING`, since no model of a surface is exact:
 
         (P^-1)' = (P_0^-1 - P^-1) / F,    P' = (P - P P_0^-1 P) / F.
 
     theta* is within its bounds, and c_1, c_2 >= 0. After a sample the estimate is projected on the
     numbers within the bounds of each parameter, and of each contact's compliances, in the metric of
-    P^-1. As they are convex and hold theta*, no projection raises (theta - theta*)^T P^-1 (theta -
-    theta*), and without noise no sample does. To clip a number alone leaves what is correlated with
-    it where it is: in ideal contact the rest then moves away from theta* by a factor of e in 15 ms.
+    P^-1, which raises no (theta - theta*)^T P^-1 (theta - theta*). To clip a number alone leaves
+    what is correlated with it where it is.
 
     Args:
         identified: The parameters.
@@ -67,12 +63,6 @@ class ParameterFilter:
         largest_friction: Their upper bound.
         rate: k_o in 1/s.
         period: The time between samples of the filter in s.
-
-    Attributes:
-        change: The last change of theta, shape (c,).
-        held: All that is held, a column of symbols.
-        start: Its initial value.
-        deviations: The standard deviations of theta, shape (c,).
     """
 
     def __init__(

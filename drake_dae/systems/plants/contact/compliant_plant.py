@@ -28,8 +28,8 @@ from drake_dae.trace.functions import FailureKind
 class CompliantPlant(ParameterizedSystem, Plant):
     """A robot whose contacts are compliant, by Drake's equations of point contact.
 
-    It is like a `ContactPlant` of traced equations: surfaces may have any shape and move. Each
-    `PointOnSurface` touches with a ball; nothing else of the robot collides.
+    Unlike those of a `ContactPlant` its surfaces may have any shape and move. Each `PointOnSurface`
+    touches with a ball; nothing else of the robot collides.
 
     With `time_step` > 0 it is discrete: at t_n = n time_step, with the control of that instant,
 
@@ -50,8 +50,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
 
     Output ports:
         state, link_state, joint_torque, and the ports of the stages: as for `RobotPlant`.
-        contact_force: The force F of each contact on the robot in the world, in N, including
-            friction, shape (3 m,); if discrete, the mean force of the step to t_n.
+        contact_force: F of each contact on the robot, N, shape (3 m,), with friction, in the world.
         constraint_force: lambda = n(q) . F, N, shape (m,).
         constraint_residual: phi and phi', as for `DaePlant`; not zero in compliant contact.
         controlled_output: z = l(x) + m(x) lambda.
@@ -65,7 +64,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
     Raises:
         ModelError: A constraint is no contact of a point with a surface, a ball does not fit its
             surface, or the step is too long for the stages.
-        SimulationError: A joint reaches its limit during a run, or a step has no solution.
+        SimulationError: A joint reaches its limit in a run, or a step has no solution.
     """
 
     __slots__ = SHARED_DICTIONARY
