@@ -24,22 +24,21 @@ class StateEstimator(ParameterizedSystem):
 
     **Disturbance** r, in E x' = f + S d + g v + h u, by the momentum p = S^T E x that the model did
     not predict over a sample T: r_k = r_(k-1) + gain (p_k - predicted p_k) / T, with
-    gain = 1 - e^(-k_o T); k_n along the constrained directions. Velocity noise n leaves k_o M n.
+    gain = 1 - e^(-k_o T), and k_n along the constrained directions.
 
     **State.** With exact velocities x is as measured. With a `state_rate` (rigid joints) it is
-    predicted by the model with r, the applied control and the measured force, and corrected by
+    predicted by the model with r, control and measured force, and corrected by
 
         q = q + K_1 e,    v = v + K_2 e,    r = r + M K_3 e,    e = qm - q,
 
     with the gains of the stationary Kalman filter of each position, `ChainFilter`.
 
     **Friction** takes its share of r, mu' = k_f (c . r) / (c . c) with c = S^T dg/dmu v.
-    **Parameters** that `with_disturbance` made exogenous come from a filter of r, `ParameterFilter`.
+    **Parameters** that `with_disturbance` made exogenous follow by `ParameterFilter`.
 
     Input ports:
         measured_state: x, shape (n,). With a state_rate velocities count if their noise is given.
-        control: The applied u, shape (p,).
-        measured_force: v, shape (m,); with a state_rate only if the law measures it.
+        control, measured_force: The applied u, shape (p,); v, shape (m,), if the law measures it.
         hold: Not 0 while a drive is at its limit: mu and parameters then rest.
         reference: R of the controller; the current outputs and rates without a wire.
 
@@ -52,8 +51,7 @@ class StateEstimator(ParameterizedSystem):
         estimated_force: v by the model (25), shape (m,); with a state_rate, if none is measured.
 
     Args:
-        law: The law, for a system that `with_disturbance` made.
-        observing, sample_period: The rates, with thresholds for friction; T in s.
+        law, observing, sample_period: Of a system that `with_disturbance` made; the rates; T in s.
         control_lag: The share of T for which the previous control acts: 1 for a discrete plant.
         control_delay, plant_step: The mean time in s until a control acts; that of a plant's step.
         position_deviation, velocity_deviation: Of measurements; 0 for velocities not measured.
