@@ -3,7 +3,6 @@
 from math import ceil
 
 import numpy as np
-from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepFunctions, StepSettings
@@ -132,6 +131,8 @@ class InterpretedRun:
 
     def steps_to_end(self) -> None:
         """Steps from row to row and sample to sample, in the order of stepper.c."""
+        from scipy.integrate import DOP853
+
         times, row = self.problem.times, 0
         is_fixed, plan = self.settings.tableau is not None, list[float]()
         solver, tried, longest = None, None, self.settings.longest

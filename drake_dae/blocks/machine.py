@@ -10,17 +10,16 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.integrate import DOP853
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.emitter import can_be_emitted, emitted
 from drake_dae.blocks.stepping import (
-    DOP,
     Run,
     RunEnding,
     RunProblem,
     StepFunctions,
     StepSettings,
+    tableau_of,
 )
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.compiled import Compiled, generate, library, renamed, without_branches
@@ -245,7 +244,9 @@ class _Call:
             run.trial = np.inf
             run.ending = RunEnding.PAUSED
         self.next = np.zeros(1, dtype=np.longlong)
-        tables = settings.tableau or DOP
+        from scipy.integrate import DOP853
+
+        tables = settings.tableau or tableau_of("dop853")
         self._fixed: dict[str, Any] = {
             **dict(zip("abc", map(np.ascontiguousarray, tables), strict=True)),
             "e3": DOP853.E3,

@@ -3,14 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from functools import cache, cached_property
 from threading import local
 from typing import NamedTuple, Self
 
 import casadi as ca
 import numpy as np
 from pydrake.systems.analysis import SimulatorConfig
-from scipy.integrate import DOP853, RK23, RK45
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, Block, stacked
@@ -180,17 +179,32 @@ def _tableau(a: list[list[float]], b: list[float], c: list[float]) -> Tableau:
     return Tableau(square, np.array(b, dtype=float), np.array(c, dtype=float))
 
 
-FIXED = {
-    "explicit_euler": _tableau([[]], [1.0], [0.0]),
-    "runge_kutta2": _tableau([[], [1.0]], [0.5, 0.5], [0.0, 1.0]),
-    "runge_kutta3": _tableau([[], [0.5], [-1.0, 2.0]], [1 / 6, 2 / 3, 1 / 6], [0.0, 0.5, 1.0]),
-    "bogacki_shampine3": _tableau(RK23.A, RK23.B, RK23.C),
-    "runge_kutta5": _tableau(RK45.A, RK45.B, RK45.C),
-}
+FIXED = (
+    "explicit_euler",
+    "runge_kutta2",
+    "runge_kutta3",
+    "bogacki_shampine3",
+    "runge_kutta5",
+)
 """Drake's explicit schemes."""
 
-DOP = Tableau(DOP853.A, DOP853.B, DOP853.C)
-"""The scheme under error control, of order 8 (Hairer, Norsett and Wanner, 1993)."""
+
+@cache
+def tableau_of(scheme: str) -> Tableau:
+    """One of `FIXED`, or "dop853", of order 8, with error control (Hairer, Norsett, Wanner, 1993).
+
+    SciPy's tables are read here: a run that needs none need not load its integrators.
+    """
+    from scipy.integrate import DOP853, RK23, RK45
+
+    return {
+        "explicit_euler": _tableau([[]], [1.0], [0.0]),
+        "runge_kutta2": _tableau([[], [1.0]], [0.5, 0.5], [0.0, 1.0]),
+        "runge_kutta3": _tableau([[], [0.5], [-1.0, 2.0]], [1 / 6, 2 / 3, 1 / 6], [0.0, 0.5, 1.0]),
+        "bogacki_shampine3": _tableau(RK23.A, RK23.B, RK23.C),
+        "runge_kutta5": _tableau(RK45.A, RK45.B, RK45.C),
+        "dop853": Tableau(DOP853.A, DOP853.B, DOP853.C),
+    }[scheme]
 
 
 class RunEnding(IntEnum):
@@ -241,9 +255,9 @@ class StepSettings:
                     f"integration_scheme: a rollout takes no fixed steps of {scheme}; choose "
                     f"{', '.join(FIXED)}, or use_error_control"
                 )
-            tableau = FIXED[scheme]
+            tableau = tableau_of(scheme)
         elif not functions.block.state.numel():  # There is no error to control.
-            tableau = FIXED["explicit_euler"]
+            tableau = tableau_of("explicit_euler")
         relative = max(SHARE * config.accuracy, SMALLEST)
         return cls(config.max_step_size, tableau, relative * functions.scale, relative, look)
 

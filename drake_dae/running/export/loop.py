@@ -10,7 +10,7 @@ from pydrake.systems.primitives import RandomSource
 from drake_dae.arguments import checked
 from drake_dae.blocks import machine
 from drake_dae.blocks.compose import Composed, compose, leaf_port
-from drake_dae.blocks.stepping import FIXED
+from drake_dae.blocks.stepping import FIXED, tableau_of
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.c_code import (
@@ -110,7 +110,7 @@ def write_loop(
 ) -> list[Path]:
     """Writes a loop from its start time in s on as name_loop.h and name_loop.c."""
     scheme, longest = fixed_steps(config)
-    steps, tableau, file = code.steps, FIXED[scheme], file_of(name)
+    steps, tableau, file = code.steps, tableau_of(scheme), file_of(name)
     begin = ""
     if "begin" in steps.functions:
         begin = """  memcpy(held, l->held, sizeof(held));
