@@ -16,6 +16,7 @@ from .dae import drop_constraints as drop_constraints
 from .dae import share_forces as share_forces
 from .dae import TrackingLaw as TrackingLaw
 from .dae import poles as poles
+from .dae import contact_gains as contact_gains
 from .references import Reference as Reference
 from .references import ConstantReference as ConstantReference
 from .references import LineReference as LineReference
@@ -90,7 +91,6 @@ from .diagrams import ClosedLoop as ClosedLoop
 from .diagrams import Record as Record
 from .scene import start_meshcat as start_meshcat
 from .analysis import analyze as analyze
-from .analysis import contact_gains as contact_gains
 from .running.simulate import simulate as simulate
 from .running.rollout import rollout as rollout
 from .running import export_controller as export_controller

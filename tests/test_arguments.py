@@ -36,6 +36,8 @@ from drake_dae.dae import (
     Manifold,
     PinnedMotion,
     RankMargin,
+    SensedContact,
+    SensorNoise,
     with_disturbance,
 )
 from drake_dae.diagrams.record import Recorded
@@ -65,6 +67,11 @@ def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
 def observed_law() -> dd.TrackingLaw:
     dae = with_disturbance(arm("two_link").model.dae, ["joint1_w", "joint2_w"])
     return dd.TrackingLaw(dae, dd.poles(-4.0))
+
+
+def sensed() -> SensedContact:
+    noise = SensorNoise(1e-5, force=0.1)
+    return SensedContact(1e-3, 1, 1e5, 0.03, 0.3, 0.7, 0.7, 5.0, noise, True)
 
 
 @cache
@@ -135,6 +142,8 @@ SAMPLES: dict[Any, Callable[[], Any]] = {
     dd.Sampling: lambda: dd.Sampling(0.01),
     dd.Encoders: lambda: dd.Encoders(1e-5),
     Observing: lambda: Observing(10.0),
+    SensedContact: sensed,
+    SensorNoise: lambda: SensorNoise(),
     dd.NormalForm: normal_form,
     Manifold: lambda: arm("two_link").structure.manifold,
     Derivatives: lambda: arm("two_link").structure.derivatives,

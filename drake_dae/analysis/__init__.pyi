@@ -3,8 +3,6 @@
 from .examination import along as along
 from .examination import analyze as analyze
 from .examination import examine as examine
-from .gains import ContactGains as ContactGains
-from .gains import contact_gains as contact_gains
 from .limits import Excess as Excess
 from .limits import LimitKind as LimitKind
 from .limits import LimitsAlong as LimitsAlong

@@ -2,13 +2,19 @@
 
 from .assumptions import Violation as Violation
 from .assumptions import ViolationKind as ViolationKind
+from .beyond.advised_gains import AdvisedGains as AdvisedGains
+from .beyond.advised_gains import SensedContact as SensedContact
+from .beyond.advised_gains import advised_gains as advised_gains
+from .beyond.contact_gains import ContactGains as ContactGains
+from .beyond.contact_gains import contact_damping as contact_damping
+from .beyond.contact_gains import contact_gains as contact_gains
 from .beyond.disturbance import Observation as Observation
 from .beyond.disturbance import with_disturbance as with_disturbance
 from .beyond.identified import IdentifiedTerms as IdentifiedTerms
 from .beyond.lags import Lags as Lags
-from .beyond.one_direction import SensedContact as SensedContact
 from .beyond.one_direction import SensorNoise as SensorNoise
-from .beyond.one_direction import direction_gains as direction_gains
+from .beyond.sampled import sampled_poles as sampled_poles
+from .beyond.sampled import sampling_error as sampling_error
 from .contacts import PainleveOutcome as PainleveOutcome
 from .contacts import UnilateralInput as UnilateralInput
 from .contacts import painleve_outcome as painleve_outcome

@@ -37,7 +37,7 @@ from drake_dae.references import Reference
 from drake_dae.robots import Links, RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
-from drake_dae.scenario.gains import advised, latency_of
+from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import (
     completed_model,
     exogenous_references,
@@ -234,6 +234,19 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             contact_stiffness=settings.contact_stiffness,
             latency=latency_of(scenario, model),
         )
+
+
+def latency_of(scenario: Scenario, model: RobotModel) -> float:
+    """The mean time from a sample to the moment when its control acts, for rigid joints, in s.
+
+    A plant that steps by h damps with the speed at the end of each step: h / 2 later than the mean,
+    and h later than a law without sampling, which acts at each step.
+    """
+    sampling, material = scenario.sampling, scenario.plant.material
+    step = 0.0 if material is None else material.time_step
+    if model.stages:
+        return 0.0
+    return step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
 
 
 def check_task(scenario: Scenario) -> None:

@@ -8,51 +8,54 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import expm
 
-from drake_dae.analysis.gains import DAMPING, DECAY, FORCE, ContactGains, contact_gains
-from drake_dae.analysis.sampled_loop import EVERY
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import Structure
+from drake_dae.dae import (
+    AdvisedGains,
+    ContactGains,
+    SensedContact,
+    SensorNoise,
+    Structure,
+    advised_gains,
+    contact_gains,
+)
+from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR
 from drake_dae.dae.law_model import damping_gains
-from drake_dae.dae.law_terms import Deflection
-from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.errors import ModelError, ScenarioError
-from drake_dae.references import Reference, SinusoidReference
-from drake_dae.robots import RobotModel
+from drake_dae.errors import ScenarioError
+from drake_dae.references import Reference
+from drake_dae.robots import RobotModel, velocities_are_rates
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at
-from drake_dae.scenario.model import reference_and_start, references_of
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact
-from drake_dae.systems.plants.contact.contact_material import PointMaterial
 from drake_dae.systems.task.automaton import SMOOTH, fading
 from drake_dae.systems.task.phases import Approach, Press
 
 _SOFTER = 5.0
 """The ratio of the poles of positions to those of the distance, of a robot without contact."""
 
+NOISE = 1e-3
+"""The standard deviation of velocity noise in rad/s, without encoders."""
+
 _FORCE = 10.0
 """The force in N at which the stiffness of a hydroelastic patch is evaluated."""
+
+_SHARE = 0.003
+"""The default of the largest roughness, as a fraction of the largest effort limit."""
 
 _PERIODS = 3
 """The number of oscillations of the contact after the force of a touch has reached its goal."""
 
-_LONGEST = 10.0
-"""The longest motion in s along which the loop is examined."""
-
-_ROUND, _FAST = 0.02, 2.5
-"""The circle in m, and its frequency in rad/s, for which the gains of a task are computed."""
-
 
 def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Completed:
-    """Computes gains and other settings that a scenario in contact that gives way leaves out.
+    """Computes gains and other settings that a scenario in Drake's own contact leaves out.
 
-    It computes the gains of `contact_gains`, integrals of forces and of points, constraint damping,
-    an estimator of disturbance and friction, measured force, and the law's contact stiffness where
-    references of forces are smooth, each if it is left out; and for a task the gains without
-    contact, soft along the distance. A scenario with `law.gains`, or with ideal contact, is
-    unchanged.
+    It computes gains, integrals of forces and of points, constraint damping, an estimator of
+    disturbance and friction, and measured force, each if it is left out; and for a task the gains
+    without contact, soft along the distance. With encoders and rigid joints the gains are those of
+    `advised_gains` for the noise of the encoders; otherwise those of `contact_gains`. A scenario
+    with `law.gains`, or with ideal contact, is unchanged.
 
     Args:
         scenario: The scenario, with all of its outputs.
@@ -63,14 +66,12 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         The scenario, and the choices in words.
 
     Raises:
-        ScenarioError: There are no default gains for such a scenario, or none are smooth and
-            stable; or `largest_roughness` is given and not used.
+        ScenarioError: There are no default gains for such a scenario, or none are smooth and stable
+            enough; or `largest_roughness` or `largest_errors` is given and not used.
     """
     material = scenario.plant.material
     law, sensors = scenario.law, scenario.sensors
-    if law.largest_roughness is not None and not scenario.is_advised:
-        text = "it is used only for computed gains; leave it out, or leave `law.gains` out"
-        raise ScenarioError(("law.largest_roughness", text))
+    _check_bounds(scenario)
     if material is None or not scenario.is_advised:
         return Completed(scenario)
     if model.stages:
@@ -87,72 +88,68 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             "or a sampling"
         )
         raise ScenarioError(("law.gains", text))
+    late = 0 if sampling is None else sampling.late_samples
+    mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
+    stiffness = material.stiffness_on(model, _FORCE)
+    fast = None
+    known_by, outlook = f"velocities within {NOISE:.2g} rad/s", ""
+    efforts = model.control_limits[np.isfinite(model.control_limits)]
+    if sensors.encoders is None:
+        contact = contact_gains(stiffness, mobility, period, late, NOISE)
+    else:
+        sensed = sensed_contact(scenario, model, structure, (period, late), stiffness)
+        roughness = law.largest_roughness
+        if roughness is None:
+            roughness = _SHARE * float(np.max(efforts)) if efforts.size else 1.0
+        bounds = {} if law.largest_errors is None else vars(law.largest_errors)
+        errors = {f"{name}_error": most for name, most in bounds.items() if most is not None}
+        with at("law.gains"):
+            best = advised_gains(sensed, roughness, **errors)
+        contact, fast = best.gains, best.state_rate
+        known_by, outlook = "these encoders", f". {_predicted(best)}"
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
+    points = _moved_points(model)
     integral = law.integral
     if integral is None:
-        points = _moved_points(model)
         integral = [name for name in positions if name in points] + forces.tolist()
-    stiffness = material.stiffness_on(model, _FORCE)
     force = sensors.force or parts.MeasuredForce(sample_period=period)
-    estimator = scenario.estimator or parts.Estimator()
-    frictional = [c.friction_parameter for c in model.constraints if c.friction_parameter]
-    identify = list(dict.fromkeys([*frictional, *estimator.identify]))
-    references, guess, stated = _motion(scenario, model, structure, stiffness)
-    begin, given = scenario.integrator.start_time, law.constraint_damping
-    with at("law.gains"):
-        best = contact_gains(
-            model,
-            PointMaterial(
-                material.time_step,
-                stiffness,
-                material.dissipation,
-                None,
-                material.stiction_tolerance,
-                material.radius,
-            ),
-            references,
-            LoopSettings(
-                sensor=force.sensor(model.dae.num_constraints),
-                encoders=sensors.encoders,
-                sampling=sampling,
-                observer=None if estimator.rate is None else estimator,
-            ),
-            times=(begin, begin + min(scenario.duration, _LONGEST)),
-            guess=guess,
-            structure=structure,
-            identify=identify,
-            integral=integral,
-            constraint_damping=None if given is None else given.design(),
-            contact_stiffness=stated,
-            latency=latency_of(scenario, model),
-            roughness=law.largest_roughness,
-        )
     # A force of degree 0 has a gain only if it is integrated.
-    of_forces = {name: [_rounded(best.force_gain)] for name in forces.tolist() if name in integral}
+    of_forces = {
+        name: [_rounded(contact.force_gain)] for name in forces.tolist() if name in integral
+    }
     of_positions = {
-        name: [_rounded(gain) for gain in best.position_gains(3 if name in integral else 2)]
+        name: [_rounded(gain) for gain in contact.position_gains(3 if name in integral else 2)]
         for name in positions.tolist()
     }
-    damping = law.constraint_damping or parts.Poles(all=[-_rounded(best.constraint_damping)])
+    gains = parts.Coefficients(outputs=of_positions | of_forces)
+    damping = law.constraint_damping
+    if damping is None and contact.constraint_damping:
+        damping = parts.Poles(all=[-_rounded(contact.constraint_damping)])
+    estimator = scenario.estimator or parts.Estimator()
+    frictional = [c.friction_parameter for c in model.constraints if c.friction_parameter]
     if estimator.rate is None:
-        own, fast = best.observing, best.observing.state_rate
         estimator = replace(
             estimator,
-            rate=_rounded(own.rate),
-            force_rate=_rounded(own.force_rate or own.rate),
-            friction_rate=_rounded(own.friction_rate),
-            identify=identify,
+            rate=_rounded(contact.observer_rate),
+            force_rate=_rounded(contact.observer_force_rate),
+            friction_rate=_rounded(contact.friction_rate),
+            identify=list(dict.fromkeys([*frictional, *estimator.identify])),
             state_rate=None if fast is None else _rounded(fast),
         )
-    task, touch_note = scenario.task, ""
+    task = scenario.task
     if task is not None and task.gains is None:
-        task = replace(task, gains=_free_gains(scenario, model, best))
+        task = replace(task, gains=_free_gains(scenario, model, contact))
+    touch_note = ""
     if task is not None:
-        mobility = float(np.max(np.diag(structure.constraint_matrix(structure.states[0]))))
-        late = period * (1 + (0 if sampling is None else sampling.late_samples))
-        least = _least_damping(structure, damping)
-        touching = _Touch(stiffness, mobility, least, best.force_gain, period, late)
+        touching = _Touch(
+            stiffness,
+            mobility,
+            contact.constraint_damping if damping is None else _least_damping(structure, damping),
+            contact.force_gain,
+            period,
+            period * (1 + late),
+        )
         task = touching.slowed(task)
         touch_note = touching.note(task)
     chosen = replace(
@@ -160,68 +157,47 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         task=task,
         law=replace(
             law,
-            gains=parts.Coefficients(outputs=of_positions | of_forces),
+            gains=gains,
             integral=integral,
             constraint_damping=damping,
-            contact_stiffness=None if task is not None else stated,
             largest_roughness=None,
+            largest_errors=None,
         ),
         estimator=estimator,
         sensors=replace(sensors, force=force),
     )
-    return Completed(chosen, (_note(best, chosen, stiffness) + touch_note,))
+    identified = ", ".join(name for name in estimator.identify if name in frictional) or "none"
+    estimated = "" if fast is None else f", and an estimate of the state of {_rounded(fast):g} 1/s"
+    note = (
+        f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
+        f"{period:g} s and {known_by}: Butterworth's poles of positions "
+        f"at {_rounded(contact.position_rate):g} 1/s, and of forces one at "
+        f"{-_rounded(contact.force_gain):g} 1/s, with integrals of {', '.join(integral)}, damping "
+        f"of the constraint {_rounded(contact.constraint_damping):g} 1/s, an estimator of "
+        f"{estimator.rate:g} 1/s that identifies: {identified}{estimated}"
+        f"{outlook}"
+        f"{touch_note}"
+    )
+    return Completed(chosen, (note,))
 
 
-def _motion(
-    scenario: Scenario, model: RobotModel, structure: Structure, stiffness: float
-) -> tuple[list[Reference], FloatArray | None, float | None]:
-    """The references along which gains are computed, a state near them, and the law's stiffness.
+def _check_bounds(scenario: Scenario) -> None:
+    """Checks that bounds for computed gains are used.
 
-    That of a task is a small circle, with the force that its contact has in the middle.
+    Raises:
+        ScenarioError: One is not, or is not positive.
     """
-    names = [signal.name for signal in model.dae.output_signals]
-    degrees = list(structure.output_degrees)
-    forces = range(len(model.position_signals), len(names))
-    if scenario.task is not None:
-        dae, points = model.dae, _moved_points(model)
-        state = structure.manifold.project(dae.nominal_state)
-        outputs = ca.Function("z", [dae.state, dae.parameter_symbol], [dae.l])
-        middle = outputs(state, dae.parameter_values).full()[:, 0]
-        middle[list(forces)] = _FORCE
-        turns = {name: pi / 2.0 * i for i, name in enumerate(points)}
-        return (
-            [
-                SinusoidReference(value, _ROUND * (name in points), _FAST, turns.get(name, 0.0))
-                for name, value in zip(names, middle.tolist(), strict=True)
-            ],
-            state,
-            None,
-        )
-    with at("start"):
-        _, guess = reference_and_start(scenario, model, structure)
-    stated = scenario.law.contact_stiffness
-    if stated is None:
-        for i in forces:
-            degrees[i] = 2
-        try:
-            Deflection.of(structure, stiffness, None)
-            return references_of(scenario, names, degrees), guess, stiffness
-        except (ModelError, ScenarioError):  # Other outputs, or forces that jump.
-            degrees = list(structure.output_degrees)
-    return references_of(scenario, names, degrees), guess, stated
-
-
-def latency_of(scenario: Scenario, model: RobotModel) -> float:
-    """The mean time from a sample to the moment when its control acts, for rigid joints, in s.
-
-    A plant that steps by h damps with the speed at the end of each step: h / 2 later than the mean,
-    and h later than a law without sampling, which acts at each step.
-    """
-    sampling, material = scenario.sampling, scenario.plant.material
-    step = 0.0 if material is None else material.time_step
-    if model.stages:
-        return 0.0
-    return step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
+    is_used, law = scenario.is_advised and scenario.sensors.encoders is not None, scenario.law
+    for name in ("largest_roughness", "largest_errors"):
+        if getattr(law, name) is not None and not is_used:
+            text = (
+                "it is used only for gains that are computed for rigid joints with encoders in "
+                "Drake's contact; leave it out, or leave `law.gains` out and give encoders"
+            )
+            raise ScenarioError((f"law.{name}", text))
+    if law.largest_roughness is not None and not law.largest_roughness > 0.0:
+        value = f"must be positive, got {law.largest_roughness:g} N m"
+        raise ScenarioError(("law.largest_roughness", value))
 
 
 def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) -> parts.Coefficients:
@@ -241,45 +217,66 @@ def _least_damping(structure: Structure, damping: parts.Gains) -> float:
         return float(np.min(np.diag(damping_gains(structure, damping.design()).matrix)))
 
 
-def _note(best: ContactGains, chosen: Scenario, stiffness: float) -> str:
-    """The choice of gains as sentences."""
-    law, estimator = chosen.law, chosen.estimator
-    assert estimator is not None
-    observed = f"an estimator of {estimator.rate:g} 1/s that identifies: "
-    observed += ", ".join(estimator.identify) or "none"
-    if estimator.state_rate is not None:
-        observed += f", with an estimate of the state of {estimator.state_rate:g} 1/s"
-    binds = {
-        "roughness": "the roughness of the controls",
-        "damping": "the damping of fast modes",
-        "decay": "the decay of slow modes",
-        "start": "the start",
-    }.get(best.binds, "sampling and delay")
-    text = (
-        f"recommended for a contact of {stiffness:.2g} N/m: Butterworth's poles of positions at "
-        f"{_rounded(best.position_rate):g} 1/s, of forces one at {-_rounded(best.force_gain):g} "
-        f"1/s, with integrals of {', '.join(law.integral or ())}, damping of the constraint "
-        f"{_rounded(best.constraint_damping):g} 1/s, {observed}. "
+def sensed_contact(
+    scenario: Scenario,
+    model: RobotModel,
+    structure: Structure,
+    timing: tuple[float, int],
+    stiffness: float,
+) -> SensedContact:
+    """Collects the data on a robot, its contact and its sensors for the choice of gains.
+
+    Args:
+        scenario: The scenario, with encoders.
+        model, structure: Its robot.
+        timing: The period in s and the delay in samples.
+        stiffness: The stiffness of the contact in N/m.
+    """
+    system, state, encoders = model.dae, structure.states[0], scenario.sensors.encoders
+    assert encoders is not None
+    velocities = slice(model.links.q.numel(), 2 * model.links.q.numel())
+    rows, moved = system.l.numel(), _moved_points(model)
+    points = [i for i in range(rows) if system.output_signals[i].name in moved]
+    x, mass = system.state, system.mass_matrix[velocities, velocities]
+    reads = ca.vertcat(system.l[points], system.k)
+    slopes = ca.jacobian(reads, x)[:, : model.links.q.numel()]
+    function = system.trace("levers", {"slopes": slopes, "mass": mass}, often=False)
+    values = function(state, system.parameter_values)
+    jacobian, inertia = values[0].reshape(reads.numel(), -1), values[1]
+    moves = np.einsum("ij,ji->i", jacobian, np.linalg.solve(inertia, jacobian.T))
+    levers = np.linalg.norm(jacobian, axis=1)
+    free, contact = slice(len(points)), slice(len(points), None)
+    estimator = scenario.estimator
+    may_estimate = estimator is None or estimator.rate is None or estimator.state_rate is not None
+    has_rates = encoders.velocity_bandwidth is None and velocities_are_rates(model.links)
+    period, delay = timing
+    return SensedContact(
+        period=period,
+        delay=delay,
+        stiffness=stiffness,
+        mobility=float(np.max(moves[contact])),
+        free_mobility=float(np.max(moves[free], initial=np.max(moves[contact]))),
+        lever=float(np.max(levers[free], initial=np.max(levers[contact]))),
+        contact_lever=float(np.max(levers[contact])),
+        inertia=float(np.linalg.norm(inertia)),
+        noise=SensorNoise(
+            position=float(np.max(encoders.position_deviation)),
+            velocity=float(np.max(np.asarray(encoders.velocity_noise, dtype=float))),
+            force=float(np.max(scenario.sensors.force_noise)),
+            velocity_bandwidth=encoders.velocity_bandwidth or 0.0,
+        ),
+        estimates=may_estimate and has_rates,
     )
-    if best.binds == "rest":
-        text += "The references rest, so that no loop was examined. "
-    else:
-        text += (
-            "On the loop itself, with stiffness and tool's mass from 1/2 to 2 times the model's "
-            f"and friction up to 0.8, the slowest mode decays at {best.decay:.2g} 1/s, and the "
-            f"least damping ratio is {best.damping:.2g}; {binds} keeps the gains from being "
-            "faster. "
-        )
-    text += (
-        f"Noise changes the controls by {best.roughness:.2g} N m from sample to sample. Expected "
-        f"are {1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N rms, if an unknown "
-        f"force of {FORCE:g} N appears every {EVERY:g} s"
-    )
-    if best.margin >= 1.0:
-        return text
+
+
+def _predicted(best: AdvisedGains) -> str:
+    """The errors from which gains were chosen, as sentences."""
+    by_noise = f"{1e3 * best.noise_error:.2g} mm and {best.noise_force:.2g} N"
     return (
-        f"{text}. {DECAY:g} 1/s and {DAMPING:g} are recommended: more inertia at the tool, a "
-        "shorter delay, a softer contact or less noise would help"
+        "These gains are the best for one direction alone: "
+        f"{1e3 * best.position_error:.2g} mm and {best.force_error:.2g} N rms "
+        f"if an unknown force of {MODEL_ERROR:g} N appears every {EVERY:g} s, {by_noise} of it by "
+        f"noise, and a change of the controls of {best.roughness:.2g} N m from sample to sample"
     )
 
 

@@ -337,13 +337,8 @@ def _slower(loop: ClosedLoop, model: RobotModel, limits: SignalLimits, record: R
     dae, law = model.dae, loop.controller.law
     if loop.generator is None or dae.exogenous.moving:
         return []
+    reference = loop.generator.reference
     structure = law.structure if law.system is dae else find_structure(dae)
-    # A law that leads a deflection has more derivatives of forces than the motion needs.
-    stacked = stack_references(loop.generator.references, structure.layout.reference_degrees)
-
-    def reference(time: float) -> FloatArray:
-        return stacked(time).copy()
-
     times, start = record.time[:: record.time.size // MOST_TIMES + 1], record["state"][0]
     motion = ZeroDynamics(dae, structure=structure).motion(reference, times, start)
     found = limits_along(structure, limits, reference, motion)

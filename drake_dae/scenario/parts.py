@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.arrays import FloatArray, positive, unknown_name
 from drake_dae.dae import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.references import Reference
@@ -159,6 +159,24 @@ class Sensors:
 
 
 @dataclass(frozen=True)
+class LargestErrors:
+    """The largest rms errors by which gains are computed, see `AdvisedGains`.
+
+    Attributes:
+        position: Of a point that follows a path, in m; no bound if left out.
+        force: Of a contact force, in N; no bound if left out.
+    """
+
+    position: float | None = None
+    force: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, most in vars(self).items():
+            if most is not None:
+                positive(f"largest {name} error", most)
+
+
+@dataclass(frozen=True)
 class Estimator(Observing):
     """The settings of a `StateEstimator` of model errors.
 
@@ -265,6 +283,8 @@ class Law:
         largest_roughness: The largest permitted rms change of the controls from sample to sample by
             the noise of encoders, over all joints, in N m, for computed gains; if left out 0.3 % of
             the largest effort limit, or 1 N m without limits.
+        largest_errors: The largest permitted errors for computed gains: those are then the
+            smoothest ones within them, and without a bound the ones with the least errors.
     """
 
     gains: Gains | None = None
@@ -274,6 +294,7 @@ class Law:
     force_gain: ArrayLike = 0.0
     control_weights: list[float] = field(default_factory=list)
     largest_roughness: float | None = None
+    largest_errors: LargestErrors | None = None
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,8 @@ The plant of each test is x' = f + g F + h u with F = -k phi in place of the con
 integrated by SciPy.
 """
 
+import warnings
+
 import numpy as np
 import pytest
 import scipy.integrate
@@ -17,6 +19,8 @@ from drake_dae import (
     TrackingLaw,
     poles,
 )
+from drake_dae.dae import contact_damping
+from drake_dae.errors import AdviceWarning, ModelError
 from drake_dae.references import stack_references
 
 STIFFNESS, MASS = 1e4, 2.0
@@ -65,7 +69,8 @@ def test_a_contact_that_gives_way_is_damped_as_chosen(share):
     In closed form by the exponential of a matrix; the integrator leaves 1e-6 of 20 N.
     """
     frequency = np.sqrt(STIFFNESS / MASS)
-    c = share * 2.0 * frequency
+    c = share * contact_damping(STIFFNESS, 1.0 / MASS)
+    assert contact_damping(STIFFNESS, 1.0 / MASS) == pytest.approx(2.0 * frequency)
     law = TrackingLaw(block(), poles(-8.0), constraint_damping=poles(-c) if c else None)
     times = np.linspace(0.0, 0.2, 101)
     wanted = [ConstantReference(0.0), ConstantReference(20.0)]
@@ -99,3 +104,73 @@ def test_a_force_that_changes_is_followed_with_the_error_derived():
 
 
 # Advice.
+
+
+def sampled(frequency, damping, sample_time, delay, samples):
+    """|phi| of a contact from phi = 1, its damping held and late, ten times a sample."""
+    fine = scipy.linalg.expm(
+        np.array([[0.0, 1.0, 0.0], [-(frequency**2), 0.0, 1.0], [0.0, 0.0, 0.0]])
+        * (sample_time / 10.0)
+    )
+    x, waiting, largest = np.array([1.0, 0.0, 0.0]), [0.0] * delay, []
+    for _ in range(samples):
+        waiting.append(-damping * x[1])
+        x[2], size = waiting.pop(0), 0.0
+        for _ in range(10):
+            x = fine @ x
+            size = max(size, abs(x[0]))
+        largest.append(size)
+    return np.array(largest)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::drake_dae.errors.AdviceWarning")
+@pytest.mark.parametrize("delay", [0, 1, 2])
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.4, 0.8])
+def test_the_advice_brings_a_sampled_contact_to_rest_sooner_than_others(share, delay):
+    """Half and twice of it are slower in the long run, or no damping is advised at all."""
+    T, k = 1e-3, (share / 1e-3) ** 2
+    c, samples = contact_damping(k, 1.0, T, delay), int(20 / share)
+    assert 0.0 <= c <= 2.0 * np.sqrt(k) * (1.0 + 1e-12)
+    left = [sampled(np.sqrt(k), f * c, T, delay, samples)[-5:].max() for f in (1.0, 0.5, 2.0)]
+    if c > 0.0:
+        assert left[0] < min(*left[1:], 1.0)
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2])
+@pytest.mark.parametrize("swing", [0.2, 0.5, 0.8, 1.0, 1.5, 2.5, 4.5, 7.0])
+def test_nothing_is_advised_in_silence_that_is_unstable_next_door(swing, delay):
+    """A softer contact and one that is stiffer by up to two come to rest, or this warns."""
+    T = 1e-3
+    frequency = swing / T
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        c = contact_damping(frequency**2, 1.0, T, delay)
+    if not told:
+        for factor in (0.3, 0.9, 1.1, 1.99):
+            left = sampled(frequency * factor**0.5, c, T, delay, 400)
+            assert left[-50:].max() < 0.5 * left[:50].max(), factor
+        return
+    (one,) = told
+    assert one.category is AdviceWarning
+    assert swing > {0: 1.3, 1: 0.6, 2: 0.36}[delay]
+    # The stiffness that is named does not come to rest indeed, unless samples do not show it.
+    words = str(one.message)
+    factor = float(words.split("which is ")[1].split(" times")[0])
+    if swing * factor**0.5 < 3.1:
+        left = sampled(frequency * (1.02 * factor) ** 0.5, c, T, delay, 300)
+        assert not left[-50:].max() < 0.05 * left[:50].max()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ((0.0, 1.0), "stiffness"),
+        ((1e5, -1.0), "mobility"),
+        ((1e5, 1.0, -1e-3), "sample_time"),
+        ((1e5, 1.0, 1e-3, -1), "delay"),
+    ],
+)
+def test_advice_needs_sensible_numbers(numbers, message):
+    with pytest.raises(ModelError, match=message):
+        contact_damping(*numbers)

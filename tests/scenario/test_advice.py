@@ -5,16 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arms import numbers
 from pydrake.systems.analysis import Simulator
 from runs import scenario
 
-from drake_dae import build_scenario, load_scenario
+from drake_dae import build_scenario, contact_gains, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario import plants
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.gains import advised
+from drake_dae.scenario.gains import advised, sensed_contact
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario, save_scenario
@@ -44,16 +45,17 @@ def test_what_is_left_out_is_advised_and_reported():
     assert len(completed.notes) == 1
     assert "1e+05 N/m" in completed.notes[0]
     assert "identifies: wall.friction" in completed.notes[0]
+    model = scenario_model(found)
+    structure = scenario_structure(model)
+    mobility = structure.constraint_matrix(structure.states[0]).item()
+    wanted = contact_gains(1e5, mobility, 1e-3, 1)
     run = completed.scenario
     assert run.law.integral == ["tool.z", "wall.force"]
-    (lowest, _, highest), (rate,) = (
-        run.law.gains.outputs["tool.z"],
-        run.law.gains.outputs["wall.force"],
-    )
-    assert highest == pytest.approx(2.0 * lowest ** (1.0 / 3.0), rel=1e-2)  # Butterworth's poles.
-    assert run.law.constraint_damping.all == [pytest.approx(-rate / 0.4, rel=1e-2)]
-    assert run.law.contact_stiffness == 1e5
-    assert run.estimator.rate > run.estimator.force_rate > 0.0
+    assert run.law.gains.outputs["tool.z"] == pytest.approx(wanted.position_gains(3), rel=1e-2)
+    assert run.law.gains.outputs["wall.force"] == [pytest.approx(wanted.force_gain, rel=1e-2)]
+    assert run.law.constraint_damping.all == [pytest.approx(-wanted.constraint_damping, rel=1e-2)]
+    assert run.estimator.rate == pytest.approx(wanted.observer_rate, rel=1e-2)
+    assert run.estimator.force_rate == pytest.approx(wanted.observer_force_rate, rel=1e-2)
     assert run.sensors.force == parts.MeasuredForce(sample_period=1e-3)
     assert loop.observer is not None
     assert loop.observer.friction_signals[0].name == "wall.friction"
@@ -66,6 +68,7 @@ def test_encoders_are_estimated_at_rates_for_their_noise():
         for size in ("1.0e-6", "1.0e-3")
     )
     assert "estimate of the state" in fine.notes[0]
+    assert "the best for one direction alone" in fine.notes[0]
     assert fine.scenario.estimator.state_rate > coarse.scenario.estimator.state_rate
     differences = chosen(two_link("sensors.encoders={resolution: 1.0e-6, velocity_bandwidth: 500}"))
     assert differences.estimator.state_rate is None
@@ -74,18 +77,37 @@ def test_encoders_are_estimated_at_rates_for_their_noise():
 
 
 def test_a_roughness_without_use_is_refused():
-    with pytest.raises(ScenarioError, match="largest_roughness"):
-        chosen(two_link("law.largest_roughness=1.0", "law.gains={all: [-9]}"))
+    with pytest.raises(ScenarioError, match="encoders"):
+        chosen(two_link("law.largest_roughness=1.0"))
     with pytest.raises(ScenarioError, match="-1"):
         chosen(two_link("sensors.encoders={resolution: 1.0e-5}", "law.largest_roughness=-1.0"))
 
 
 @pytest.mark.slow
 def test_a_noise_that_no_gains_smooth_is_named():
-    with pytest.raises(ScenarioError, match=r"0\.0001"):
+    with pytest.raises(ScenarioError, match="position"):
         chosen(
             two_link("sensors.encoders={position_noise: 1.0e-3}", "law.largest_roughness=1.0e-4")
         )
+
+
+def test_largest_errors_bound_what_is_predicted_or_say_what_forbids_them():
+    free, bound = (
+        build_completed(two_link("sensors.encoders={resolution: 1.0e-5}", *more))[0]
+        for more in ((), ("law.largest_errors={position: 1.0e-3}",))
+    )
+    assert bound.scenario.law.gains.outputs["tool.z"] < free.scenario.law.gains.outputs["tool.z"]
+    assert bound.scenario.law.largest_errors is None
+    with pytest.raises(ScenarioError, match="gains: "):
+        chosen(
+            two_link(
+                "sensors.encoders={resolution: 1.0e-5}", "law.largest_errors={position: 1.0e-7}"
+            )
+        )
+    with pytest.raises(ScenarioError, match="largest_errors: "):
+        chosen(two_link("law.largest_errors={force: 0.1}"))
+    with pytest.raises(ScenarioError, match="force"):
+        chosen(two_link("sensors.encoders={resolution: 1.0e-5}", "law.largest_errors={force: 0}"))
 
 
 @pytest.mark.slow
@@ -93,7 +115,7 @@ def test_gains_that_cannot_be_computed_are_a_problem_before_a_run():
     found = find_feasibility(
         two_link("sensors.encoders={position_noise: 1.0e-3}", "law.largest_roughness=1.0e-4")
     )
-    assert any("0.0001" in problem for problem in found.problems)
+    assert any("position" in problem for problem in found.problems)
 
 
 @pytest.mark.slow
@@ -202,3 +224,21 @@ def parameters(loop, wall):
 def test_observer_that_does_not_fit_is_refused(settings, message):
     with pytest.raises(ScenarioError, match=message):
         build_scenario(two_link(*settings))
+
+
+def test_levers_and_mobilities_are_those_of_multibody_plant():
+    """Of the point and of the wall; the matrices of MultibodyPlant alone, to round-off."""
+    found = two_link("sensors.encoders={resolution: 1.0e-4}")
+    model = scenario_model(found)
+    structure = scenario_structure(model)
+    sensed = sensed_contact(found, model, structure, (1e-3, 1), 1e5)
+    known = numbers("two_link", *np.split(structure.states[0], 2))
+    inverse, rows = np.linalg.inv(known.mass), (known.output_jacobian, known.constraint_jacobian)
+    levers, mobilities = zip(
+        *((np.linalg.norm(J), (J @ inverse @ J.T).item()) for J in rows), strict=True
+    )
+    assert (sensed.lever, sensed.contact_lever) == pytest.approx(levers)
+    assert (sensed.free_mobility, sensed.mobility) == pytest.approx(mobilities)
+    assert sensed.inertia == pytest.approx(np.linalg.norm(known.mass))
+    assert sensed.noise.position == pytest.approx(1e-4 / 12.0**0.5)
+    assert sensed.estimates

@@ -1,7 +1,7 @@
-"""The sampled loop of a law in one direction, as a linear system driven by noise, and its gains."""
+"""The sampled loop of a law in one direction, as a linear system driven by noise."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -59,7 +59,7 @@ class DirectionGains:
 
 
 @dataclass(frozen=True)
-class DirectionLoop:
+class SampledLoop:
     """A sampled linear loop: x+ = A x + B n with noise n of deviation 1, and outputs C x + D n.
 
     `step` and `noise` are A and B. `shown` has the rows (C, D) of the error, of a contact that of
@@ -105,7 +105,7 @@ class DirectionLoop:
         return float(max(rest @ spread @ rest, 0.0)) ** 0.5
 
 
-def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise) -> DirectionLoop:
+def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise) -> SampledLoop:
     """Returns the loop of a law whose model is right, except for the `mass_error`.
 
     In a free direction the error moves as e'' = m a + d, where a is the acceleration that the law
@@ -133,7 +133,7 @@ def sampled_loop(direction: Direction, rates: DirectionGains, noise: SensorNoise
     both[:, :size] /= units
     looked = np.array([row[:count] for row in shown])
     looked[:, :size] /= units
-    return DirectionLoop(
+    return SampledLoop(
         both[:, :size], both[:, size:count], looked, both[:, count], direction.period
     )
 
@@ -234,129 +234,3 @@ def _estimated(
         return {"q": q + period**2 / 2.0 * acted, "w": w + period * acted, "a": a}
 
     return estimates, update
-
-
-PHASE = 0.3
-"""The phase in rad that sampling and delay cost at the crossover with the fastest gains of a
-contact; the fastest free directions are twice as fast."""
-
-MODEL_ERROR, EVERY = 1.0, 2.0
-"""An unknown force of 1 N appears or turns every 2 s."""
-
-RAMP = 10.0
-"""The reference of a force changes by 10 N/s."""
-
-_RATES = np.geomspace(1.0, 1.0 / 120.0, 20).tolist()
-"""The rates that are tried, relative to the fastest."""
-
-_STATE_RATES = (2.0, 4.0, 7.0, 12.0, 20.0)
-"""The rates of an estimate of the state that are tried, relative to half of the fastest."""
-
-
-@dataclass(frozen=True)
-class SensedContact:
-    """The numbers of a robot in contact, its sampling and its sensors that decide its gains.
-
-    Attributes:
-        period, delay: T in s, and the delay of the control in samples.
-        stiffness: k of the contact in N/m.
-        mobility, free_mobility: J M^-1 J^T of the contact, and of points on a path, in 1/kg.
-        lever, contact_lever: The displacement of such a point, and of the contact, per radian of
-            noise of all joints: the length of a row of J, in m/rad.
-        inertia: sqrt(tr M M): the torque per acceleration of all joints, in kg m^2.
-        noise: That of a joint's angle and velocity, in rad and rad/s, and of the force in N.
-        estimates: Whether the state is estimated from positions.
-        leads: Whether the law knows the deflection of a force that changes.
-    """
-
-    period: float
-    delay: int
-    stiffness: float
-    mobility: float
-    free_mobility: float
-    lever: float
-    contact_lever: float
-    inertia: float
-    noise: SensorNoise
-    estimates: bool
-    leads: bool = False
-
-    def of(self, lever: float) -> SensorNoise:
-        """The noise of a distance that is computed from noisy angles."""
-        noise = self.noise
-        position, velocity = lever * noise.position, lever * noise.velocity
-        return replace(noise, position=position, velocity=velocity)
-
-
-@dataclass(frozen=True)
-class Part:
-    """One direction: its rate w and gains, the error in m or N, and the roughness in N m."""
-
-    rate: float
-    gains: DirectionGains
-    error: float
-    roughness: float
-
-
-def direction_gains(situation: SensedContact, roughness: float) -> tuple[Part, Part]:
-    """The gains of free directions and of the contact with the least errors, each for itself.
-
-    Free directions have Butterworth's poles at p = 1.5 w and the estimator's rate 2 w; a contact
-    the damping c = 2.3 w, at most 2 sqrt(A k), the integral 0.4 c and the estimator's rate w. The
-    product of both rms errors is least, by noise and by `MODEL_ERROR`, among those that change the
-    controls by `roughness` from sample to sample at most; and where all are rougher, the roughness.
-    Nothing here knows of friction, tilt and posture: see `contact_gains`.
-    """
-    highest = PHASE / (3.0 * (situation.delay + 0.5) * situation.period)
-    fast: list[float | None] = [None]
-    if situation.estimates:
-        most = 0.5 / situation.period
-        fast = [rate for share in _STATE_RATES if (rate := share * highest / 2.0) <= most]
-    pairs = []
-    for state_rate in fast:
-        free = _best(
-            [_free(situation, 2.0 * share * highest, state_rate) for share in _RATES], roughness
-        )
-        most = max(roughness**2 - free.roughness**2, 0.5 * roughness**2) ** 0.5
-        contact = [_contact(situation, share * highest, state_rate) for share in _RATES]
-        pairs.append((free, _best(contact, most)))
-
-    def order(pair: tuple[Part, Part]) -> tuple[float, float]:
-        total = float(np.hypot(pair[0].roughness, pair[1].roughness))
-        return max(total / roughness, 1.5), pair[0].error * pair[1].error
-
-    return min(pairs, key=order)
-
-
-def _best(parts: list[Part], roughness: float) -> Part:
-    smooth = [part for part in parts if part.roughness <= roughness]
-    if not smooth:
-        return min(parts, key=lambda part: part.roughness)
-    return min(smooth, key=lambda part: part.error)
-
-
-def _free(situation: SensedContact, w: float, state_rate: float | None) -> Part:
-    p, direction = 1.5 * w, Direction(situation.period, situation.delay)
-    gains = DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, state_rate)
-    loop = sampled_loop(direction, gains, situation.of(situation.lever))
-    by_noise, _ = loop.deviations()
-    _, jump = sampled_loop(direction, gains, situation.of(1.0)).deviations()
-    by_force = MODEL_ERROR * situation.free_mobility * _rms(loop)
-    return Part(w, gains, float(np.hypot(by_noise, by_force)), situation.inertia * jump)
-
-
-def _contact(situation: SensedContact, w: float, state_rate: float | None) -> Part:
-    A, k = situation.mobility, situation.stiffness
-    c = min(2.3 * w, 2.0 * (A * k) ** 0.5)
-    gains = DirectionGains((0.0, 0.0, c), 0.4 * c, w, state_rate)
-    direction = Direction(situation.period, situation.delay, A, k)
-    loop = sampled_loop(direction, gains, situation.of(situation.contact_lever))
-    by_noise, jump = loop.deviations()
-    ramp = 0.0 if situation.leads else c * RAMP / (A * k)
-    errors = by_noise, MODEL_ERROR * A * _rms(loop), ramp
-    return Part(w, gains, float(np.linalg.norm(errors)), situation.contact_lever * jump / A)
-
-
-def _rms(loop: DirectionLoop) -> float:
-    """The rms error per disturbing acceleration that appears every `EVERY` seconds."""
-    return loop.after_step() * float(np.sqrt(loop.period / EVERY))

@@ -10,13 +10,7 @@ from scipy.integrate import solve_ivp
 
 from drake_dae.dae import SensorNoise
 from drake_dae.dae.beyond.chain_filter import ChainFilter, transition
-from drake_dae.dae.beyond.one_direction import (
-    Direction,
-    DirectionGains,
-    SensedContact,
-    direction_gains,
-    sampled_loop,
-)
+from drake_dae.dae.beyond.one_direction import Direction, DirectionGains, sampled_loop
 
 T = 1e-3
 FREE = DirectionGains((15.0**3, 2.0 * 15.0**2, 30.0), 0.0, 20.0)
@@ -115,31 +109,3 @@ def test_motion_within_a_sample_is_that_of_the_contact():
     start = np.zeros(len(loop.step))
     start[:2] = 1.0, 3.0 * T  # In units of the period.
     assert_allclose(loop.step[:2] @ start, run.y[:, -1] * [1.0, T], rtol=1e-10)
-
-
-def situation(resolution, bandwidth=0.0, leads=False):
-    """An arm whose noise is that of angles, filtered as differences or by an estimator."""
-    noise = SensorNoise(resolution, force=0.3, velocity_bandwidth=bandwidth)
-    estimates = not bandwidth
-    return SensedContact(T, 1, 1e5, 0.03, 0.3, 0.7, 0.7, 5.0, noise, estimates, leads)
-
-
-@pytest.mark.parametrize(("resolution", "bandwidth"), [(1e-5, 0.0), (3e-6, 300.0)])
-def test_gains_are_smooth_enough_and_have_the_least_error(resolution, bandwidth):
-    """Roughness is that of both directions, by loops that other tests compare with runs."""
-    given = situation(resolution, bandwidth)
-    free, contact = direction_gains(given, 1.0)
-    _, jump = sampled_loop(Direction(T, 1), free.gains, given.of(1.0)).deviations()
-    pressing = Direction(T, 1, given.mobility, given.stiffness)
-    _, push = sampled_loop(pressing, contact.gains, given.of(0.7)).deviations()
-    assert free.roughness == pytest.approx(5.0 * jump)
-    assert contact.roughness == pytest.approx(0.7 / given.mobility * push)
-    assert np.hypot(free.roughness, contact.roughness) < 1.3
-    smoother = direction_gains(given, 0.2)
-    assert smoother[0].roughness < 0.25 < free.roughness
-    assert smoother[0].error * smoother[1].error > free.error * contact.error
-
-
-def test_a_law_that_leads_the_deflection_has_a_faster_contact():
-    slow, fast = (direction_gains(situation(1e-6, leads=leads), 10.0)[1] for leads in (False, True))
-    assert fast.rate > 1.5 * slow.rate

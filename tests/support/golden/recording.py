@@ -4,12 +4,13 @@ writes them anew."""
 import io
 import json
 import sys
+import warnings
 from importlib.metadata import version
 
 import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 
-from drake_dae import build_scenario, load_scenario, rollout
+from drake_dae import build_scenario, contact_gains, load_scenario, rollout
 from drake_dae.cli import main
 from drake_dae.running import start_values
 from drake_dae.scenario.shipped import find_scenario
@@ -94,8 +95,16 @@ def values_at(case: Case, states: np.ndarray | None = None) -> dict[str, np.ndar
 
 
 def gains_found() -> dict[str, list[float]]:
-    """Computed gains of six scenarios."""
+    """Computed gains: six of `contact_gains`, six of scenarios."""
     found = {}
+    contacts = [(1e5, 0.03, 1e-3), (1e4, 0.03, 1e-3), (1e6, 0.03, 1e-3), (1e5, 0.5, 1e-3)]
+    contacts += [(1e4, 0.1, 4e-3), (3e5, 0.05, 5e-4)]
+    for stiffness, mobility, period in contacts:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            gains = contact_gains(stiffness, mobility, period)
+        key = f"{stiffness:g} N/m, {mobility:g} 1/kg, {period:g} s"
+        found[key] = [float(value) for value in vars(gains).values()]
     settings = {
         "point": (),
         "softer": ("plant.stiffness=2e4",),

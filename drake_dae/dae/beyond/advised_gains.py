@@ -1,0 +1,400 @@
+"""Gains of law, observer and estimator for compliant contact and given sensors, as an optimum."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from math import inf, prod
+
+import numpy as np
+
+from drake_dae.arguments import checked
+from drake_dae.arrays import check_whole_number, positive
+from drake_dae.dae.beyond.contact_gains import ContactGains, best_damping
+from drake_dae.dae.beyond.one_direction import (
+    Direction,
+    DirectionGains,
+    SampledLoop,
+    SensorNoise,
+    sampled_loop,
+)
+from drake_dae.errors import GainError, ModelError
+
+_PHASE = 0.3
+"""As for `contact_gains`: the loss of phase by sampling and delay at the crossover, in rad; half of
+it with an estimator: a force along the contact that it attributes to friction couples the contact
+to free directions, and with the full phase an unknown mass of 1 kg made them swing."""
+
+MASSES = (0.5, 1.0, 2.0)
+"""Free directions are stable if a force accelerates by these factors more than in the model."""
+
+CONTACT_MASSES = (2.0 / 3.0, 1.0, 1.5)
+STIFFNESSES = (1e-3, 0.1, 0.5, 1.0, 2.0)
+"""The same along a contact, each with these stiffnesses relative to the stated one."""
+
+DECAY = 0.05
+"""The least rate at which these loops settle, relative to w, with half of the stiffness or more."""
+
+SLOWER = (1.0, 0.5, 0.25)
+"""The factors by which the integral and the observer along a contact are slowed, since both reduce
+damping; the first one for which there are gains is taken."""
+
+MODEL_ERROR, EVERY = 1.0, 2.0
+"""An unknown force of 1 N appears or turns every 2 s."""
+
+RAMP = 10.0
+"""The reference of a force changes by 10 N/s."""
+
+
+@checked(ModelError)
+@dataclass(frozen=True)
+class SensedContact:
+    """The numbers of a robot in contact, its sampling and its sensors that decide the gains.
+
+    Attributes:
+        period: T in s.
+        delay: The delay of the control in samples.
+        stiffness: k of the contact in N/m.
+        mobility: J M^-1 J^T of the contact in 1/kg, the largest along the motion.
+        free_mobility: The mobility of the points that follow a path, in 1/kg.
+        lever, contact_lever: The displacement of a point that follows a path, and of the contact,
+            per radian of noise of all joints: the length of a row of J, in m/rad.
+        inertia: sqrt(tr M M): the torque per acceleration of all joints, in kg m^2.
+        noise: The noise of a joint's angle and velocity, in rad and rad/s, and of the force in N;
+            with a `velocity_bandwidth` if velocities are filtered finite differences.
+        estimates: Whether the state comes from a `StateEstimator`.
+
+    Raises:
+        ModelError: A number is not positive, or a noise is negative.
+    """
+
+    period: float
+    delay: int
+    stiffness: float
+    mobility: float
+    free_mobility: float
+    lever: float
+    contact_lever: float
+    inertia: float
+    noise: SensorNoise
+    estimates: bool
+
+    def __post_init__(self) -> None:
+        names = ("period", "stiffness", "mobility", "free_mobility", "lever", "contact_lever")
+        for name in (*names, "inertia"):
+            positive(name, getattr(self, name))
+        check_whole_number("delay", self.delay, 0)
+        for name, value in vars(self.noise).items():
+            if not value >= 0.0:
+                raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
+
+    def free(self, mass_error: float = 1.0) -> Direction:
+        """Returns a free direction."""
+        return Direction(self.period, self.delay, mass_error=mass_error)
+
+    def contact(self, mass_error: float = 1.0, share: float = 1.0) -> Direction:
+        """Returns the direction of the contact, with a fraction of its stiffness."""
+        stiffness = share * self.stiffness
+        return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
+
+    def noise_of(self, lever: float) -> SensorNoise:
+        """Returns the noise of a distance that is computed from noisy angles."""
+        noise = self.noise
+        position, velocity = lever * noise.position, lever * noise.velocity
+        return replace(noise, position=position, velocity=velocity)
+
+    @cached_property
+    def best_damping(self) -> float:
+        """`contact_damping` of the contact, in 1/s."""
+        return best_damping(self.stiffness, self.mobility, self.period, self.delay)
+
+    @property
+    def quiet(self) -> SensorNoise:
+        """Measurements without noise, with the lag of differentiated velocities."""
+        return SensorNoise(velocity_bandwidth=self.noise.velocity_bandwidth)
+
+
+@dataclass(frozen=True)
+class Part:
+    """The prediction for one direction: the error, its part by noise, and the roughness in N m."""
+
+    rate: float
+    rates: DirectionGains
+    is_contact: bool
+    error: float
+    by_noise: float
+    roughness: float
+
+
+def is_stable(situation: SensedContact, part: Part) -> bool:
+    """Whether a loop settles for all masses and stiffnesses for which it must be stable."""
+    cases = [(situation.free(mass), DECAY) for mass in MASSES]
+    if part.is_contact:
+        cases = [
+            (situation.contact(mass, share), DECAY if share >= 0.5 else 0.0)
+            for mass, share in product(CONTACT_MASSES, STIFFNESSES)
+        ]
+    for direction, decay in cases:
+        loop = sampled_loop(direction, part.rates, situation.quiet)
+        if not loop.radius < 1.0 - decay * part.rate * loop.period:
+            return False
+    return True
+
+
+def free_part(situation: SensedContact, w: float, fast: float | None) -> Part:
+    """The prediction for free directions with the rates w and that of an estimator, in 1/s."""
+    p = 1.5 * w
+    rates = DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
+    loop = sampled_loop(situation.free(), rates, situation.noise_of(situation.lever))
+    error, _ = loop.deviations()
+    _, jump = sampled_loop(situation.free(), rates, situation.noise_of(1.0)).deviations()
+    step = MODEL_ERROR * situation.free_mobility * _rms(loop)
+    return Part(w, rates, False, float(np.hypot(error, step)), error, situation.inertia * jump)
+
+
+def contact_part(situation: SensedContact, w: float, fast: float | None, share: float) -> Part:
+    """The same along the contact, with a factor by which integral and observer are slowed."""
+    c = min(2.3 * w, situation.best_damping)
+    rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
+    loop = sampled_loop(situation.contact(), rates, situation.noise_of(situation.contact_lever))
+    error, jump = loop.deviations()
+    step = MODEL_ERROR * situation.mobility * _rms(loop)
+    ramp = rates.gains[2] * RAMP / (situation.mobility * situation.stiffness)
+    whole = float(np.linalg.norm([error, step, ramp]))
+    return Part(w, rates, True, whole, error, situation.contact_lever * jump / situation.mobility)
+
+
+def _rms(loop: SampledLoop) -> float:
+    """The rms error per disturbing acceleration that appears every `EVERY` seconds."""
+    return loop.after_step() * float(np.sqrt(loop.period / EVERY))
+
+
+def noisiest_sensor(situation: SensedContact, part: Part, deviation: int) -> str:
+    """The sensor whose noise causes most of an error (deviation 0), or of a roughness (1)."""
+    direction = situation.contact() if part.is_contact else situation.free()
+    lever = situation.contact_lever if part.is_contact else situation.lever
+
+    def without(name: str) -> float:
+        quiet = replace(situation, noise=replace(situation.noise, **{name: 0.0}))
+        return sampled_loop(direction, part.rates, quiet.noise_of(lever)).deviations()[deviation]
+
+    return min(("position", "velocity", "force")[: 2 + part.is_contact], key=without)
+
+
+@dataclass(frozen=True)
+class AdvisedGains:
+    """Gains, and the errors predicted for them.
+
+    Attributes:
+        gains: The gains.
+        state_rate: w of the estimator in 1/s; None without one.
+        position_error: The rms error of a point in m: by noise, and by an unknown force of
+            `MODEL_ERROR` that appears every `EVERY` seconds, in squares.
+        force_error: The rms error of the contact force in N, also by a reference that changes by
+            `RAMP`.
+        noise_error, noise_force: The parts of the errors by noise.
+        roughness: The rms change of the controls from sample to sample, over all joints, in N m.
+    """
+
+    gains: ContactGains
+    state_rate: float | None
+    position_error: float
+    force_error: float
+    noise_error: float
+    noise_force: float
+    roughness: float
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """The largest roughness in N m and errors in m and N."""
+
+    roughness: float
+    position_error: float
+    force_error: float
+
+    @property
+    def along(self) -> float:
+        """The largest roughness along the contact."""
+        return self.roughness / 2.0**0.5
+
+    @property
+    def has_errors(self) -> bool:
+        return min(self.position_error, self.force_error) < inf
+
+    def order(self, free: Part, contact: Part) -> tuple[float, float]:
+        """What is least for the best gains: the errors without a bound, then the roughness."""
+        pairs = (free, self.position_error), (contact, self.force_error)
+        errors = [part.error for part, most in pairs if most == inf]
+        return prod(errors), float(np.hypot(free.roughness, contact.roughness))
+
+
+@checked(ModelError)
+def advised_gains(
+    situation: SensedContact,
+    roughness: float,
+    *,
+    position_error: float = inf,
+    force_error: float = inf,
+) -> AdvisedGains:
+    """Returns the gains with the least predicted errors that are smooth and stable enough.
+
+    The gains are those of `contact_gains`, as functions of its rate w, for which free directions
+    and contacts have a value of their own; and the rate of a `StateEstimator`, if there is one.
+    For each of them the loop of one direction is a linear system with samples, delay, law,
+    observer and contact; its errors and its roughness follow from Lyapunov's equation, its
+    stability from eigenvalues; see `sampled_loop`. The product of the errors of position and force
+    is least among those gains that
+
+    - change the controls by at most `roughness` from sample to sample, in rms,
+    - are stable, and settle at least at the rate `DECAY` w, if a force accelerates 1/2 to 2 times
+      as in the model of the law in free directions, and 2/3 to 3/2 times along a contact whose
+      stiffness is up to 2 times the stated one,
+    - lose at most 0.3 rad of phase to samples and delay, with an estimator half of it.
+
+    Where an error is bounded, the gains of its direction are the smoothest ones within the bound.
+
+    Args:
+        situation: The contact and its sensors.
+        roughness: The largest rms change of the controls from sample to sample, in N m.
+        position_error, force_error: The largest predicted errors, as of `AdvisedGains`, in m and N;
+            infinite without a bound.
+
+    Raises:
+        GainError: No gains do so; the message names the noise or the limit that prevents it.
+        ModelError: The roughness or an error is not positive.
+    """
+    positive("roughness", roughness)
+    for name, most in (("position_error", position_error), ("force_error", force_error)):
+        if not most > 0.0:
+            raise ModelError(f"{name} must be positive, got {most:g}")
+    bounds = _Bounds(roughness, position_error, force_error)
+    phase = _PHASE / 2.0 if situation.estimates else _PHASE
+    highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
+    rates = np.geomspace(highest, highest / 60.0, 17).tolist()
+    candidates = []
+    for fast in _state_rates(situation, highest):
+        found = _pair(situation, rates, fast, bounds)
+        if found is not None:
+            candidates.append((*found, fast))
+    if not candidates:
+        raise GainError(_reason(situation, rates, bounds, highest))
+    free, contact, fast = min(candidates, key=lambda parts: bounds.order(*parts[:2]))
+    w, of_contact = free.rate, contact.rates
+    return AdvisedGains(
+        gains=ContactGains(
+            position_rate=1.5 * w,
+            force_gain=of_contact.force_gain,
+            constraint_damping=of_contact.gains[2],
+            observer_rate=2.0 * w,
+            observer_force_rate=of_contact.observer_rate,
+            friction_rate=w / 2.0,
+        ),
+        state_rate=fast,
+        position_error=free.error,
+        force_error=contact.error,
+        noise_error=free.by_noise,
+        noise_force=contact.by_noise,
+        roughness=float(np.hypot(free.roughness, contact.roughness)),
+    )
+
+
+def _state_rates(situation: SensedContact, highest: float) -> Iterator[float | None]:
+    if not situation.estimates:
+        yield None
+        return
+    for share in (2.0, 4.0, 7.0, 12.0, 20.0):
+        if share * highest * situation.period <= 0.5:
+            yield share * highest
+
+
+def _pair(
+    situation: SensedContact, rates: list[float], fast: float | None, bounds: _Bounds
+) -> tuple[Part, Part] | None:
+    """The best gains of free directions and of the contact, if there are any."""
+
+    def free(allowed: float) -> Part | None:
+        parts = [free_part(situation, w, fast) for w in rates]
+        return _best(situation, parts, allowed, bounds.position_error)
+
+    def contact(allowed: float) -> Part | None:
+        tried = ([contact_part(situation, w, fast, share) for w in rates] for share in SLOWER)
+        allowed = min(allowed, bounds.along)
+        best = (_best(situation, parts, allowed, bounds.force_error) for parts in tried)
+        return next(filter(None, best), None)
+
+    # The contact comes first, with at most its share of the roughness; but free directions do where
+    # their error is bounded, since their smoothest gains leave the most.
+    is_free_first = bounds.position_error < inf
+    first, second = (free, contact) if is_free_first else (contact, free)
+    if (one := first(bounds.roughness)) is None:
+        return None
+    remaining = (bounds.roughness**2 - one.roughness**2) ** 0.5
+    if (other := second(remaining)) is None:
+        return None
+    return (one, other) if is_free_first else (other, one)
+
+
+def _best(situation: SensedContact, parts: list[Part], allowed: float, most: float) -> Part | None:
+    """The part with the least error that is smooth and stable enough, if there is one.
+
+    Where the error may be at most a number, it is the smoothest one within it.
+    """
+    within = [part for part in parts if part.roughness <= allowed and part.error <= most]
+    for part in sorted(within, key=lambda part: part.error if most == inf else part.roughness):
+        if is_stable(situation, part):
+            return part
+    return None
+
+
+def _reason(situation: SensedContact, rates: list[float], bounds: _Bounds, highest: float) -> str:
+    """Returns why no gains are found."""
+    found = []  # The stable parts of free directions and of the contact, for each estimator.
+    for fast in _state_rates(situation, highest):
+        free = [free_part(situation, w, fast) for w in rates]
+        contact = [contact_part(situation, w, fast, share) for w in rates for share in SLOWER]
+        found.append(
+            [[part for part in parts if is_stable(situation, part)] for parts in (free, contact)]
+        )
+    most_of = bounds.position_error, bounds.force_error
+    names = ("in free directions", "m"), ("along the contact", "N")
+    for parts, (where, unit), most in zip(zip(*found, strict=True), names, most_of, strict=True):
+        stable = [part for some in parts for part in some]
+        if not stable:
+            return (
+                f"no gains are stable {where} with a margin, for a contact of "
+                f"{situation.stiffness:.3g} N/m sampled each {situation.period:g} s with "
+                f"{situation.delay} samples of delay: sample more often, or make it softer"
+            )
+        best = min(stable, key=lambda part: part.error)
+        if best.error > most:
+            cause = f"an unknown force of {MODEL_ERROR:g} N that appears every {EVERY:g} s"
+            if best.by_noise > best.error / 2.0:
+                cause = f"the noise of the {noisiest_sensor(situation, best, 0)}"
+            return (
+                f"the error {where} is {best.error:.3g} {unit} rms with the best gains that are "
+                f"stable, mostly by {cause}, and {most:.3g} {unit} are allowed: allow more, sample "
+                "more often, or use better sensors"
+            )
+    smoothest = []
+    for both in found:  # Of one estimator.
+        within = [
+            [part for part in parts if part.error <= most]
+            for parts, most in zip(both, most_of, strict=True)
+        ]
+        if all(within):
+            smoothest.append([min(parts, key=lambda part: part.roughness) for parts in within])
+    if not smoothest:
+        return (
+            "no rate of the estimator has both errors within their bounds: allow more of one of "
+            "them, sample more often, or use better sensors"
+        )
+    across, along = min(smoothest, key=lambda pair: np.hypot(pair[0].roughness, pair[1].roughness))
+    noisiest = noisiest_sensor(situation, across, 1)
+    gains = "all gains that are stable" + bounds.has_errors * " and have errors within their bounds"
+    return (
+        f"the noise of the {noisiest} changes the controls by {across.roughness:.3g} N m in free "
+        f"directions and {along.roughness:.3g} N m along the contact from sample to sample with "
+        f"{gains}; {bounds.roughness:.3g} N m are allowed, of which the contact has at most "
+        f"{bounds.along:.3g}: allow more roughness, or use a better sensor"
+    )
