@@ -198,7 +198,6 @@ def compose(
         held,
         stacked(column),
         start,
-        walk.defaults,
         projection=_projection(states, dynamics),
         scale=np.concatenate([np.zeros(0), *scales]),
         requirements=tuple(r for s in systems for r in dynamics[s].requirements),
@@ -231,7 +230,6 @@ class _Walk:
         self.inputs: dict[str, ca.SX] = {}
         self.cuts: dict[str, Port] = {}
         self.fixed: dict[str, Port] = {}
-        self.defaults: dict[str, ca.SX] = {}
         self.blocks: dict[System, Block | None] = {}
         self.own: dict[System, dict[str, ca.SX]] = {}  # Source -> symbols of this leaf.
         self.values: dict[Port, ca.SX] = {}
@@ -342,16 +340,13 @@ class _Walk:
         if place in self.leaves.sources:
             return self.port(self.leaves.sources[place])
         assert block is not None
-        has_value, has_default = port.HasValue(self.local(system)), name in block.defaults
-        if place in self.exported or has_value:
+        if not port.HasValue(self.local(system)) and name in block.defaults:
+            return self.expressions(system, [block.defaults[name]])[0]
+        if place in self.exported or port.HasValue(self.local(system)):
             label = self.exported.get(place, f"{self.name(system)}.{name}")
             if label not in self.inputs:
                 self._new_input(self.fixed, label, place, port.size())
-                if has_default and not has_value:
-                    self.defaults[label] = self.expressions(system, [block.defaults[name]])[0]
             return self.inputs[label]
-        if has_default:
-            return self.expressions(system, [block.defaults[name]])[0]
         if not port.size():
             return NOTHING
         raise ModelError(

@@ -288,6 +288,8 @@ class RolloutProgram:
         name: Its name in messages.
         complete: Adds derived signals to a record.
         choice: Whether it becomes machine code by default.
+        like: The same without shared parameters; None for that one.
+        context: A context in which input ports without a wire have values; the default if None.
 
     Attributes:
         functions: The functions of the block.
@@ -305,9 +307,10 @@ class RolloutProgram:
         complete: Callable[[Record], Record] = lambda record: record,
         choice: Compiled = "auto",
         like: "RolloutProgram | None" = None,
+        context: Context | None = None,
     ) -> None:
         self.diagram, self.name, self.choice, self._complete = diagram, name, choice, complete
-        self.context, leaves = diagram.CreateDefaultContext(), Leaves.of(diagram)
+        self.context, leaves = context or diagram.CreateDefaultContext(), Leaves.of(diagram)
         self.laws = laws_of(leaves.systems)
         for plant, law in self.laws.items() if like is not None else ():
             own = plant.GetMyMutableContextFromRoot(self.context).get_mutable_numeric_parameter(0)

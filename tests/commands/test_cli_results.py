@@ -148,7 +148,7 @@ def test_all_commands_start_at_the_same_state(name, tmp_path, monkeypatch):
     def kept(loop, context, *_):
         own = loop.plant.GetMyContextFromRoot(context)
         found["export"] = own.get_continuous_state_vector().CopyToVector()
-        return []
+        return [tmp_path / "loop.c"]
 
     monkeypatch.setattr(exported, "export_loop", kept)
     settings = ["--set=start={}", "--set=duration=0.01", *BARE]

@@ -279,7 +279,7 @@ def in_context(name):
         system.set_consistent_state(own, system.structure.states[1])
     elif isinstance(system, TrackingController):
         diagram.GetInputPort("in 0").FixValue(context, system.law.structure.states[1])
-    return system, diagram, context, RolloutProgram(diagram, None, name)
+    return system, diagram, context, RolloutProgram(diagram, None, name, context=context.Clone())
 
 
 def check_functions(diagram, context, program, tolerance):
@@ -341,7 +341,9 @@ def test_any_plant_of_equations_is_traced(name):
     diagram, context = alone(plant)
     own = plant.GetMyMutableContextFromRoot(context)
     plant.set_consistent_state(own, plant.structure.states[0])
-    check_functions(diagram, context, RolloutProgram(diagram, None, name), 1e-12)
+    check_functions(
+        diagram, context, RolloutProgram(diagram, None, name, context=context.Clone()), 1e-12
+    )
 
 
 def test_a_system_that_cannot_be_traced_is_named():
