@@ -285,13 +285,8 @@ class RunDiagnosis:
         rate = fastest_rate(self._diagram, context, time, state)
         if rate * pace > 1.0:
             self._is_watched = False
-            warnings.warn(
-                f"the loop is stiff: its fastest rate of {rate:.3g} 1/s, not the accuracy, makes "
-                f"explicit steps of {pace:.2g} s, of which this run needs about "
-                f"{self._steps + (self._end - time) / pace:.2g}. Choose integration_scheme "
-                "'radau3' or 'implicit_euler', or a slower model",
-                stacklevel=2,
-            )
+            count = self._steps + (self._end - time) / pace
+            warnings.warn(stiffness(rate, pace, count, IN_SIMULATE), stacklevel=2)
 
     def _check_collapse(self, context: Context) -> None:
         time, pace = context.get_time(), self._steps - self._seen[1]
@@ -304,6 +299,25 @@ class RunDiagnosis:
         short = SimulationError("steps have become too short", time, state)
         if (found := self._explained(short)) is not short:
             raise found
+
+
+IN_SIMULATE = "Choose integration_scheme 'radau3' or 'implicit_euler', or a slower model"
+IN_ROLLOUT = "Run it by simulate with integration_scheme 'radau3', or choose a slower model"
+
+
+def stiffness(rate: float, pace: float, count: float, remedy: str) -> str:
+    """The warning of a stiff loop.
+
+    Args:
+        rate: Its fastest rate in 1/s.
+        pace: The mean step in s.
+        count: The number of steps of the run.
+        remedy: `IN_SIMULATE` or `IN_ROLLOUT`.
+    """
+    return (
+        f"the loop is stiff: its fastest rate of {rate:.3g} 1/s, not the accuracy, makes explicit "
+        f"steps of {pace:.2g} s, of which this run needs about {count:.2g}. {remedy}"
+    )
 
 
 def too_long(

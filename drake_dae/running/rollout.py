@@ -1,5 +1,6 @@
 """Rollouts: runs of a whole diagram without Drake's Simulator."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -32,7 +33,14 @@ from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter, computed_record, recorded_values
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.running.diagnosis import explained, too_long
+from drake_dae.running.diagnosis import (
+    IN_ROLLOUT,
+    MANY,
+    explained,
+    fastest_rate,
+    stiffness,
+    too_long,
+)
 from drake_dae.running.drake_stepped import CONTROL, run_stepped
 from drake_dae.running.events import Seed, drawn_noise, events_within, source_period
 from drake_dae.running.rollout_failures import failure_of
@@ -155,6 +163,7 @@ def rollout(
 
     Warns:
         MachineCodeWarning: Machine code was requested, or would pay, and cannot be made.
+        UserWarning: The loop is stiff, so that explicit steps are many.
     """
     found = run_loop(loop, starts, parameters, times, config=config, compiled=compiled, seeds=seeds)
     if not isinstance(loop, ClosedLoop) or sum(r.failure is not None for r in found) > DIAGNOSED:
@@ -229,6 +238,8 @@ def run_loop(
             if code is not None and look is None and indices.size >= SEVERAL:
                 lanes = kind.lanes(choice, FASTER * calls, is_all)
         runs |= zip(indices.tolist(), _runs(kind, some, settings, code, lanes), strict=True)
+    if settings.tableau is None:
+        _warn_of_stiffness(program, max(runs.values(), key=lambda run: run.steps), problems)
     found = []
     for i in range(len(problems.state)):
         failure = None
@@ -237,6 +248,17 @@ def run_loop(
                 failure = failure_of(program, problems.run(i), runs[i])
         found.append(Rollout(runs[i].steps, failure, program, moments, runs[i].rows))
     return found
+
+
+def _warn_of_stiffness(program: "RolloutProgram", run: Run, problems: RunProblem) -> None:
+    """Warns where the fastest rate, not the accuracy, has made the steps of a run short."""
+    if run.steps < MANY or not np.isfinite(run.state).all():
+        return
+    context, pace = program.context.Clone(), (run.time - problems.times[0]) / run.steps
+    program.put(context, run.time, run.state, run.held, problems.run(0).parameters)
+    rate = fastest_rate(program.diagram, context, run.time, run.state[: program.num_states])
+    if rate * pace > 1.0:
+        warnings.warn(stiffness(rate, pace, run.steps, IN_ROLLOUT), stacklevel=4)
 
 
 def _runs(

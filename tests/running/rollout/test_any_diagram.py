@@ -358,3 +358,15 @@ def test_a_diagram_is_compiled_once(monkeypatch):
             ends.append(run.record["sum"][-1, 0] - start)
     assert len(made) == 2
     np.testing.assert_allclose(ends, [0.5, 0.5, 1.0, 1.0], rtol=1e-12)
+
+
+def test_a_stiff_rollout_says_so(monkeypatch):
+    """A decay at 2000 1/s: its steps are some 3 ms for ever, whatever the accuracy."""
+    monkeypatch.setattr(module, "MANY", 500)
+    builder = DiagramBuilder()
+    system = builder.AddSystem(LinearSystem([[-2e3]], np.zeros((1, 0)), np.eye(1)))
+    builder.ExportOutput(system.get_output_port(), "x")
+    diagram = builder.Build()
+    config = SimulatorConfig(accuracy=1e-3)
+    with pytest.warns(UserWarning, match=r"2e\+03 1/s"):
+        rollout(diagram, [1.0], None, [0.0, 3.0], config=config, compiled=False)
