@@ -66,6 +66,27 @@ def test_contact_force_is_what_drake_balances():
     assert_allclose(-force[0], record["constraint_force"][-1, 0], rtol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("name", "tolerance"), [("wall_point_contact", 1e-9), ("wall_hydroelastic", 0.02)]
+)
+def test_contact_force_from_generalized_forces_is_that_of_drakes_results(name, tolerance):
+    """While the tool slides: of a point to round-off; of a patch but for its torque."""
+    loop, context, record = run_scenario(scenario(name, "duration=0.05"))
+    own = loop.plant.GetMyContextFromRoot(context)
+    assert record["state"][-1, 7:] @ record["state"][-1, 7:] > 1e-3
+    found = loop.plant.GetOutputPort("contact_force").Eval(own)
+    results = loop.plant.GetOutputPort("contact_results").Eval(own)
+    points, patches = results.num_point_pair_contacts(), results.num_hydroelastic_contacts()
+    forces = [results.point_pair_contact_info(i).contact_force() for i in range(points)]
+    forces += [
+        results.hydroelastic_contact_info(i).F_Ac_W().translational() for i in range(patches)
+    ]
+    (total,) = forces  # Of one contact, on one of the two bodies.
+    total = total * np.sign(total @ found)
+    assert np.linalg.norm(total) > 1.0
+    assert_allclose(found, total, rtol=0.0, atol=tolerance)
+
+
 def _contact_point(plant, own):
     results = plant.GetOutputPort("contact_results").Eval(own)
     assert results.num_point_pair_contacts() == 1
