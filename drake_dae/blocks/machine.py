@@ -19,6 +19,7 @@ from drake_dae.blocks.stepping import (
     RunProblem,
     StepFunctions,
     StepSettings,
+    dop853_tables,
     tableau_of,
 )
 from drake_dae.errors import InconsistentStateError
@@ -244,16 +245,10 @@ class _Call:
             run.trial = np.inf
             run.ending = RunEnding.PAUSED
         self.next = np.zeros(1, dtype=np.longlong)
-        from scipy.integrate import DOP853
-
         tables = settings.tableau or tableau_of("dop853")
         self._fixed: dict[str, Any] = {
             **dict(zip("abc", map(np.ascontiguousarray, tables), strict=True)),
-            "e3": DOP853.E3,
-            "e5": DOP853.E5,
-            "d": np.ascontiguousarray(DOP853.D),
-            "a_more": np.ascontiguousarray(DOP853.A_EXTRA),
-            "c_more": DOP853.C_EXTRA,
+            **dop853_tables(),
             "absolute": settings.absolute,
             "times": problems.times,
             "events": problems.events,

@@ -207,6 +207,16 @@ def tableau_of(scheme: str) -> Tableau:
     }[scheme]
 
 
+@cache
+def dop853_tables() -> dict[str, FloatArray]:
+    """The estimates of the error and the interpolant of DOP853, by their names in stepper.c."""
+    from scipy.integrate import DOP853
+
+    named = {"e3": DOP853.E3, "e5": DOP853.E5, "d": DOP853.D}
+    named |= {"a_more": DOP853.A_EXTRA, "c_more": DOP853.C_EXTRA}
+    return {name: np.ascontiguousarray(table) for name, table in named.items()}
+
+
 class RunEnding(IntEnum):
     """How the stepping ended; stepper.c has the same list."""
 

@@ -27,7 +27,7 @@ from drake_dae.blocks.compose import Leaves, compose
 from drake_dae.blocks.primitives import symbolic_block
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.errors import DrakeDaeError
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.contract import plants_in
 
 EVERY = 32
 """The number of steps after which the context of the diagram as wired gets the results."""
@@ -72,7 +72,7 @@ class CompiledRun:
         self.composed = composed = compose(
             diagram, ports, context=context, merge=True, is_whole=True
         )
-        (choice, *_) = [p.dae.compiled for p in _plants(diagram)]
+        (choice, *_) = [p.dae.compiled for p in plants_in(diagram)]
         builder = DiagramBuilder()
         self._block = builder.AddSystem(TracedSystem(composed.block, compiled=choice))
         self._copies = {system: builder.AddSystem(copy) for system, copy in copies.items()}
@@ -116,7 +116,7 @@ class CompiledRun:
         """Returns a run; None if the diagram has to run as wired, or is as fast."""
         if not isinstance(diagram, Diagram):
             return None
-        leaves, plants = Leaves.of(diagram).systems, _plants(diagram)
+        leaves, plants = Leaves.of(diagram).systems, plants_in(diagram)
         periods = [getattr(system, "sample_period", 0.0) for system in leaves]
         periods += [plant.time_step for plant in plants]
         usual = USUAL if config.use_error_control else config.max_step_size
@@ -188,17 +188,6 @@ class CompiledRun:
 
 
 _GOES_ON = EventStatus.DidNothing()
-
-
-def _plants(diagram: Diagram) -> list[Plant]:
-    """The plants in a diagram, at any depth."""
-    found = []
-    for system in diagram.GetSystems():
-        if isinstance(system, Plant):
-            found.append(system)
-        elif isinstance(system, Diagram):
-            found += _plants(system)
-    return found
 
 
 def _is_traced(system: System) -> bool:

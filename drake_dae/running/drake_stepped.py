@@ -1,7 +1,6 @@
 """Rollouts of a plant that Drake steps; one block computes everything else at a sample."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -13,13 +12,8 @@ from drake_dae.blocks.failures import cannot_go_on
 from drake_dae.blocks.interpreted import LOOKED
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepSettings
 from drake_dae.errors import SimulationError
+from drake_dae.running.rollout_program import CONTROL, RolloutProgram
 from drake_dae.trace.functions import TracedFunction
-
-CONTROL = "$control"
-"""The name of the control of Drake's plant among the outputs of the block."""
-
-if TYPE_CHECKING:
-    from drake_dae.running.rollout import RolloutProgram
 
 
 class DrakeSteps:
@@ -58,7 +52,7 @@ class DrakeSteps:
         self._part.ExecuteForcedEvents(self._local, False)
 
 
-def _function(program: "RolloutProgram", what: str, values: Sequence[ca.SX]) -> TracedFunction:
+def _function(program: RolloutProgram, what: str, values: Sequence[ca.SX]) -> TracedFunction:
     functions = program.functions
     held = stacked([each.symbol for each in program.block.held.values()])
     inputs = {
@@ -72,7 +66,7 @@ def _function(program: "RolloutProgram", what: str, values: Sequence[ca.SX]) -> 
     return function
 
 
-def run_stepped(program: "RolloutProgram", problem: RunProblem, settings: StepSettings) -> Run:
+def run_stepped(program: RolloutProgram, problem: RunProblem, settings: StepSettings) -> Run:
     """Makes a run of a diagram in which Drake steps one plant, and nothing has a continuous state.
 
     At each sample, the control and the unrestricted updates are computed from the values before the
@@ -157,7 +151,7 @@ def run_stepped(program: "RolloutProgram", problem: RunProblem, settings: StepSe
 
 
 def _ended(
-    program: "RolloutProgram",
+    program: RolloutProgram,
     rows: Sequence[FloatArray],
     ending: RunEnding,
     time: float,

@@ -1,7 +1,5 @@
 """The exceptions of rollouts that ended early: the diagram as wired says what failed."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context
@@ -22,13 +20,11 @@ from drake_dae.errors import (
     NonFiniteError,
     SimulationError,
 )
+from drake_dae.running.rollout_program import RolloutProgram
 from drake_dae.systems.plants.contract import Plant
 
-if TYPE_CHECKING:
-    from drake_dae.running.rollout import RolloutProgram
 
-
-def failure_of(program: "RolloutProgram", problem: RunProblem, run: Run) -> SimulationError:
+def failure_of(program: RolloutProgram, problem: RunProblem, run: Run) -> SimulationError:
     """The exception that the same run raises in Drake's Simulator."""
     if isinstance(run.error, SimulationError):
         return run.error
@@ -59,7 +55,7 @@ def failure_of(program: "RolloutProgram", problem: RunProblem, run: Run) -> Simu
 
 
 def _reason(
-    program: "RolloutProgram",
+    program: RolloutProgram,
     time: float,
     state: FloatArray,
     held: FloatArray,
@@ -85,7 +81,7 @@ def _reason(
     return None
 
 
-def _evaluate_ports(program: "RolloutProgram", context: Context) -> None:
+def _evaluate_ports(program: RolloutProgram, context: Context) -> None:
     for port in program.ports.values():
         system = port.get_system()
         port.Eval(context if system is program.diagram else system.GetMyContextFromRoot(context))

@@ -25,7 +25,7 @@ from drake_dae.errors import (
     ScenarioError,
     SimulationError,
 )
-from drake_dae.running.rollout import program_of
+from drake_dae.running.rollout_program import program_of
 from drake_dae.running.simulate import simulate
 from drake_dae.running.summary import figures_of
 from drake_dae.scenario.build import build_completed

@@ -1,6 +1,6 @@
 """Blocks with the parameters of a DaeSystem, and its exogenous signals on a port."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -13,7 +13,6 @@ from drake_dae.blocks.block import Block, Requirement
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import DaeSystem, DerivativeLayout
 from drake_dae.errors import ModelError
-from drake_dae.trace.functions import TracedFunction
 
 
 class ParameterizedSystem(TracedSystem):
@@ -145,15 +144,3 @@ def with_exogenous(block: Block, places: Sequence[int]) -> Block:
 
 def _next(block: Block) -> list[ca.SX]:
     return [held.next for held in block.held.values()]
-
-
-def function_along(function: TracedFunction, given: Mapping[str, FloatArray]) -> FloatArray:
-    """The first value of a function at each time, one row each; nan without a value."""
-    count = len(next(iter(given.values())))
-    arguments = [given[name] for name in function.input_names]
-    rows = np.full((count, function.nowhere()[0].size), np.nan)
-    for row, *inputs in zip(rows, *arguments, strict=True):
-        values = function.evaluate(*inputs)
-        if function.is_valid:
-            row[:] = values[0]
-    return rows

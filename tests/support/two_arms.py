@@ -52,11 +52,16 @@ REFERENCES = [
 def two_arms_plant() -> MultibodyPlant:
     """Arms "left" and "right", and the object of 4 kg, which is fixed to the left tool."""
     plant = MultibodyPlant(0.0)
+    add_two_arms(plant)
+    plant.Finalize()
+    return plant
+
+
+def add_two_arms(plant: MultibodyPlant, scene: object = None) -> None:
+    """Adds them to a plant, as a `ContactPlant` asks for."""
     parser = Parser(plant)
     parser.package_map().AddPackageXml(str(FOLDER / "models" / "package.xml"))
     parser.AddModelsFromUrl("package://drake_dae_models/two_arms.dmd.yaml")
-    plant.Finalize()
-    return plant
 
 
 def two_arms(actuation: Sequence[Stage] = ()) -> RobotModel:

@@ -62,11 +62,6 @@ class ReferenceGenerator(TracedSystem):
         """Name of an output port beside `reference` -> names and units, for a record."""
         return {}
 
-    @property
-    def follows_time(self) -> bool:
-        """Whether R follows from the time and the parameters in a context."""
-        return not (self.num_input_ports() or self.num_continuous_states())
-
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s by the defaults of its parameters, shape (sum (mu_i + 1),)."""
         return self._at(time, self._base.default("parameters")).copy()

@@ -98,11 +98,6 @@ class StateEstimator(ParameterizedSystem):
         super().__init__(law.system, _block(law, sample, period), degrees=(), sees_steps=False)
 
     @property
-    def disturbance_signals(self) -> Sequence[Signal]:
-        """Names and units of `disturbance`."""
-        return self.block.signals["disturbance"]
-
-    @property
     def friction_signals(self) -> Sequence[Signal]:
         """Names and units of `friction`."""
         return self.block.signals["friction"]

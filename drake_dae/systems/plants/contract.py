@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, DiagramBuilder, System
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
@@ -191,3 +191,14 @@ class Plant(System):
                 f"{needed_by} needs a robot, such as a RobotPlant, and '{self.dae.name}' is none"
             )
         return self.model
+
+
+def plants_in(diagram: Diagram) -> list[Plant]:
+    """The plants in a diagram, at any depth."""
+    found = []
+    for system in diagram.GetSystems():
+        if isinstance(system, Plant):
+            found.append(system)
+        elif isinstance(system, Diagram):
+            found += plants_in(system)
+    return found

@@ -30,7 +30,7 @@ from scipy.linalg import expm
 
 from drake_dae import rollout
 from drake_dae.errors import ModelError
-from drake_dae.running import export_loop, start_values
+from drake_dae.running import export_loop, rollout_program, start_values
 from drake_dae.running import rollout as module
 
 
@@ -338,13 +338,13 @@ def test_a_diagram_is_compiled_once(monkeypatch):
     """To compile one takes many times as long as a short run; another diagram is another."""
     made = []
 
-    whole = module.RolloutProgram
+    whole = rollout_program.RolloutProgram
 
     def counted(diagram, *arguments):
         made.append(diagram)
         return whole(diagram, *arguments)
 
-    monkeypatch.setattr(module, "RolloutProgram", counted)
+    monkeypatch.setattr(rollout_program, "RolloutProgram", counted)
     ends = []
     for factor in (1.0, 2.0):
         builder = DiagramBuilder()

@@ -18,7 +18,7 @@ from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import MachineCodeWarning, ModelError
 from drake_dae.running import rollout as module
 from drake_dae.running import start_values
-from drake_dae.running.rollout import program_of
+from drake_dae.running.rollout_program import program_of
 from drake_dae.trace.compiled import library
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")

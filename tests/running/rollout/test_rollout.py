@@ -29,7 +29,8 @@ from drake_dae.errors import (
 )
 from drake_dae.references.polynomials import UNROLLED
 from drake_dae.running import start_values
-from drake_dae.running.rollout import program_of, run_loop
+from drake_dae.running.rollout import run_loop
+from drake_dae.running.rollout_program import program_of
 from drake_dae.scenario.rolled import roll_scenario
 
 COMPILED = {"boom", "planar_4rrr", "seven_joint_moving_plate", "two_link_hydraulics"}

@@ -21,7 +21,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.running import start_values
-from drake_dae.running.rollout import program_of
+from drake_dae.running.rollout_program import program_of
 from drake_dae.systems import Condition
 
 

@@ -88,8 +88,3 @@ def test_references_with_parameters_are_not_commanded():
     given = ExpressionReference(lambda t, level: [level, 2.0 * level], {"level": 0.3})
     with pytest.raises(ReferenceSignalError, match="level"):
         CommandedReferences([given], [2, 0], SIGNALS)
-
-
-def test_commanded_references_do_not_follow_time():
-    block = CommandedReferences([moving()], [2, 0], SIGNALS)
-    assert not block.follows_time

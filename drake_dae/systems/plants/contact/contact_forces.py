@@ -10,7 +10,7 @@ from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import Context, LeafSystem
 
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.block import Block, Held
+from drake_dae.blocks.block import Block, Held, Requirement
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
 from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.robots import RobotModel, contact_normals
@@ -128,6 +128,7 @@ def contact_block(
     dae, numbers = model.dae, ca.DM(values)
     given, held = ca.SX.sym("contact_force", 3 * len(model.constraints)), dict[str, Held]()
     inputs, contact = {"state": dae.state, "contact_force": given}, given
+    required: tuple[Requirement, ...] = ()
     nominal = structure.manifold.project(dae.nominal_state, values)
     jacobian = _contact_jacobian(model, nominal, numbers, material.radius)
     rows = ca.Function("J", [dae.state], [jacobian])(nominal).full()
@@ -135,7 +136,9 @@ def contact_block(
         tau, before = ca.SX.sym("tau", rows.shape[1]), ca.SX.sym("before", dae.num_states)
         held["before"] = Held(before, dae.state, nominal, material.time_step)
         J = ca.substitute(jacobian, dae.state, before)
-        contact = PositiveDefiniteFactorization(J @ J.T).solve(J @ tau)
+        factors = PositiveDefiniteFactorization(J @ J.T)
+        regular = Requirement.regular(factors.pivot, "J J^T of the contact points")
+        contact, required = regular.of(factors.solve(J @ tau)), (regular,)
         inputs = {"state": dae.state, "generalized_contact_force": tau}
     normals = contact_normals(model).function(dae.state, numbers)[0]
     force = ca.sum1(ca.reshape(normals * contact, 3, -1)).T
@@ -147,7 +150,7 @@ def contact_block(
         "constraint_residual": residual,
         "controlled_output": output,
     }
-    return Block("contact_signals", inputs, outputs, held=held)
+    return Block("contact_signals", inputs, outputs, held=held, requirements=required)
 
 
 def _contact_jacobian(

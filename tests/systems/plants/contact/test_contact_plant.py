@@ -9,10 +9,21 @@ from pydrake import geometry
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import JacobianWrtVariable, SpatialInertia
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from runs import run_scenario, scenario
+from two_arms import NOMINAL, add_two_arms, two_arms_plant
 
-from drake_dae import ContactMaterial, build_scenario, make_animation
+from drake_dae import (
+    ContactMaterial,
+    ContactPlant,
+    Plane,
+    PointOnSurface,
+    RobotModel,
+    build_scenario,
+    make_animation,
+)
+from drake_dae.dae import find_constraint_structure
 from drake_dae.errors import ScenarioError, WiringError
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.scenario import Scenario, save_scenario
@@ -85,6 +96,32 @@ def test_contact_force_from_generalized_forces_is_that_of_drakes_results(name, t
     total = total * np.sign(total @ found)
     assert np.linalg.norm(total) > 1.0
     assert_allclose(found, total, rtol=0.0, atol=tolerance)
+
+
+def test_contact_forces_of_several_model_instances_are_those_of_drakes_results():
+    """Of two arms that fall onto two tables: to round-off of 100 N, on one of the two bodies."""
+    links = two_arms_plant()
+    at = links.CreateDefaultContext()
+    links.SetPositions(at, NOMINAL)
+    tables = []
+    for side in ("left", "right"):
+        tool = links.GetFrameByName("tool", links.GetModelInstanceByName(side))
+        table = Plane(point=tool.CalcPoseInWorld(at).translation(), normal=(0, 0, 1))
+        tables.append(PointOnSurface(f"{side}::tool", table, name=side, friction=0.3))
+    model = RobotModel.from_multibody(links, tables, nominal_positions=NOMINAL)
+    structure = find_constraint_structure(model.dae)
+    material = ContactMaterial(time_step=1e-3, stiffness=1e5)
+    plant = ContactPlant(model, add_two_arms, material, structure=structure)
+    context = plant.CreateDefaultContext()
+    plant.GetInputPort("control").FixValue(context, 3.0 * np.sin(np.arange(14)))
+    plant.set_consistent_state(context, model.dae.nominal_state)
+    Simulator(plant, context).AdvanceTo(0.02)
+    results = plant.GetOutputPort("contact_results").Eval(context)
+    found = plant.GetOutputPort("contact_force").Eval(context).reshape(2, 3)
+    infos = map(results.point_pair_contact_info, range(results.num_point_pair_contacts()))
+    wanted = np.array([info.contact_force() for info in infos])
+    assert_allclose(np.abs(found), np.abs(wanted), rtol=0.0, atol=1e-9)
+    assert found[:, 2].min() > 5.0
 
 
 def _contact_point(plant, own):

@@ -1,0 +1,451 @@
+"""A diagram as a rollout steps it: its block, and the places of its numbers."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from numbers import Integral
+from threading import RLock
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import Context, Diagram, PortDataType
+from pydrake.systems.primitives import RandomSource
+
+from drake_dae.arrays import FloatArray, brief, by_columns, numbers
+from drake_dae.blocks.block import Block, Held, stacked
+from drake_dae.blocks.compose import Leaves, compose, laws_of, leaf_inputs
+from drake_dae.blocks.machine import (
+    Stepper,
+    can_run_several,
+    load,
+)
+from drake_dae.blocks.stepping import RunProblem, StepFunctions
+from drake_dae.blocks.traced_system import TracedSystem, context_in
+from drake_dae.dae import Signal
+from drake_dae.diagrams.closed_loop import ClosedLoop
+from drake_dae.diagrams.record import Record, computed_record, recorded_values
+from drake_dae.errors import ModelError
+from drake_dae.running.events import Seed, drawn_noise, events_within, source_period
+from drake_dae.systems.parameterized import ParameterizedSystem
+from drake_dae.systems.plants.contract import plants_in
+from drake_dae.systems.plants.dae_plant import DaePlant
+from drake_dae.trace.compiled import Compiled, attempts
+
+CONTROL = "$control"
+"""The name of the control of Drake's plant among the outputs of the block."""
+
+MAKING = RLock()
+"""What is made once is made by one thread; expressions of CasADi cannot be shared by several."""
+
+
+class RolloutProgram:
+    """A diagram as a rollout steps it: its block, whose inputs became parameters and held values.
+
+    Args:
+        diagram: The diagram.
+        signals: The columns of a row: name of an output port -> names and units of its entries.
+        name: Its name in messages.
+        complete: Adds derived signals to a record.
+        choice: Whether it becomes machine code by default.
+        like: The same without shared parameters; None for that one.
+        context: A context in which input ports without a wire have values; the default if None.
+
+    Attributes:
+        functions: The functions of the block.
+        drake: The `ContactPlant` that Drake steps; None without one.
+
+    Raises:
+        ModelError: A system cannot be traced.
+    """
+
+    def __init__(
+        self,
+        diagram: Diagram,
+        signals: Mapping[str, Sequence[Signal]] | None,
+        name: str,
+        complete: Callable[[Record], Record] = lambda record: record,
+        choice: Compiled = "auto",
+        like: "RolloutProgram | None" = None,
+        context: Context | None = None,
+    ) -> None:
+        self.diagram, self.name, self.choice, self._complete = diagram, name, choice, complete
+        self.context, leaves = context or diagram.CreateDefaultContext(), Leaves.of(diagram)
+        self.laws = laws_of(leaves.systems)
+        for plant, law in self.laws.items() if like is not None else ():
+            own = plant.GetMyMutableContextFromRoot(self.context).get_mutable_numeric_parameter(0)
+            numbers = law.GetMyContextFromRoot(self.context).get_numeric_parameter(0)
+            own.SetFromVector(numbers.value()[: own.size()])
+        names = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]
+        names = [p for p in names if p.get_data_type() == PortDataType.kVectorValued]
+        self.ports = {p.get_name(): p for p in names if not signals or p.get_name() in signals}
+        stepped = [plant for plant in plants_in(diagram) if plant.time_step]
+        self.is_discrete = bool(stepped)
+        self.drake = next((p for p in stepped if not isinstance(p, TracedSystem)), None)
+        wanted = dict(self.ports)
+        if self.drake is not None:
+            (entry,) = leaf_inputs(self.drake, int(self.drake.GetInputPort("control").get_index()))
+            system, index = leaves.sources[entry]
+            wanted[CONTROL] = system.get_output_port(index)
+        self.composed = composed = compose(
+            diagram, wanted, context=self.context, shares=like is not None
+        )
+        inside = [self.drake]
+        if isinstance(self.drake, Diagram):
+            inside = Leaves.of(self.drake).systems
+        self.stepped = {name: cut for name, cut in composed.cuts.items() if cut[0] in inside}
+        self.block = block = self._without_inputs()
+        outputs = {each: block.outputs[each] for each in signals or self.ports}
+        self.functions = StepFunctions(replace(block, outputs=outputs))
+        self.num_states = block.state.numel()
+        if self.drake is not None and (states := list(composed.states)):
+            raise ModelError(
+                f"a rollout cannot combine '{self.drake.get_name()}', which has Drake's own "
+                f"contact, with '{states[0].get_name()}', which has a continuous state. Sample the "
+                "law, with a force sensor without a time constant, or run the loop by simulate"
+            )
+        self.signals = signals or {
+            each: composed.block.signals.get(each)
+            or [Signal(f"{each}[{i}]") for i in range(value.numel())]
+            for each, value in outputs.items()
+        }
+        if not self.signals:
+            raise ModelError(
+                "the diagram has no output port with a vector, so that a rollout has nothing to "
+                "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
+            )
+        sources = [name for name, (s, _) in composed.cuts.items() if isinstance(s, RandomSource)]
+        self.sources = {each: composed.cuts[each][0] for each in sources}
+        places, first = {}, 0
+        for group, held in self.block.held.items():
+            places[group] = slice(first, first + held.symbol.numel())
+            first += held.symbol.numel()
+        self.held_places, drawn = places, np.zeros(first, dtype=bool)
+        for each in sources:
+            drawn[places[each]] = True
+        self.kept_places = np.flatnonzero(~drawn)
+        self._like, self._made = like, dict[str, Any]()
+
+    def kept(self, name: str, make: Callable[[], Any]) -> Any:
+        with MAKING:
+            if name not in self._made:
+                self._made[name] = make()
+            return self._made[name]
+
+    @property
+    def stepper(self) -> Stepper | None:
+        """Its machine code; None if there is none yet."""
+        return self._made.get("code")
+
+    @property
+    def shared(self) -> "RolloutProgram":
+        """The program of runs in which each plant and the model of its law have equal numbers."""
+
+        def make() -> RolloutProgram:
+            return RolloutProgram(
+                self.diagram, self.signals, self.name, self._complete, self.choice, self
+            )
+
+        found: RolloutProgram = self.kept("shared", make) if self.laws else self
+        return found
+
+    def shares(self, parameters: FloatArray, count: int) -> np.ndarray:
+        """In which runs each plant and its law have equal numbers, shape (count,)."""
+        parts, equal = self.composed.parameters, np.full(len(parameters), True)
+        for plant, law in self.laws.items():
+            if plant not in parts:
+                continue
+            own = parameters[:, parts[plant]]
+            same = own == parameters[:, parts[law]][:, : own.shape[1]]
+            if isinstance(plant, ParameterizedSystem) and plant.exogenous_places:
+                same[:, plant.exogenous_places] |= plant.GetInputPort("exogenous").HasValue(
+                    plant.GetMyContextFromRoot(self.context)
+                )
+            equal &= same.all(axis=1)
+        return np.broadcast_to(equal & bool(self.laws), count)
+
+    def reduced(self, problems: RunProblem, indices: np.ndarray) -> RunProblem:
+        """Some runs, with the parameters of this program."""
+        parameters, noise = (
+            table if len(table) == 1 else table[indices]
+            for table in (problems.parameters, problems.noise)
+        )
+        if self._like is not None:
+            whole = self._like.composed.parameters
+            own = [whole[system] for system in self.composed.parameters]
+            total = sum(part.stop - part.start for part in whole.values())
+            columns = [np.arange(part.start, part.stop) for part in own]
+            columns.append(np.arange(total, parameters.shape[1]))
+            parameters = np.ascontiguousarray(parameters[:, np.concatenate(columns)])
+        return replace(
+            problems,
+            state=problems.state[indices],
+            held=problems.held[indices],
+            parameters=parameters,
+            noise=noise,
+        )
+
+    def machine_code(self, choice: Compiled, calls: float, is_all: bool) -> Stepper | None:
+        """Its machine code; None if compiling takes longer than it saves.
+
+        Code that is already in the cache is used in any case, unless further runs will follow.
+        """
+        make = self._pays(choice, calls)
+        if choice is False or self.drake is not None or not (make or is_all):
+            return None
+        stepper = self._made.get("code") or load(self.functions, choice, make)
+        self._made["code"] = stepper
+        return stepper
+
+    def lanes(self, choice: Compiled, calls: float, is_all: bool) -> Stepper | None:
+        """As `machine_code`, for several runs side by side."""
+        make = self._pays(choice, calls)
+        if not self.kept("can run several", lambda: can_run_several(self.functions)):
+            return None
+        if not (make or is_all):
+            return None
+        stepper = self._made.get("lanes") or load(self.functions, choice, make, several=True)
+        self._made["lanes"] = stepper
+        return stepper
+
+    def _pays(self, choice: Compiled, calls: float) -> bool:
+        """Whether machine code pays that saves so many interpreted evaluations."""
+        tries = attempts("auto", self.functions.num_operations)
+        return choice is True or any(makes and calls >= least for least, makes in tries)
+
+    @property
+    def drake_state(self) -> slice:
+        """The place of the state of Drake's plant among the held values."""
+        size = self.drake.dae.num_states if self.drake is not None else 0
+        parts = [self.held_places[name] for name in self.stepped]
+        return next(part for part in parts if part.stop - part.start == size)
+
+    def values_in(self, context: Context) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """State, held values and parameters in a context of the diagram.
+
+        Raises:
+            ModelError: An input port without a wire has no value in it, or it is that of another
+                diagram.
+        """
+        composed, functions = self.composed, self.functions
+        state, held = np.zeros(functions.size), np.zeros(functions.sizes[2])
+        for system, part in composed.states.items():
+            local = context_in(system, context)
+            state[part] = local.get_continuous_state_vector().CopyToVector()
+        for (system, i), (group, _) in composed.held.items():
+            local = context_in(system, context)
+            held[self.held_places[group]] = local.get_discrete_state(i).value()
+        for name, (system, i) in composed.cuts.items():
+            value = system.get_output_port(i).Eval(context_in(system, context))
+            held[self.held_places[name]] = value
+        values = []
+        for system in composed.parameters:
+            local = context_in(system, context)
+            groups = range(local.num_numeric_parameter_groups())
+            values += [local.get_numeric_parameter(i).value() for i in groups]
+        for system, i in composed.fixed.values():
+            port, local = system.get_input_port(i), context_in(system, context)
+            if not port.HasValue(local):
+                raise ModelError(
+                    f"the input port '{port.get_name()}' of '{system.get_name()}' has no value in "
+                    "this context"
+                )
+            values.append(port.Eval(local))
+        return state, held, np.concatenate([np.zeros(0), *values])
+
+    def put(
+        self,
+        context: Context,
+        time: float,
+        state: FloatArray,
+        held: FloatArray,
+        parameters: FloatArray,
+    ) -> None:
+        """Sets time, states and parameters in a context of the diagram."""
+        composed = self.composed
+        context.SetTime(time)
+        for system, part in composed.states.items():
+            system.GetMyMutableContextFromRoot(context).SetContinuousState(state[part])
+        for (system, i), (group, _) in composed.held.items():
+            local = system.GetMyMutableContextFromRoot(context)
+            local.SetDiscreteState(i, held[self.held_places[group]])
+        for system, part in composed.parameters.items():
+            local, first = system.GetMyMutableContextFromRoot(context), part.start
+            for i in range(local.num_numeric_parameter_groups()):
+                group = local.get_mutable_numeric_parameter(i)
+                group.SetFromVector(parameters[first : first + group.size()])
+                first += group.size()
+        first = sum(part.stop - part.start for part in composed.parameters.values())
+        for system, i in composed.fixed.values():
+            port, local = system.get_input_port(i), system.GetMyMutableContextFromRoot(context)
+            port.FixValue(local, parameters[first : first + port.size()])
+            first += port.size()
+        if self.drake is not None:
+            local = self.drake.GetMyMutableContextFromRoot(context)
+            self.drake.set_state(local, held[self.drake_state])
+
+    def problems(
+        self,
+        starts: ArrayLike,
+        parameters: ArrayLike | None,
+        times: FloatArray,
+        seeds: Sequence[Seed] | None,
+    ) -> RunProblem:
+        """The runs of `rollout`, from its arguments.
+
+        Raises:
+            ModelError: The arguments have wrong shapes.
+            InconsistentStateError: A start is not on N*.
+        """
+        functions = self.functions
+        rates = [(rate.period, rate.offset) for rate in functions.rates]
+        # A discrete plant logs its steps before the updates of their times.
+        events, due = events_within(rates, times, with_end=not self.is_discrete)
+        if parameters is None:
+            parameters = self.values_in(self.context)[2]
+        if seeds is not None:
+            seeds = [int(seed) if isinstance(seed, Integral) else seed for seed in seeds]
+        states = _table("starts", starts, self.num_states + self.kept_places.size)
+        rows = _table("parameters", parameters, functions.sizes[3])
+        count = max(len(states), len(rows), len(seeds or ()))
+        if len(states) == 1:
+            states = np.repeat(states, count, axis=0)
+        count = len(states)
+        if len(rows) not in (1, count):
+            raise ModelError(f"{len(rows)} rows of parameters for {count} starts")
+        if seeds is not None and len(seeds) != count:
+            raise ModelError(f"{len(seeds)} seeds for {count} starts")
+        for seed in seeds or ():
+            for value in [seed] if isinstance(seed, int) else seed.values():
+                if not 0 <= value < 2**32:
+                    raise ModelError(f"a seed is a number from 0 to 2^32 - 1, got {brief(value)}")
+        # Without noise, or without seeds, it is the same in all runs.
+        different: Sequence[Seed | None] = seeds if seeds and self.sources else [None]
+        noise = np.array([self._noise(times[0], events, due, seed) for seed in different])
+        held = np.zeros((count, functions.sizes[2]))
+        held[:, self.kept_places] = states[:, self.num_states :]
+        first = 0
+        for name in self.sources:
+            place = self.held_places[name]
+            size = place.stop - place.start
+            held[:, place] = noise[:, 0, first : first + size]
+            first += size
+        state = np.zeros((count, functions.size))
+        state[:, : self.num_states] = states[:, : self.num_states]
+        rows, noise = np.ascontiguousarray(rows), np.ascontiguousarray(noise[:, 1:])
+        problems = RunProblem(times, state, held, rows, events, due, noise)
+        self._check_starts(problems)
+        return problems
+
+    def _noise(
+        self, start: float, events: FloatArray, due: np.ndarray, seed: Seed | None
+    ) -> FloatArray:
+        """The numbers of all sources at the start and at each event, shape (k + 1, q)."""
+        columns = []
+        for number, (name, source) in enumerate(self.sources.items()):
+            places = self.held_places[name]
+            (rate,) = (i for i, r in enumerate(self.functions.rates) if places.start in r.places)
+            rows = np.flatnonzero(due >> rate & 1)
+            drawn = np.zeros((events.size + 1, places.stop - places.start))
+            period = self.functions.rates[rate].period
+            chosen = (seed + number * 2**31) % 2**32 if isinstance(seed, int) else None
+            if isinstance(seed, Mapping):
+                chosen = seed.get(source.get_name())
+            drawn[[0, *(rows + 1)]] = drawn_noise(source, start, events[rows], period, chosen)
+            columns.append(drawn)
+        return np.concatenate([np.zeros((events.size + 1, 0)), *columns], axis=1)
+
+    def _check_starts(self, problems: RunProblem) -> None:
+        """Refuses starts that are off N*."""
+        context, time, parts = self.context.Clone(), float(problems.times[0]), self.composed
+        for plant in (s for s in parts.states if isinstance(s, DaePlant)):
+            local, part = plant.GetMyContextFromRoot(context), parts.states[plant]
+            own = parts.parameters.get(plant, slice(0, 0))
+            for i in range(len(problems.state)):
+                one = problems.run(i)
+                values = one.parameters[own]
+                if plant.exogenous_places:
+                    self.put(context, time, one.state, one.held, one.parameters)
+                    values = plant.current_parameters(local)
+                plant.check_start(one.state[part], values)
+
+    def _without_inputs(self) -> Block:
+        """The block with values of unwired inputs as parameters, and what Drake computes as held.
+
+        Its only input is "noise", from which sources of random numbers take their next values.
+
+        Raises:
+            ModelError: A system can be neither traced nor stepped beside the block.
+        """
+        composed, block = self.composed, self.composed.block
+        noise, random, stepped = list[ca.SX](), dict[str, Held](), dict[str, Held]()
+        for name, (system, index) in composed.cuts.items():
+            symbol, start = block.inputs[name], np.zeros(block.inputs[name].numel())
+            if isinstance(system, RandomSource):
+                noise.append(ca.SX.sym(name, symbol.numel()))
+                random[name] = Held(symbol, noise[-1], start, source_period(system))
+            elif self.drake is not None and name in self.stepped:
+                stepped[name] = Held(symbol, symbol, start, self.drake.time_step)
+            else:
+                port = system.get_output_port(index).get_name()
+                raise ModelError(
+                    f"the output port '{port}' of '{system.get_name()}' cannot be traced. What "
+                    "depends on it only runs in Drake's Simulator"
+                )
+        fixed = [block.inputs[name] for name in composed.fixed]
+        return replace(
+            block,
+            inputs={"noise": stacked(noise)},
+            held={**stepped, **block.held, **random},
+            parameters=stacked([block.parameters, *fixed]),
+        )
+
+    def record(self, times: FloatArray, rows: FloatArray, after: float | None = None) -> Record:
+        """The record of a run, or of its rows after a time in s."""
+        times = times[: len(rows)]
+        first = 0 if after is None else int(np.searchsorted(times, after, side="right"))
+        columns, stop, signals = by_columns(rows[first:]), 0, {}
+        for name, entries in self.signals.items():
+            start, stop = stop, stop + len(entries)
+            signals[name] = recorded_values(columns[start:stop].T, tuple(entries))
+        return self._complete(computed_record(times[first:], signals))
+
+
+def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
+    """The program of a closed loop or of any diagram, which is made once.
+
+    Raises:
+        ModelError: A block cannot be traced, with its name and the reason; or a diagram has no
+            output port with a vector.
+    """
+    with MAKING:
+        if isinstance(loop, Diagram):
+            return _of_diagram(loop)
+        if "program" not in loop.memory:
+            loop.memory["program"] = RolloutProgram(
+                loop.diagram,
+                loop.signals,
+                loop.plant.get_name(),
+                loop.with_errors,
+                loop.plant.dae.compiled,
+            )
+        program: RolloutProgram = loop.memory["program"]
+    return program
+
+
+@lru_cache(maxsize=4)
+def _of_diagram(diagram: Diagram) -> RolloutProgram:
+    return RolloutProgram(diagram, None, diagram.get_name() or "the diagram")
+
+
+def _table(what: str, given: ArrayLike, size: int) -> FloatArray:
+    table = np.atleast_2d(numbers(what, given))
+    if table.ndim != 2 or table.shape[1] != size:
+        raise ModelError(
+            f"{what} must have shape ({size},), or (k, {size}) for k runs, got "
+            f"{np.shape(given)}: see start_values"
+        )
+    if not np.isfinite(table).all():
+        raise ModelError(f"{what} must be finite")
+    return table
