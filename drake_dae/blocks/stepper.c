@@ -13,7 +13,8 @@
 /* How a run ended; Python has the same list. */
 enum { DONE, PAUSED, INVALID, OFF_MANIFOLD, STUCK, SPOILT, SLOW };
 
-/* The most trials of a step. Ten shorter ones reduce it to round-off, but for several alone. */
+/* The most trials of a step: ten shorter ones reduce it to round-off. Of runs side by side, one that
+   needs more goes on alone. */
 enum { TRIALS = LANES == 1 ? 1000 : 30 };
 
 /* A value of `next` after which no run starts, and all end. */

@@ -1,4 +1,4 @@
-"""What the commands of `drake-dae` share: options, files that are written, waits that are told."""
+"""What the commands of `drake-dae` share: options, checks of what they write, progress of waits."""
 
 import argparse
 import os

@@ -67,9 +67,9 @@ class RecordWriter:
             self._file = None
 
     def update(self, context: Context) -> None:
-        """Appends the new part of the record, if an update is due, but for its last row.
+        """Appends the new part of the record, if an update is due, without its last row.
 
-        At the end of a run that is replaced by the row after the projection.
+        At the end of a run the row after the projection replaces it.
 
         Warns:
             UserWarning: The file cannot be written to; once.

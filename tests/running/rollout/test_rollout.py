@@ -7,9 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.framework import DiagramBuilder
 from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, run, scenario, some
 
 from drake_dae import (
+    DaePlant,
+    DaeSystem,
     ForceSensor,
     RobotPlant,
     TrackingLaw,
@@ -19,6 +22,7 @@ from drake_dae import (
     rollout,
     simulate,
 )
+from drake_dae.blocks import machine
 from drake_dae.diagrams import LoopSettings
 from drake_dae.diagrams.state_feedback import encoder_seed
 from drake_dae.errors import (
@@ -32,6 +36,8 @@ from drake_dae.running import start_values
 from drake_dae.running.rollout import run_loop
 from drake_dae.running.rollout_program import program_of
 from drake_dae.scenario.rolled import roll_scenario
+
+SAMPLED = "sampling={period: 0.03125}"
 
 COMPILED = {"boom", "planar_4rrr", "seven_joint_moving_plate", "two_link_hydraulics"}
 """Those that are also made machine code; others take the compiler longer."""
@@ -155,10 +161,13 @@ def test_error_control_agrees(name, compiled):
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
-@pytest.mark.parametrize("mass", [None, 11.0])
-def test_error_control_takes_the_same_steps_with_machine_code_and_without(mass):
-    """To 1e-9, as long as the steps do; also where the plant is not what the law takes it for."""
-    chosen = scenario("two_link_wall", "integrator.accuracy=1e-6", "compiled=false")
+@pytest.mark.parametrize(("mass", "sampling"), [(None, []), (11.0, []), (11.0, [SAMPLED])])
+def test_error_control_takes_the_same_steps_with_machine_code_and_without(mass, sampling):
+    """To 1e-9, as long as the steps do; also where the plant is not what the law takes it for.
+
+    At a sample the control jumps: the rate at the end of a step is not that of the next one.
+    """
+    chosen = scenario("two_link_wall", "integrator.accuracy=1e-6", "compiled=false", *sampling)
     loop, context = build_scenario(chosen)
     if mass is not None:
         loop.plant.set_parameter(
@@ -173,6 +182,45 @@ def test_error_control_takes_the_same_steps_with_machine_code_and_without(mass):
     assert one.steps == other.steps
     for name, recorded in one.record.signals.items():
         np.testing.assert_allclose(other.record[name], recorded.values, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+@pytest.mark.parametrize("settings", [[SAMPLED], [SAMPLED, *fixed()[:2]]])
+def test_a_run_that_pauses_is_the_same_run(monkeypatch, settings):
+    """Bit by bit: Python looks at it between steps, to see Ctrl-C and divergence."""
+    chosen = scenario("two_link_wall", "integrator.max_step_size=0.01", *settings)
+    loop, context = build_scenario(chosen)
+    start, parameters = start_values(loop, context)
+    found = []
+    for first in (10**9, 3):
+        monkeypatch.setattr(machine, "FIRST", first)
+        monkeypatch.setattr(machine, "PAUSE", 0.0)
+        given = loop, start, parameters, grid(0.5, 0.02)
+        found += rollout(*given, config=chosen.integrator, compiled=True)
+    assert found[0].steps == found[1].steps > 20
+    for name, recorded in found[0].record.signals.items():
+        np.testing.assert_array_equal(found[1].record[name], recorded.values)
+
+
+def test_a_newton_step_has_the_sizes_of_the_states():
+    """Of a pendulum of 1000 mm: one step from a millionth off N* leaves the square of that."""
+    system = DaeSystem.from_functions(
+        ["a", "b", "a_rate", "b_rate"],
+        f=lambda x: [x[2], x[3], 0.0, -9810.0],
+        g=lambda x: [0.0, 0.0, x[0] / 1e3, x[1] / 1e3],
+        k=lambda x: x[0] ** 2 + x[1] ** 2 - 1e6,
+        nominal_state=[600.0, -800.0, 0.0, 0.0],
+    )
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(DaePlant(system))
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
+    program = program_of(builder.Build())
+    state, held, parameters = program.values_in(program.context)
+    off = state * (1.0 + 1e-6)
+    moved, left = program.functions.newton(0.0, off, held, parameters)
+    assert 1e-7 < float(left) < 1e-5
+    before, after = (np.hypot(*x[:2]) - 1e3 for x in (off, moved.full()[:, 0]))
+    assert abs(after) < 1e-5 * abs(before)
 
 
 def test_rows_within_a_thousand_short_steps_are_those_of_long_ones():

@@ -81,7 +81,7 @@ def test_contact_force_is_what_drake_balances():
     ("name", "tolerance"), [("wall_point_contact", 1e-9), ("wall_hydroelastic", 0.02)]
 )
 def test_contact_force_from_generalized_forces_is_that_of_drakes_results(name, tolerance):
-    """While the tool slides: of a point to round-off; of a patch but for its torque."""
+    """While the tool slides: of a point to round-off; a patch has a torque as well."""
     loop, context, record = run_scenario(scenario(name, "duration=0.05"))
     own = loop.plant.GetMyContextFromRoot(context)
     assert record["state"][-1, 7:] @ record["state"][-1, 7:] > 1e-3
