@@ -32,6 +32,7 @@ from drake_dae import rollout
 from drake_dae.errors import ModelError
 from drake_dae.running import export_loop, rollout_program, start_values
 from drake_dae.running import rollout as module
+from drake_dae.running.events import events_within
 
 
 def fixed(step=1e-3):
@@ -370,3 +371,12 @@ def test_a_stiff_rollout_says_so(monkeypatch):
     config = SimulatorConfig(accuracy=1e-3)
     with pytest.warns(UserWarning, match=r"2e\+03 1/s"):
         rollout(diagram, [1.0], None, [0.0, 3.0], config=config, compiled=False)
+
+
+def test_updates_at_rows_have_their_times():
+    """So no step of 1e-17 s leads from one to the other: 3 * 0.1 is not 0.3."""
+    times = np.linspace(0.0, 1.0, 11)
+    moments, due = events_within([(0.1, 0.0), (0.25, 0.05)], times)
+    assert {*times} <= {*moments}
+    assert due[moments == times[3]].tolist() == [0b11]
+    assert moments.size == 13
