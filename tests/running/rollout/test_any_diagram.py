@@ -380,4 +380,4 @@ def test_updates_at_rows_have_their_times():
     assert {*times} <= {*moments}
     # As in Drake, those that differ by round-off follow each other.
     assert due[moments == times[3]].tolist() == [0b10, 0b01]
-    assert moments.size == 15
+    assert moments.size == 14
