@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pebble import ProcessExpired, ProcessPool
+from pebble import ProcessExpired, ProcessFuture, ProcessPool
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
@@ -155,7 +155,8 @@ def _run(
             bar.update(len(ended))
     finally:
         for future in running:
-            future.cancel()
+            if not isinstance(future, ProcessFuture):  # Those end with their processes.
+                future.cancel()
 
 
 def _result(future: "Future[RunResult]") -> RunResult:
@@ -175,11 +176,15 @@ def _result(future: "Future[RunResult]") -> RunResult:
 @contextmanager
 def _processes(count: int, time_limit: float, most: int) -> Iterator[tuple[Submit, int]]:
     """Processes of this machine, each for so many runs. One that dies, or is slow, is replaced."""
-    pool = ProcessPool(count, max_tasks=most, context=_WithoutMain())
+    context = _WithoutMain()
+    pool = ProcessPool(count, max_tasks=most, context=context)
     try:
         yield (lambda *args: pool.schedule(run_one, args, timeout=time_limit)), 4 * count
     finally:
         pool.stop()  # type: ignore[no-untyped-call]
+        # The pool closes its channels first, which a process that is just starting would report.
+        for process in filter(_Process.is_alive, list(context.started)):
+            process.kill()
         pool.join()
 
 
@@ -196,7 +201,14 @@ class _Process(multiprocessing.context.SpawnProcess):
 
 
 class _WithoutMain(multiprocessing.context.SpawnContext):
-    Process = _Process
+    def __init__(self) -> None:
+        self.started: list[_Process] = []
+
+    def Process(self, **settings: Any) -> _Process:  # type: ignore[override]
+        """A process as the pool wants it; it is started next."""
+        self.started = [process for process in self.started if process.is_alive()]
+        self.started.append(_Process(**settings))
+        return self.started[-1]
 
 
 def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
