@@ -50,7 +50,7 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
-from drake_dae.scenario.robot_file.changes import actuators_of, closing_joints, joints_of
+from drake_dae.scenario.robot_file.changes import actuators_of, joints_of
 from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
@@ -253,11 +253,12 @@ def _read(file: str) -> tuple[MultibodyPlant, Robot]:
     robot = Robot(file, _folders_above(file), actuators="all")
 
     def read() -> MultibodyPlant:
-        plant, _ = read_robot(robot)
-        if closing := closing_joints(plant):
+        plant, loops = read_robot(robot)
+        if loops:
+            names = ", ".join(loop.options["name"] for loop in loops)
             raise ModelError(
-                f"joints close loops ({', '.join(joint.name() for joint in closing)}), and a new "
-                "scenario has none; write one by hand, as the shipped five_bar"
+                f"joints close loops ({names}), and a new scenario has none; write one by hand, as "
+                "the shipped five_bar"
             )
         finalize(plant)
         return plant
