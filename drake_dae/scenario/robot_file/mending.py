@@ -6,6 +6,7 @@ read. What changed on the way is collected, and so is what is lost.
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, SubElement
@@ -156,7 +157,7 @@ class Mender:
             why = "is outside of the model's folder or package (robot.packages can name its folder)"
         elif kinds and (drawn := drawable(path, kinds)) is None:
             why = "cannot be converted (pip install 'drake_dae[meshes]' converts more)"
-        elif collides and not _has_hull(drawn):
+        elif collides and drawn and not _has_hull(str(drawn), drawn.stat().st_mtime_ns):
             why = "cannot be read by Drake"
         if why:
             self._leave_out(why, f"'{name if path is None else Path(name).name}'")
@@ -347,10 +348,11 @@ class Mender:
             self.floating.append(Floating(model, joint, name, "world"))
 
 
-def _has_hull(mesh: Path | None) -> bool:
-    """Whether Drake can compute the convex hull that a collision needs."""
+@cache
+def _has_hull(mesh: str, changed: int) -> bool:
+    """Whether Drake can compute the convex hull that a collision needs, of a file of a time."""
     try:
-        Mesh(str(mesh)).GetConvexHull()
+        Mesh(mesh).GetConvexHull()
     except RuntimeError:
         return False
     return True
