@@ -8,7 +8,7 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, positive, unknown_name
@@ -26,11 +26,7 @@ from drake_dae.dae import (
     with_disturbance,
 )
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.drives import hold_before
-from drake_dae.diagrams.parts import add_block
-from drake_dae.diagrams.recorded import further_signals, log_signals, signals_of_plant
-from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.diagrams.state_feedback import make_sensor
+from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.references import Reference
@@ -49,7 +45,6 @@ from drake_dae.scenario.plants import IdealConstraints
 from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
-from drake_dae.scene.view import add_live_view
 from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
@@ -344,15 +339,4 @@ def _mechanism(
             raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
     structure = find_constraint_structure(model.dae)
     plant, controller = make_plant(scenario, model, structure), _NoController(structure)
-    builder = DiagramBuilder()
-    for block in (plant, controller):
-        add_block(builder, block)
-    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
-    control = controller.GetOutputPort("control")
-    builder.Connect(control, plant.GetInputPort("control"))
-    named = signals_of_plant(plant, None, None, None, control) | further_signals(plant)
-    log = log_signals(builder, plant, controller, named)
-    if meshcat is not None:
-        add_live_view(builder, plant, scene_graph, meshcat, None)
-    diagram, signals = builder.Build(), {name: tuple(of) for name, (_, of) in named.items()}
-    return ClosedLoop(diagram, plant, controller, None, log, signals, scene_graph)
+    return wire_loop(plant, controller, scene_graph=scene_graph, meshcat=meshcat)

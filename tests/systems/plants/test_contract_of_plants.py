@@ -30,7 +30,7 @@ from drake_dae import (
     sweep,
 )
 from drake_dae.diagrams.record import Record
-from drake_dae.diagrams.recorded import log_steps
+from drake_dae.diagrams.wiring import log_steps
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.shipped import find_scenario

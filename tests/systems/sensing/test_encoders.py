@@ -202,7 +202,7 @@ def test_encoders_and_force_sensor_of_one_seed_have_noise_of_their_own(seed):
     felt, measured = [], []
     for k in range(4):
         simulator.AdvanceTo((k + 0.5) * 2.0 * T)
-        for source, numbers in ((loop.noise, felt), (loop.encoders.noise, measured)):
+        for source, numbers in ((loop.noise, felt), (loop.encoder_noise, measured)):
             own = source.GetMyContextFromRoot(context)
             numbers.extend(source.get_output_port().Eval(own))
     assert len(set(felt)) == 4
