@@ -226,7 +226,7 @@ def wire_loop(
     if reference is not None and goal is not None:
         inputs["reference"] = (goal, controller.law.reference_signals)
     named = {**inputs, "control": (control, dae.control_signals), **named}
-    for block in (controller, observer, plant, reference):
+    for block in (controller, observer, plant):
         if block is not None:
             named |= {n: (block.GetOutputPort(n), s) for n, s in block.further_signals.items()}
     for name, (port, _) in named.items():

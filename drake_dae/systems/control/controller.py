@@ -105,21 +105,15 @@ class TrackingController(ParameterizedSystem, Controller):
             context.SetContinuousState(values)
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
-        """Changes the gains in a context.
-
-        Args:
-            context: The context of this system.
-            gains: A design such as `poles(-8.0)`, or finished gains.
+        """Changes the gains in a context: a design such as `poles(-8.0)`, or finished gains.
 
         Raises:
-            GainError: The gains do not fit, are not Hurwitz, or couple outputs that the law does
-                not.
+            GainError: They do not fit, are not Hurwitz, or couple outputs that the law does not.
         """
         values = self.law.all_parameters(self.parameters(context), gains)
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
     def all_parameters(self, context: Context) -> FloatArray:
-        """The parameters of the law's function: the model's at the context's time, and K."""
         self.check_context(context)
         return np.array(self._values(context))
 
@@ -153,13 +147,7 @@ class TrackingController(ParameterizedSystem, Controller):
 
 
 def law_block(law: TrackingLaw, limits: FloatArray, sample_period: float) -> Block:
-    """The law (28) with the integrals of its errors, as a block; see `TrackingController`.
-
-    Args:
-        law: The law.
-        limits: The largest |integral| of each error, shape (k,).
-        sample_period: The sample period of integrals, in s; 0 for continuous integrals.
-    """
+    """The law (28) with the integrals of its errors, as a block; see `TrackingController`."""
     system, signals = law.system, law.integral.signals
     named = {"state": "estimated_state"}
     inputs = {named.get(name, name): symbol for name, symbol in law.inputs.items()}

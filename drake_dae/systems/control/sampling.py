@@ -76,23 +76,10 @@ class ControlHold(TracedSystem):
     The controller is evaluated only at samples. Before the first control acts, that of the start is
     held, as if the robot had been at rest there.
 
-    The updates are unrestricted, which Drake computes before discrete ones and all from the same
-    instant: so the controller sees time, state and reference at t_k, even if a discrete
-    MultibodyPlant steps at t_k (also an unrestricted update). That plant uses the previously held
-    control, and so sees a delay longer by one of its steps.
-
-    Input port:
-        control: The present control of the controller, shape (p,).
-
-    Output port:
-        control: The held control, shape (p,); no direct feedthrough.
-
-    Args:
-        size: The number of controls, p.
-        sampling: Period and delay.
-
-    Raises:
-        WiringError: At the start of a run: the first control depends on itself.
+    The updates are unrestricted: so the controller sees time, state and reference at t_k, even if
+    a discrete MultibodyPlant steps at t_k. That plant uses the previously held control, and so sees
+    a delay longer by one of its steps. The output has no direct feedthrough. A first control that
+    depends on itself is a WiringError at the start.
     """
 
     __slots__ = SHARED_DICTIONARY
