@@ -18,8 +18,8 @@ from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import velocities_are_rates
 from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import SIGNAL, Controller
+from drake_dae.systems.control.drives import Sampling
 from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.control.sampling import Sampling
 from drake_dae.systems.observing.estimator import StateEstimator
 from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.plants.contract import Plant

@@ -29,9 +29,8 @@ from drake_dae.scene.view import add_live_view
 from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
-from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.drives import ControlHold, ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
-from drake_dae.systems.control.sampling import ControlHold
 from drake_dae.systems.plants.contract import Plant
 
 Named = dict[str, tuple[OutputPort, Sequence[Signal]]]

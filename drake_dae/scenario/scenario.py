@@ -43,7 +43,7 @@ from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import shipped_scenarios
 from drake_dae.scenario.typed_yaml import MOST_TEXT, TAG, dump_yaml, load_lines, load_yaml
-from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.control.drives import Sampling
 from drake_dae.systems.task import phases
 from drake_dae.trace.compiled import Compiled
 

@@ -1,5 +1,6 @@
 """The tracking law as a LeafSystem."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -12,10 +13,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.blocks.block import Block, Held, Requirement, where_finite
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae import FeedbackGains, GainDesign, Signal, TrackingLaw
-from drake_dae.errors import ModelError
+from drake_dae.dae import FeedbackGains, GainDesign, Signal, TrackingLaw, Verdict, ZeroDynamics
+from drake_dae.errors import ModelError, NonMinimumPhaseWarning
 from drake_dae.systems.control.contract import Controller, Derived
-from drake_dae.systems.control.non_minimum_phase import warn_of_zero_dynamics
 from drake_dae.systems.parameterized import ParameterizedSystem
 
 
@@ -82,7 +82,16 @@ class TrackingController(ParameterizedSystem, Controller):
             )
         if count and not sample_period >= 0.0:
             raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
-        warn_of_zero_dynamics(law, outputs)
+        if law.structure.zero_dynamics_dimension:
+            dynamics = ZeroDynamics(law.system, structure=law.structure)  # (35)
+            stability = dynamics.stability(law.structure.states[0], outputs=outputs)
+            if stability.verdict is Verdict.UNSTABLE:
+                warnings.warn(
+                    f"{law.system.name}: {stability.reason}. The outputs follow the reference "
+                    "while other states, or the control, grow without bound; choose other outputs",
+                    NonMinimumPhaseWarning,
+                    stacklevel=2,
+                )
         self.law, self.sample_period = law, sample_period if count else 0.0
         block = law_block(law, np.broadcast_to(largest, (count,)), self.sample_period)
         self.equations = law.system

@@ -1,6 +1,6 @@
 """The rates and thresholds of an observer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
@@ -28,6 +28,6 @@ class Observing:
     state_rate: float | None = None
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value is not None:
-                positive(name, value)
+        for each in fields(Observing):  # A form may have more.
+            if (value := getattr(self, each.name)) is not None:
+                positive(each.name, value)

@@ -143,6 +143,7 @@ class ContactMaterial(PointMaterial):
 
 
 def ball_properties(material: ContactMaterial, friction: float) -> ProximityProperties:
+    """The properties of the ball."""
     properties = _common_properties(material, friction)
     if material.contact_model == "hydroelastic":
         AddRigidHydroelasticProperties(material.radius / 8.0, properties)
@@ -152,6 +153,7 @@ def ball_properties(material: ContactMaterial, friction: float) -> ProximityProp
 def surface_properties(
     material: ContactMaterial, friction: float, is_half_space: bool
 ) -> ProximityProperties:
+    """The properties of the surface."""
     properties = _common_properties(material, friction)
     if material.contact_model == "hydroelastic" and is_half_space:
         AddCompliantHydroelasticPropertiesForHalfSpace(
