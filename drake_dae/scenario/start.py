@@ -76,15 +76,9 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
             ("plant.disturbances", f"plant_disturbance_{index}.force", disturbance.force)
             for index, disturbance in enumerate(scenario.plant.disturbances)
         ]
-    values = plant.parameters(at_plant)
     for key, name, value in numbers:
         with at(key):
-            # A user's own plant may not let these numbers be set, and has been made with them.
-            is_set = key != "plant.parameters" and np.array_equal(
-                values[plant.dae.parameter_slice(name)], np.ravel(value)
-            )
-            if not is_set:
-                plant.set_parameter(at_plant, name, value)
+            plant.set_parameter(at_plant, name, value)
     with at("plant"):
         scenario.plant.begin(plant, at_plant)
     force, encoders = scenario.sensors.force, scenario.sensors.encoders
