@@ -104,7 +104,6 @@ def completed_model(
     scenario: Scenario,
     scene_graph: SceneGraph | None = None,
     payloads: Sequence[Payload] = (),
-    drawn: bool = True,
     robot: RobotLinks | None = None,
 ) -> tuple[Completed, RobotModel, Structure | None]:
     """The results of `complete_scenario` and `scenario_model`, for a robot with payloads.
@@ -112,7 +111,7 @@ def completed_model(
     The structure is there where it was needed.
     """
     if robot is None:
-        drawn = drawn and scene_graph is not None
+        drawn = scene_graph is not None
         robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)
     links, loops = robot
     constraints = _checked_constraints(scenario, links, loops)
