@@ -1,7 +1,6 @@
 """Matrices of expressions, factored once for many right sides, and equations in blocks."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
@@ -87,37 +86,8 @@ def nearest_solution(
     return goal + ca.solve(root, shortest), factors.pivot
 
 
-def by_columns(function: Callable[[ca.SX], ca.SX], matrix: ca.SX) -> ca.SX:
-    """The function of each column of a matrix that is not structurally zero, side by side."""
-    result = ca.SX(*matrix.shape)
-    for j in range(matrix.shape[1]):
-        if matrix[:, j].nnz():
-            result[:, j] = function(matrix[:, j])
-    return ca.sparsify(result)
-
-
-class Factors(ABC):
+class PositiveDefiniteFactorization:
     """A factorization A = L D L^T of a symmetric positive definite matrix, for many right sides."""
-
-    def solve(self, right: ca.SX) -> ca.SX:
-        """X of A X = B, shape (n, k), with the structurally zero columns of B."""
-        return self.backward(self.forward(right))
-
-    @abstractmethod
-    def forward(self, right: ca.SX) -> ca.SX:
-        """Y = L^-1 B, shape (n, k)."""
-
-    @abstractmethod
-    def scaled(self, half: ca.SX) -> ca.SX:
-        """D^-1 Y, shape (n, k); the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
-
-    @abstractmethod
-    def backward(self, half: ca.SX) -> ca.SX:
-        """X = L^-T D^-1 Y, shape (n, k)."""
-
-
-class PositiveDefiniteFactorization(Factors):
-    """The factors of any matrix, and how regular it is."""
 
     def __init__(self, matrix: ca.SX) -> None:
         self._identity = ca.is_equal(matrix, ca.SX.eye(matrix.shape[0]))
@@ -132,39 +102,30 @@ class PositiveDefiniteFactorization(Factors):
             square = self._diagonal[i] / matrix[i, i]
             self.pivot = ca.fmin(self.pivot, ca.if_else(matrix[i, i] > 0, square, 0))
 
+    def solve(self, right: ca.SX) -> ca.SX:
+        """X of A X = B, shape (n, k), with the structurally zero columns of B."""
+        return self.backward(self.forward(right))
+
     def forward(self, right: ca.SX) -> ca.SX:
-        if self._identity:
-            return right
-        return by_columns(lambda column: ca.solve(self._lower, column), right)
+        """Y = L^-1 B, shape (n, k)."""
+        return right if self._identity else _by_columns(self._lower, right)
+
+    def backward(self, half: ca.SX) -> ca.SX:
+        """X = L^-T D^-1 Y, shape (n, k)."""
+        return half if self._identity else _by_columns(self._lower.T, self.scaled(half))
 
     def scaled(self, half: ca.SX) -> ca.SX:
+        """D^-1 Y, shape (n, k); the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
         return half if self._identity else half / ca.repmat(self._diagonal, 1, half.shape[1])
 
-    def backward(self, half: ca.SX) -> ca.SX:
-        if self._identity:
-            return half
-        return by_columns(lambda column: ca.solve(self._lower.T, column), self.scaled(half))
 
-
-class BlockFactors(Factors):
-    """The factors of a block-diagonal matrix, from those of its blocks and their sizes."""
-
-    def __init__(self, blocks: Sequence[tuple[Factors, int]]) -> None:
-        self._factors = [factors for factors, _ in blocks]
-        self._stops = np.cumsum([0, *[size for _, size in blocks]]).tolist()
-
-    def forward(self, right: ca.SX) -> ca.SX:
-        return self._each("forward", right)
-
-    def scaled(self, half: ca.SX) -> ca.SX:
-        return self._each("scaled", half)
-
-    def backward(self, half: ca.SX) -> ca.SX:
-        return self._each("backward", half)
-
-    def _each(self, name: str, matrix: ca.SX) -> ca.SX:
-        parts = zip(self._factors, ca.vertsplit(matrix, self._stops), strict=True)
-        return ca.vertcat(*[getattr(factors, name)(part) for factors, part in parts])
+def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:
+    """The solution with a triangular matrix, of the columns that are not structurally zero."""
+    result = ca.SX(*right.shape)
+    for j in range(right.shape[1]):
+        if right[:, j].nnz():
+            result[:, j] = ca.solve(triangle, right[:, j])
+    return ca.sparsify(result)
 
 
 def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]]:
@@ -188,7 +149,7 @@ def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]
 
 
 def saddle_point_solver(
-    inertia: Factors, g: ca.SX, gradient: ca.SX
+    inertia: PositiveDefiniteFactorization, g: ca.SX, gradient: ca.SX
 ) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
     """Returns a solver of [[E, -g], [c, 0]] (w, v) = -(balance, rate), by factors of E."""
     half = inertia.forward(g)

@@ -13,7 +13,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.tree import ArticulatedBodies
 
 ORIGIN = (0.0, 0.0, 0.0)
 
@@ -160,8 +159,7 @@ class Links(Frames):
     4. `kinematics(acceleration)` follows the rules of `Kinematics`, with the same frames.
     5. `generalized_force` of a reaction is tau with tau . v = its power.
     6. `inverse_dynamics` of a reaction is M v' + H - tau.
-    7. `articulated_bodies` are factors of M, if the links have them.
-    8. Signals, limits and actuator data have matching sizes; names are unique in `position_signals`
+    7. Signals, limits and actuator data have matching sizes; names are unique in `position_signals`
        and `velocity_signals` together.
     """
 
@@ -180,20 +178,15 @@ class Links(Frames):
     position_limits: tuple[FloatArray, FloatArray]  # Lower and upper ones, shape (nq,) each.
     velocity_limits: tuple[FloatArray, FloatArray]  # The same of v, shape (nv,) each.
     plant: MultibodyPlant | None = None  # Their MultibodyPlant, for Drake's visualization.
-    landmark_names: tuple[str, ...]  # The frames whose origins are landmarks of the robot.
     outlines: tuple[Outline, ...]  # Of the collision geometry of each link, or its origin.
 
     @abstractmethod
     def landmarks(self) -> ca.SX:
-        """Points of the robot for views of it, in m, shape (3, k)."""
+        """Points of the robot for views, in m, shape (3, k); the first is the world's origin."""
 
     @abstractmethod
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
         """The frames in motion with v' = `acceleration`, a symbol of its own if None."""
-
-    def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
-        """Factors of M, where `rotors`, shape (nv,), are the addition of rotors to its diagonal."""
-        return None
 
     def generalized_force(self, kinematics: Any, reaction: Reaction) -> ca.SX:
         """tau of each column of a reaction in kinematics of these links, shape (nv, k)."""

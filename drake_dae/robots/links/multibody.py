@@ -1,6 +1,6 @@
 """The equations of motion of a MultibodyPlant as CasADi expressions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -48,12 +48,10 @@ from drake_dae.robots.links.plant_frames import (
     without_round_off,
 )
 from drake_dae.robots.links.tree import (
-    ArticulatedBodies,
     Inertia,
     LinkMotion,
     frame_jacobian,
     inverse_dynamics,
-    is_one_by_one,
     link_motions,
     link_poses,
     mass_matrix,
@@ -79,8 +77,8 @@ class MultibodyExpressions(Links):
     as mimic joints, are not included either: `RobotModel` reads them from the plant.
 
     All data comes from the plant and is in SI units (m, kg, s, rad, N, N m); q, v and u have
-    Drake's order. On construction M, N and every part of H are compared with the plant's own
-    values at random states.
+    Drake's order. On construction M, N and H are compared with the plant's own values at random
+    states.
 
     Args:
         plant: The plant.
@@ -111,11 +109,10 @@ class MultibodyExpressions(Links):
             raise ModelError("the plant has no joint that moves")
         self.plant: MultibodyPlant = plant
         self._bodies = [plant.get_body(BodyIndex(i)) for i in range(plant.num_bodies())]
-        self.landmark_names = tuple(body.name() for body in self._bodies)
         self.outlines = outlines_of(plant, scene_graph, self._bodies)
-        moving = [joint for joint in joints if joint.num_velocities() > 0]
-        moving.sort(key=lambda joint: joint.velocity_start())
-        self._read_signals(moving)
+        joints = [joint for joint in joints if joint.num_velocities() > 0]
+        joints.sort(key=lambda joint: joint.velocity_start())
+        self._read_signals(joints)
         self._read_actuators()
         self.position_limits = (plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits())
         self.velocity_limits = (plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits())
@@ -127,20 +124,13 @@ class MultibodyExpressions(Links):
         self.link_poses = link_poses(self.links)
         self._poses: dict[int, tuple[ca.SX, ca.SX]] = {}
         self.parameters = self._read_masses()
-        self.velocity_map = ca.diagcat(*[joint_velocity_map(joint, self.q) for joint in moving])
-        self._read_springs(moving)
+        self.velocity_map = ca.diagcat(*[joint_velocity_map(joint, self.q) for joint in joints])
+        self._read_springs(joints)
         self.mass_matrix = mass_matrix(self.links, self._rotors)
-        self.bias = self._newton_euler(self.v, self.gravity) - self._spring_force
-        weight = -self._newton_euler(ca.SX.zeros(self.v.numel()), self.gravity)
-        terms = {
-            "mass matrix": self.mass_matrix,
-            "Coriolis and centrifugal forces": self._newton_euler(self.v, np.zeros(3)),
-            "gravity": weight,
-            "force elements and damping": weight + self._spring_force,
-            "bias": self.bias,
-            "velocity map": self.velocity_map @ self.v,
-        }
-        _compare_with_plant(plant, self.q, self.v, self.parameters, terms)
+        moving = link_motions(self.links, self.v, ca.SX(self.v.numel(), 1), self.gravity)
+        inertial = inverse_dynamics(self.links, moving, self.gravity, self.v.numel())
+        self.bias = inertial - self._spring_force
+        self._compare_with_plant()
 
     def find(self, frame: str | Frame) -> Frame:
         """A frame of the plant by its name, or "instance::name" if several have that name."""
@@ -169,13 +159,8 @@ class MultibodyExpressions(Links):
     def position(self, frame: str | Frame, point: ArrayLike = ORIGIN) -> ca.SX:
         return position_of(self.pose(self.find(frame)), point)
 
-    def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
-        """Factors of M; None if a joint has several velocities."""
-        rotors = vector("rotors", rotors, self.plant.num_velocities())
-        return ArticulatedBodies(self.links, rotors) if is_one_by_one(self.links) else None
-
     def landmarks(self) -> ca.SX:
-        """The origins of all bodies, in m, shape (3, k)."""
+        """The origins of all bodies, in m, shape (3, k), the world's first."""
         return ca.horzcat(*[self.position(body.body_frame()) for body in self._bodies])
 
     def kinematics(self, acceleration: ca.SX | None = None) -> "TreeKinematics":
@@ -349,65 +334,50 @@ class MultibodyExpressions(Links):
         """Gravity in the world, m/s^2, shape (3,)."""
         return self.plant.gravity_field().gravity_vector()
 
-    def _newton_euler(self, v: ca.SX, gravity: FloatArray) -> ca.SX:
-        """Generalized forces at velocities v without acceleration, shape (nv, 1)."""
-        moving = link_motions(self.links, v, ca.SX(v.numel(), 1), gravity)
-        return inverse_dynamics(self.links, moving, gravity, v.numel())
+    def _compare_with_plant(self) -> None:
+        """Compares M, H and N v with the plant's own values at three random states.
 
-
-def _compare_with_plant(
-    plant: MultibodyPlant,
-    q: ca.SX,
-    v: ca.SX,
-    parameters: Sequence[Parameter],
-    terms: Mapping[str, ca.SX],
-) -> None:
-    """Compares each term with the plant's own value at three random states.
-
-    The error of a term is its largest absolute difference, over its own largest entry or over that
-    of M if that is larger: forces that cancel have no scale of their own.
-    """
-    symbols = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters])
-    values = np.concatenate([np.zeros(0), *[p.value for p in parameters]])
-    function = TracedFunction("comparison", {"q": q, "v": v, "parameters": symbols}, terms)
-    random, context = np.random.default_rng(0), plant.CreateDefaultContext()
-    for _ in range(3):
-        state = random.uniform(-1.0, 1.0, (2, v.numel()))
-        ours = dict(zip(terms, function(*state, values), strict=True))
-        plant.SetPositions(context, state[0])
-        plant.SetVelocities(context, state[1])
-        forces = MultibodyForces(plant)
-        plant.CalcForceElementsContribution(context, forces)
-        applied = plant.CalcGeneralizedForces(context, forces)
-        inertial = plant.CalcBiasTerm(context)
-        theirs = {
-            "mass matrix": plant.CalcMassMatrix(context),
-            "Coriolis and centrifugal forces": inertial,
-            "gravity": plant.CalcGravityGeneralizedForces(context),
-            "force elements and damping": applied,
-            "bias": inertial - applied,
-            "velocity map": plant.MapVelocityToQDot(context, state[1]),
-        }
-        size = np.abs(theirs["mass matrix"]).max()
-        if not size > 0.0:
-            raise ModelError(
-                "no link that moves has mass or inertia; give each of them an <inertial>, or weld "
-                "it to one that has"
-            )
-        for name, other in theirs.items():
-            if not np.all(np.isfinite(other)):
+        The error is the largest absolute difference, over the largest entry or over that of M if
+        that is larger: forces that cancel have no scale of their own.
+        """
+        names = "mass matrix", "bias", "velocity map"
+        ours = self.mass_matrix, self.bias, self.velocity_map @ self.v
+        symbols = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in self.parameters])
+        values = np.concatenate([np.zeros(0), *[p.value for p in self.parameters]])
+        inputs = {"q": self.q, "v": self.v, "parameters": symbols}
+        function = TracedFunction("comparison", inputs, dict(zip(names, ours, strict=True)))
+        plant, random = self.plant, np.random.default_rng(0)
+        context = plant.CreateDefaultContext()
+        for _ in range(3):
+            state = random.uniform(-1.0, 1.0, (2, self.v.numel()))
+            plant.SetPositions(context, state[0])
+            plant.SetVelocities(context, state[1])
+            forces = MultibodyForces(plant)
+            plant.CalcForceElementsContribution(context, forces)
+            applied = plant.CalcGeneralizedForces(context, forces)
+            mass = plant.CalcMassMatrix(context)
+            rates = plant.MapVelocityToQDot(context, state[1])
+            theirs = mass, plant.CalcBiasTerm(context) - applied, rates
+            if not np.abs(mass).max() > 0.0:
                 raise ModelError(
-                    f"the plant's own {name} is not finite at q = {state[0]}: a joint has no mass "
-                    "to move; give each moving link mass and inertia, or weld it"
+                    "no link that moves has mass or inertia; give each of them an <inertial>, or "
+                    "weld it to one that has"
                 )
-            scale = max(np.abs(other).max(), 1.0 if name == "velocity map" else size)
-            error = np.abs(ours[name] - other).max() / scale
-            if not error <= TOLERANCE:
-                raise ModelError(
-                    f"{name} differs from the plant's own by {error:.1e} (relative) at "
-                    f"q = {state[0]}, v = {state[1]}; this is an error in drake_dae, please "
-                    "report the model"
-                )
+            scales = np.abs(mass).max(), np.abs(mass).max(), 1.0
+            own = function(*state, values)
+            for name, one, other, scale in zip(names, own, theirs, scales, strict=True):
+                if not np.all(np.isfinite(other)):
+                    raise ModelError(
+                        f"the plant's own {name} is not finite at q = {state[0]}: a joint has no "
+                        "mass to move; give each moving link mass and inertia, or weld it"
+                    )
+                error = np.abs(one - other).max() / max(np.abs(other).max(), scale)
+                if not error <= TOLERANCE:
+                    raise ModelError(
+                        f"{name} differs from the plant's own by {error:.1e} (relative) at "
+                        f"q = {state[0]}, v = {state[1]}; this is an error in drake_dae, please "
+                        "report the model"
+                    )
 
 
 @dataclass(frozen=True, eq=False)

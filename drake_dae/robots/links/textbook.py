@@ -108,8 +108,7 @@ class LinkExpressions(Links):
 
         self.position_limits = limits("position_limits", position_limits, nq)
         self.velocity_limits = limits("velocity_limits", velocity_limits, nv)
-        self.landmark_names = ("world", *self.frames)
-        self.outlines = tuple(Outline(name, name) for name in self.landmark_names)
+        self.outlines = tuple(Outline(name, name) for name in ("world", *self.frames))
 
     def rotation(self, frame: str) -> ca.SX:
         if frame == "world":

@@ -1,11 +1,10 @@
 """A tree of links, each with its own frame, its inertia and one elementary joint to its parent.
 
-Its algorithms (Featherstone, Rigid Body Dynamics Algorithms, 2008): the composite rigid body
-algorithm and the recursive Newton-Euler algorithm (chapters 5 and 6), in link frames, and the
-articulated-body algorithm (chapter 7). P is the frame of a link's parent, L its own, W the world's.
-Quantities of a link are expressed in L unless said otherwise. A link moves by one elementary joint,
-so that its rotation is sparse; a joint with several is a chain of links, of which the last carries
-the inertia.
+Its algorithms are the composite rigid body algorithm and the recursive Newton-Euler algorithm in
+link frames (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6). P is the frame
+of a link's parent, L its own, W the world's. Quantities of a link are expressed in L unless said
+otherwise. A link moves by one elementary joint, so that its rotation is sparse; a joint with
+several is a chain of links, of which the last carries the inertia.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,6 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.trace.factorization import Factors, by_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,123 +261,3 @@ def inverse_dynamics(
         moments[link.parent] += moment
         forces[link.parent] += force
     return tau
-
-
-def is_one_by_one(links: Sequence[TreeLink]) -> bool:
-    """Whether each link moves by one velocity of its own at most, as `ArticulatedBodies` need it.
-
-    A free body, a ball joint or a screw has links that share velocities.
-    """
-    moved = [[*link.turning, *link.shifting] for link in links]
-    owned = [index for indices in moved for index in indices]
-    return len(owned) == len(set(owned)) and all(len(indices) <= 1 for indices in moved)
-
-
-@dataclass(frozen=True, eq=False)
-class ArticulatedInertia:
-    """Moment J w + H a and force H' w + M a of a link's acceleration (w, a), at its origin."""
-
-    J: ca.SX
-    H: ca.SX
-    M: ca.SX
-
-    def __add__(self, other: "ArticulatedInertia") -> "ArticulatedInertia":
-        return ArticulatedInertia(self.J + other.J, self.H + other.H, self.M + other.M)
-
-    def to_parent(self, link: TreeLink) -> "ArticulatedInertia":
-        """The same inertia in the axes of the parent, at its origin."""
-        arm, coupling = ca.skew(link.offset), link.rotation @ self.H @ link.rotation.T
-        force = symmetric(link.to_parent_axes(self.M))
-        shifted = arm @ force
-        half = coupling @ arm.T
-        moment = link.to_parent_axes(self.J) + half + half.T + shifted @ arm.T
-        return ArticulatedInertia(symmetric(moment), coupling + shifted, force)
-
-
-class ArticulatedBodies(Factors):
-    """M = L D L' of a tree of links that move one by one.
-
-    By the articulated-body algorithm as a factorization (Jain, Robot and Multibody Dynamics, 2011,
-    chapter 7), with the articulated inertia I of each link, its joint axis S, U = I S and D = S' U
-    + rotor. L and its inverse are recursions along the tree: operations grow with the number of
-    links, those of a triangular factor with its square or cube.
-    """
-
-    def __init__(self, links: Sequence[TreeLink], rotors: FloatArray) -> None:
-        self._links = links
-        self._axes: list[list[tuple[int, ca.SX, ca.SX]]] = []
-        self._gains: list[tuple[ca.SX, ca.SX]] = [(ca.SX.zeros(3), ca.SX.zeros(3)) for _ in links]
-        self._sizes = ca.SX.zeros(len(rotors))
-        for link in links:
-            turns = [(j, direction, ca.SX.zeros(3)) for j, direction in link.turning.items()]
-            shifts = [
-                (j, ca.SX.zeros(3), link.rotation.T @ direction)
-                for j, direction in link.shifting.items()
-            ]
-            self._axes.append(turns + shifts)
-        bodies = [
-            ArticulatedInertia(
-                ca.trace(link.inertia.second) * ca.SX.eye(3) - link.inertia.second,
-                ca.skew(link.inertia.first),
-                link.inertia.mass * ca.SX.eye(3),
-            )
-            for link in links
-        ]
-        for index in range(len(links) - 1, 0, -1):
-            body = bodies[index]
-            for j, turn, shift in self._axes[index]:
-                moment, force = body.J @ turn + body.H @ shift, body.H.T @ turn + body.M @ shift
-                size = ca.dot(turn, moment) + ca.dot(shift, force) + rotors[j]
-                self._gains[index], self._sizes[j] = (moment, force), size
-                body = ArticulatedInertia(  # What remains where the joint is free.
-                    symmetric(body.J - moment @ moment.T / size),
-                    body.H - moment @ force.T / size,
-                    symmetric(body.M - force @ force.T / size),
-                )
-            parent = links[index].parent
-            if parent > 0:
-                bodies[parent] += body.to_parent(links[index])
-
-    def forward(self, right: ca.SX) -> ca.SX:
-        return by_columns(self._forward, right)
-
-    def scaled(self, half: ca.SX) -> ca.SX:
-        return half / ca.repmat(self._sizes, 1, half.shape[1])
-
-    def backward(self, half: ca.SX) -> ca.SX:
-        return by_columns(self._backward, half)
-
-    def _forward(self, tau: ca.SX) -> ca.SX:
-        """From the tips to the base."""
-        result = ca.densify(tau)
-        moments, forces = (
-            [ca.SX.zeros(3) for _ in self._links],
-            [ca.SX.zeros(3) for _ in self._links],
-        )
-        for index in range(len(self._links) - 1, 0, -1):
-            link, moment, force = self._links[index], moments[index], forces[index]
-            for j, turn, shift in self._axes[index]:
-                result[j] -= ca.dot(turn, moment) + ca.dot(shift, force)
-                along = result[j] / self._sizes[j]
-                gain = self._gains[index]
-                moment, force = moment + gain[0] * along, force + gain[1] * along
-            moment, force = link.force_to_parent(moment, force)
-            moments[link.parent] += moment
-            forces[link.parent] += force
-        return result
-
-    def _backward(self, half: ca.SX) -> ca.SX:
-        """From the base to the tips."""
-        result = ca.densify(half / self._sizes)
-        moving = [(ca.SX.zeros(3), ca.SX.zeros(3))]
-        for index, link in enumerate(self._links[1:], 1):
-            turning, shifting = moving[link.parent]
-            shifting = link.rotation.T @ (shifting + ca.cross(turning, link.offset))
-            turning = link.rotation.T @ turning
-            for j, turn, shift in self._axes[index]:
-                moment, force = self._gains[index]
-                carried = ca.dot(moment, turning) + ca.dot(force, shifting)
-                result[j] -= carried / self._sizes[j]
-                turning, shifting = turning + turn * result[j], shifting + shift * result[j]
-            moving.append((turning, shifting))
-        return result
