@@ -212,9 +212,7 @@ FAMILIES: dict[type, Family] = {
     Stage: _family(robots.FlexibleJoints, robots.DcMotors, robots.ElectrohydraulicServos),
     Reference: Family(_REFERENCES, float),
     Load: _family(robots.KnownForce, robots.JointFriction),
-    ScenarioPlant: _family(
-        IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
-    ),
+    ScenarioPlant: _family(IdealConstraints, plants.MultibodyPlant, plants.CompliantContact),
     parts.Gains: _family(parts.Poles, parts.Coefficients, parts.Matrices),
     phases.Phase: _family(
         phases.Approach, phases.Press, phases.Move, phases.Dwell, phases.Release, phases.Retreat

@@ -47,6 +47,8 @@ class DisturbanceForce:
     point: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if self.frame == "world":
+            raise ModelError("a disturbance on the world moves nothing; name a frame of the robot")
         positive("the rise of a disturbance", self.rise)
         start = number("the start_time of a disturbance", self.start_time)
         if self.end_time is not None and not self.end_time > start:
