@@ -127,9 +127,9 @@ def scene_points(
 ) -> FloatArray:
     """Points that enclose a robot and its contact points at some states, m, shape (k, 3)."""
     links, dae = model.links, model.dae
-    # The world's origin is not a part of the robot.
-    own = [k for k, name in enumerate(links.landmark_names) if name != "world"]
-    origins = links.landmarks()[:, own] if own else links.landmarks()
+    origins = links.landmarks()
+    if origins.shape[1] > 1:  # The world's origin is not a part of the robot.
+        origins = origins[:, 1:]
     inputs = {"q": links.q, "parameters": dae.parameter_symbol}
     landmarks = TracedFunction("landmarks", inputs, {"points": origins})
     no_force, points = np.zeros(len(dae.force_signals)), []
