@@ -43,7 +43,7 @@ from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import shipped_scenarios
 from drake_dae.scenario.typed_yaml import MOST_TEXT, TAG, dump_yaml, load_lines, load_yaml
-from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.control.drives import Sampling
 from drake_dae.systems.task import phases
 from drake_dae.trace.compiled import Compiled
 
@@ -212,9 +212,7 @@ FAMILIES: dict[type, Family] = {
     Stage: _family(robots.FlexibleJoints, robots.DcMotors, robots.ElectrohydraulicServos),
     Reference: Family(_REFERENCES, float),
     Load: _family(robots.KnownForce, robots.JointFriction),
-    ScenarioPlant: _family(
-        IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
-    ),
+    ScenarioPlant: _family(IdealConstraints, plants.MultibodyPlant, plants.CompliantContact),
     parts.Gains: _family(parts.Poles, parts.Coefficients, parts.Matrices),
     phases.Phase: _family(
         phases.Approach, phases.Press, phases.Move, phases.Dwell, phases.Release, phases.Retreat
@@ -235,15 +233,9 @@ _VALUES: dict[Any, Any] = {
 @cache
 def scenario_reader() -> Reader[Scenario]:
     """The reader and writer of scenarios as plain data."""
-    keys: dict[type, dict[str, Key]] = {
-        cls: {  # Points of paths are lists.
-            name: replace(key, hint=Annotated[Any, form.ROW]) if key.hint == ArrayLike else key
-            for name, key in keys_of(cls).items()
-        }
-        for cls in _REFERENCES.values()
-    }
-    start = keys[rs.PointToPointReference]["start_time"]
-    keys[rs.PointToPointReference]["start_time"] = replace(start, default=0.0)
+    move = dict(keys_of(rs.PointToPointReference))
+    move["start_time"] = replace(move["start_time"], default=0.0)
+    keys: dict[type, Mapping[str, Key]] = {rs.PointToPointReference: move}
     keys[SimulatorConfig] = {n: Key(type(v), v, text) for n, (v, text) in _INTEGRATOR.items()}
     return Reader(Scenario, FAMILIES, _VALUES, keys)
 

@@ -107,7 +107,7 @@ class Mender:
                     self.lost["inertia"].append(text)
                 self.tell("moments of inertia of no body become possible ones", text)
         for joint in root.iter("joint"):
-            self._mend_limits(joint, place(joint))
+            self._mend_limits(joint, kind, place(joint))
         if kind == ".urdf":
             self._mend_urdf(root, file, model, placed)
         elif kind == ".sdf":
@@ -125,8 +125,14 @@ class Mender:
     def tell(self, kind: str, item: str, category: type[Warning] = RobotFileWarning) -> None:
         self.told[category, kind].append(item)
 
-    def _mend_limits(self, joint: Element, place: str) -> None:
+    def _mend_limits(self, joint: Element, kind: str, place: str) -> None:
         """Removes limits that Drake refuses, and those of joints that have none."""
+        # Drake damps no free body, and limits no ball joint.
+        own = {"free": "damping", "ball": "range"} if kind == ".xml" else {}
+        part = own.get(joint.get("type", ""), "")
+        values = [number_in(word) for word in joint.attrib.pop(part, "").split()]
+        if any(values) and (part == "damping" or joint.get("limited") != "false"):
+            self.lost[f"joint/{part}"].append(place)
         is_continuous = joint.get("type") == "continuous"
         for owner in (joint, *(joint.find(way) for way in ("limit", "axis/limit", "axis2/limit"))):
             if owner is None:

@@ -40,7 +40,6 @@ RobotLinks = tuple[MultibodyExpressions, list[Constraint]]
 """The links of a robot, and its loop-closing joints as constraints."""
 
 _REMEDIES = {
-    "inertia": "it takes the nearest possible moments of inertia",
     "friction": "robot.known_forces has friction as a !JointFriction",
     "mimic": "constraints has joints that move together as a !JointCoupler",
     "equality/joint": "constraints has joints that move together as a !JointCoupler",
@@ -214,6 +213,7 @@ def _told(lost: Mapping[str, list[str]]) -> str:
     """The message for what Drake does not read of the files."""
     text = "; ".join(f"{part} ({_listed(places)})" for part, places in lost.items())
     ways = [f"leave_out: [{', '.join(lost)}] under robot"]
+    ways += ["it takes the nearest possible moments of inertia"] if "inertia" in lost else []
     ways += [hint for word, hint in _REMEDIES.items() if any(word in part for part in lost)]
     if any(part.startswith(DRIVES) for part in lost):
         ways.append("or name the driven joints under robot.actuators")
