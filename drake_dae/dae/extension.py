@@ -79,22 +79,7 @@ def extend(
     integrators: Mapping[str, int] | Sequence[str],
     nominal_control: Mapping[str, float] | None = None,
 ) -> DaeSystem:
-    """Puts integrators before controls: u_i, u_i', ... become states, the next one the control.
-
-    Constraints, outputs, parameters and mass matrix do not change, and the degrees r_i neither if
-    Assumption (3) holds. If it is violated, since u_i acts on a derivative of a constraint before
-    any constraint input does, integrators repair it: the constraint then restricts the state u_i.
-
-    Args:
-        system: The system (1)-(3).
-        integrators: Name of a control -> number of integrators; or names, for one each.
-        nominal_control: Values of controls at the nominal state, for the integrators that hold
-            them; zero where not given. B(x) is often singular at zero.
-
-    Raises:
-        ModelError: A control is unknown, a number of integrators is below 1, or the system has a
-            `control_metric`.
-    """
+    """Puts integrators before controls: u_i, u_i', ... become states, the next one the control."""
     _refuse_metric(system)
     if not isinstance(integrators, Mapping):
         integrators = dict.fromkeys(integrators, 1)
@@ -204,10 +189,7 @@ class _Chain:
         return ", ".join(f"{count} before {name}" for name, count in self.integrators.items())
 
     def near_nominal(self) -> DaeSystem:
-        """The system with a nominal state at which no sine is accidentally zero.
-
-        Rows of B(x) may vanish accidentally there, as sin(heading) does at heading 0.
-        """
+        """The system with a nominal state at which no sine is accidentally zero."""
         random = np.random.default_rng(0)
         step = 0.1 * self.spread * random.standard_normal(self.system.num_states)
         nominal = self.system.nominal_state + step

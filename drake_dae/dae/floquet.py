@@ -141,10 +141,7 @@ class PeriodicMotions:
         return projected
 
     def _close(self, state: FloatArray, begin: float) -> tuple[FloatArray, FloatArray]:
-        """Returns the start of the periodic motion near a state, and M.
-
-        Newton's method for the distance from the start after a period, along the tangent space.
-        """
+        """Returns the start of the periodic motion near a state, and M."""
         for _ in range(NEWTON_STEPS):
             basis = tangent(self._at(begin).gradients(state), self._scale)
             later, columns = self._carry(state, basis, begin)

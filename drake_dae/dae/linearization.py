@@ -49,16 +49,7 @@ class LinearModel:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """The linear models of one system at one state and input.
-
-    Attributes:
-        descriptor: In x and v, with the constraints as rows of E without a derivative.
-        minimal: In the n - sum r_i states that are coordinates of N*.
-        index: The index of the DAE.
-        coordinates: The indices of these states.
-        basis: The derivatives of all states by them, shape (n, n - sum r_i).
-        state, rate, control, constraint_input: x, x', u and v where it is linearized.
-    """
+    """The linear models of one system at one state and input."""
 
     descriptor: LinearModel
     minimal: LinearModel
@@ -111,23 +102,7 @@ def linearize_loop(
     *,
     parameters: ArrayLike | None = None,
 ) -> Linearization:
-    """Linearizes a plant under the law (28), from R to the controlled outputs z.
-
-    All entries of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) are inputs of their own. With r_i^(j)
-    = s^j r_i the transfer matrix is the identity if the plant is the model of the law.
-
-    Args:
-        law: The law.
-        reference: R, shape (sum (mu_i + 1),).
-        state: x on N*, shape (n,); the nominal consistent state if None.
-        parameters: Values of the plant's parameters; the defaults if None. The law has its own,
-            the defaults.
-
-    Raises:
-        InconsistentStateError: The state is not on N*.
-        ModelError: A shape is wrong, a number is not finite, or A(x) or B(x) is singular at the
-            state; or the force that the law measures is not determined.
-    """
+    """Linearizes a plant under the law (28), from R to the controlled outputs z."""
     if law.integral.outputs:
         raise ModelError(
             f"{law.system.name}: a law with integral action has a state, which this function does "

@@ -84,11 +84,7 @@ class Manifold:
 
     @cached_property
     def short_gradient(self) -> ca.SX:
-        """`gradient`, in fewer operations where constraint forces are along the gradients.
-
-        Where q' = v, the forces g' are dk/dq, and the gradient of k' = (dk/dq) v is the derivative
-        of dk/dq along v beside dk/dq.
-        """
+        """`gradient`, in fewer operations where constraint forces are along the gradients."""
         system = self.system
         if set(self.layout.degrees) != {2}:
             return self.gradient
@@ -108,10 +104,7 @@ class Manifold:
 
     @cached_property
     def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, divided by the scale of the states.
-
-        A function of the state, a second state at which the gradients are taken, and parameters.
-        """
+        """The Newton step of least norm from a state, divided by the scale of the states."""
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(self.short_gradient, state, other)
         step = _shortest_step(gradient, ca.SX(self.scale))[0](self.residual_expression)
@@ -119,12 +112,7 @@ class Manifold:
         return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
 
     def _trace_first_steps(self) -> TracedFunction:
-        """Traces the first Newton steps from a state, all with the gradients at that state.
-
-        The outputs are the outcome of `_followed` and the lengths of the steps (in states over
-        their scale), the state that they reach, and the first step. The result is not valid where
-        gradients are nearly dependent, by their usual lengths.
-        """
+        """Traces the first Newton steps from a state, all with the gradients at that state."""
         system = self.system
         usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
         usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
@@ -167,11 +155,7 @@ class Manifold:
         return self._relative_size(x, p) <= CONSISTENT
 
     def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Returns the consistent state next to a state, to round-off, by Newton's method.
-
-        Raises:
-            InconsistentStateError: Newton's method does not reach N*.
-        """
+        """Returns the consistent state next to a state, to round-off, by Newton's method."""
         start, p = self._state(state), self.system.parameter_vector(parameters)
         found = self.projected(start, p)
         if self._is_at_pole(found, p):
@@ -187,11 +171,7 @@ class Manifold:
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
-        """Whether the residual is large though Newton's step is short.
-
-        Near a pole the step is the distance to it. The residual then falls along the step, while it
-        grows from a consistent state, whose own is round-off.
-        """
+        """Whether the residual is large though Newton's step is short."""
         step = self._first_steps.evaluate(x, p)[2]
         length = norm(step / self.scale)
         if not (isfinite(length) and length > 0.0):
@@ -277,23 +257,7 @@ class Manifold:
         parameters: ArrayLike | None = None,
         fixed: Sequence[str] = (),
     ) -> FloatArray:
-        """Returns the consistent state next to a user's start, computed level by level.
-
-        The constraints are met first, by the states that they depend on; then their derivatives, by
-        the states that are new in them, and so on: positions first, then velocities, so that no
-        velocity moves a position. Velocities that are not zero are kept where the constraints allow
-        it, and the others follow. If Newton's method does not reach N*, it starts again from random
-        states, at first near the given one.
-
-        Args:
-            state: A state near N*, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-            fixed: Names of states that keep their values.
-
-        Raises:
-            InconsistentStateError: N* is not reached, or not with these states fixed.
-            ModelError: There is no such state, or a shape is wrong.
-        """
+        """Returns the consistent state next to a user's start, computed level by level."""
         start, p = self._state(state), self.system.parameter_vector(parameters)
         names = [signal.name for signal in self.system.state_signals]
         for name in fixed:
@@ -371,12 +335,7 @@ def _followed(
 def _shortest_step(
     gradient: ca.SX, scale: ca.SX
 ) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
-    """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
-
-    It is -(C S)' N^-1 residual with N = C S (C S)', each row by its largest entry. An error of N^-1
-    grows with the square of the condition of C, and only makes Newton's method slower. The lengths
-    of the parts of the gradients that are orthogonal to those before are returned as well.
-    """
+    """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale."""
     if not gradient.shape[0]:
         return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
     scaled = ca.mtimes(gradient, ca.diag(scale))
@@ -398,10 +357,7 @@ def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
 
 
 def coordinates(gradients: FloatArray, scale: FloatArray) -> tuple[Indices, FloatArray]:
-    """Returns n - k states that are coordinates, and the derivatives of all states by them.
-
-    Unlike an orthonormal basis this one leaves a triangular system triangular.
-    """
+    """Returns n - k states that are coordinates, and the derivatives of all states by them."""
     basis = tangent(gradients, scale) / scale[:, None]
     count = basis.shape[1]
     free = np.sort(scipy.linalg.qr(basis.T, mode="r", pivoting=True)[1][:count])

@@ -12,7 +12,7 @@ from drake_dae.arrays import FloatArray, listed, show, vector
 from drake_dae.dae.margins import RankMargin, find_margin
 from drake_dae.dae.samples import Samples
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.expressions import find_flaw
@@ -70,7 +70,7 @@ class NormalForm:
         *,
         structure: Structure | None = None,
     ) -> None:
-        structure = structure_of("NormalForm", system, structure)
+        structure = structure_of("NormalForm", system, structure, find_structure)
         self.structure = structure
         self.system = system
         residual = structure.manifold.residual_expression
@@ -279,11 +279,7 @@ def _signal_of(expression: ca.SX, name: str, system: DaeSystem) -> Signal:
 
 
 def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
-    """Single states whose differentials complete those of the chains, or else linear combinations.
-
-    They complete them if they are regular on the null spaces of the chains' differentials. The
-    arguments are those of `_checked_completion`.
-    """
+    """Single states whose differentials complete those of the chains, or else combinations."""
     system, count = structure.system, structure.zero_dynamics_dimension
     if not count:
         return _checked_completion(structure, chains, samples, ca.SX(0, 1))

@@ -52,10 +52,7 @@ class EndCause(Enum):
 
 @dataclass(frozen=True, eq=False)
 class MotionEnd:
-    """The end of a motion with pinned outputs: its cause, time in s, text and last state.
-
-    `matrix` is the matrix that loses its rank, "A" or "B"; empty if none does.
-    """
+    """The end of a motion with pinned outputs: its cause, time in s, text and last state."""
 
     cause: EndCause
     time: float
@@ -69,16 +66,7 @@ class MotionEnd:
 
 @dataclass(frozen=True, eq=False)
 class PinnedMotion:
-    """The motion with the outputs on a reference, until the last time or until it ends.
-
-    Attributes:
-        times: The times in s, shape (k,).
-        states, controls, constraint_inputs, parameters: x, u, v and the values of all parameters,
-            shapes (k, n), (k, p), (k, m), ...
-        constraint_margins, control_margins: The smallest singular values of A(x) and B(x), shape
-            (k,).
-        ending: Why it ends before the last time; None if it does not.
-    """
+    """The motion with the outputs on a reference, until the last time or until it ends."""
 
     times: FloatArray
     states: FloatArray

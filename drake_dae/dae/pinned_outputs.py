@@ -28,10 +28,7 @@ number."""
 
 @dataclass(frozen=True, eq=False)
 class PinnedPoint:
-    """A state on Z(R) with x', u, v, A of Assumption (2) and B of (5), which may be infinite.
-
-    `pivot` is 0 exactly where A or B is singular; `unrest` is |E x'| relative to its terms.
-    """
+    """A state on Z(R) with x', u, v, A of Assumption (2) and B of (5), which may be infinite."""
 
     state: FloatArray
     rate: FloatArray

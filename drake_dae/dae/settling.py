@@ -111,11 +111,7 @@ def _groups(system: DaeSystem, count: int) -> list[Indices]:
 
 
 class Settling:
-    """Newton's method on each order of derivatives, by the states that are new in it.
-
-    Where constraint forces do no work, as in a mechanism, its steps take the least kinetic energy,
-    see `KineticMetric`; else they are shortest relative to the scale of the states.
-    """
+    """Newton's method on each order of derivatives, by the states that are new in it."""
 
     def __init__(
         self,
@@ -147,10 +143,7 @@ class Settling:
         return self._levels[0][1] if self._levels else np.zeros(0, dtype=np.intp)
 
     def given_rates(self, start: FloatArray) -> Indices:
-        """The states that are new in derivatives of constraints, as velocities, where some are 0.
-
-        Those that are not 0 are given, and the others may follow.
-        """
+        """The states that are new in derivatives of constraints and not 0, where others are 0."""
         found = [np.zeros(0, dtype=np.intp)]
         for _, columns in self._levels[1:]:
             given = columns[start[columns] != 0.0]

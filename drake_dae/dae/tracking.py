@@ -14,7 +14,7 @@ from drake_dae.dae.gains import FeedbackGains, GainDesign
 from drake_dae.dae.law_model import damped
 from drake_dae.dae.law_terms import Deflection, ForceMeasurement, IntegralAction
 from drake_dae.dae.signals import DerivativeLayout, Signal
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
 from drake_dae.trace.expressions import result_of
@@ -76,7 +76,7 @@ class TrackingLaw:
         contact_stiffness: float | None = None,
         latency: float = 0.0,
     ) -> None:
-        self.structure = structure_of("TrackingLaw", system, structure)
+        self.structure = structure_of("TrackingLaw", system, structure, find_structure)
         self.damped_structure = damped(self.structure, constraint_damping, latency)
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()

@@ -28,7 +28,7 @@ from drake_dae.dae.equilibria import (
 from drake_dae.dae.floquet import PeriodicMotions, StabilityAlong
 from drake_dae.dae.pinned_motion import PinnedMotion, TimeFunction, follow
 from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedSet
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 
@@ -60,7 +60,7 @@ class ZeroDynamics:
     """
 
     def __init__(self, system: DaeSystem, *, structure: Structure | None = None) -> None:
-        self.structure = structure = structure_of("ZeroDynamics", system, structure)
+        self.structure = structure = structure_of("ZeroDynamics", system, structure, find_structure)
         self.system = system
         self.dimension = structure.zero_dynamics_dimension
         self._pinned = PinnedOutputs(structure)
