@@ -13,7 +13,6 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from functools import cache, cached_property
 from pathlib import Path
-from sys import float_info
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -34,7 +33,7 @@ from typing_extensions import TypedDict
 
 from drake_dae.arrays import brief
 from drake_dae.errors import DrakeDaeError, ScenarioError
-from drake_dae.scenario.typed_yaml import TAG
+from drake_dae.scenario.typed_yaml import TAG, first_name
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -88,111 +87,66 @@ class Key:
 
 
 @dataclass(frozen=True, eq=False)
-class Value:
-    """Annotates values that a function of value and folder converts; None where it is wrong.
+class Expected:
+    """Annotates data like a hint, of which `convert` makes a value; `words` answer all other data.
 
-    `words` say what is expected, as `schema` does.
+    `convert` takes the data and, as a second argument if it has one, pydantic's information, whose
+    context is the folder of the file.
     """
 
     words: str
-    schema: Mapping[str, Any]
-    convert: Callable[[Any, Path], Any]
+    hint: Any
+    convert: Callable[..., Any] = lambda value: value
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: pydantic.GetCoreSchemaHandler
     ) -> core_schema.CoreSchema:
-        return core_schema.with_info_plain_validator_function(self._read)
+        more = pydantic.AfterValidator(self.convert), pydantic.WrapValidator(self._read)
+        return handler.generate_schema(_annotated(self.hint, *more))
 
-    def __get_pydantic_json_schema__(
-        self, source: Any, handler: pydantic.GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        return dict(self.schema)
-
-    def _read(self, value: Any, info: core_schema.ValidationInfo) -> Any:
-        converted = self.convert(value, info.context or Path())
-        if converted is None:
-            raise ValueError(f"expected {self.words}, got {_shown(value)}")
-        return converted
+    def _read(self, value: Any, inner: pydantic.ValidatorFunctionWrapHandler) -> Any:
+        try:
+            return inner(value)
+        except pydantic.ValidationError:
+            raise ValueError(f"expected {self.words}, got {_shown(value)}") from None
 
 
-def _are_numbers(values: Any) -> bool:
-    return all(type(v) in (int, float) and abs(v) <= float_info.max for v in values)
-
-
-def _vector(value: Any, size: int) -> Any:
-    is_right = isinstance(value, (list, tuple)) and _are_numbers(value)
-    return tuple(map(float, value)) if is_right and len(value) == (size or len(value)) else None
-
-
-def _numbers(value: Any) -> Any:
+def _rectangular(value: Any) -> Any:
     rows = value if isinstance(value, list) else [value]
-    is_matrix = bool(rows) and all(isinstance(row, list) for row in rows)
-    entries = [entry for row in rows for entry in row] if is_matrix else rows
-    if not entries or not _are_numbers(entries):
-        return None
-    if is_matrix and len({len(row) for row in rows}) > 1:
-        return None
-    numbers = np.array(value, dtype=float)
-    return numbers.tolist() if numbers.size > 1 else numbers.item()
+    if not rows or len({len(row) if isinstance(row, list) else -1 for row in rows}) > 1:
+        raise ValueError
+    return value
 
 
-def _number_or_list(value: Any) -> Any:
-    return value if _are_numbers(value if isinstance(value, list) else [value]) else None
-
-
-def _interval(value: Any) -> Any:
-    is_pair = isinstance(value, (list, tuple)) and len(value) == 2
-    return tuple(value) if is_pair and all(_number_or_list(v) is not None for v in value) else None
-
-
-def in_folder(value: Any, folder: Path) -> str | None:
-    """The path of a file, relative to a folder; None if it is no name of a file."""
-    if not isinstance(value, (str, Path)) or not str(value) or "\0" in str(value):
-        return None
+def in_folder(name: str, info: pydantic.ValidationInfo) -> str:
+    """The path of a file, relative to a folder."""
+    if not name or "\0" in name:
+        raise ValueError
     try:
-        return str((folder / value).resolve())
+        return str(((info.context or Path()) / name).resolve())
     except (OSError, RuntimeError):  # A link that leads to itself; no working directory.
-        return None
+        raise ValueError from None
 
 
-def _names(value: Any) -> Any:
-    names = value if isinstance(value, list) else [value]
-    return value if all(isinstance(name, str) for name in names) else None
+def _fixed(size: int) -> Expected:
+    length = pydantic.Field(min_length=size, max_length=size)
+    return Expected(f"{size} numbers", Annotated[list[float], length], tuple)
 
 
-_NUMBER: dict[str, Any] = {"type": "number"}
-_LIST: dict[str, Any] = {"type": "array", "items": _NUMBER}
-_TEXT: dict[str, Any] = {"type": "string"}
-
-
-def _fixed(size: int) -> Value:
-    schema = {**_LIST, "minItems": size, "maxItems": size}
-    return Value(f"{size} numbers", schema, lambda value, folder: _vector(value, size))
-
-
-NUMBERS = Value(
-    "a number, a list of numbers, or a matrix as a list of rows of one length",
-    {"anyOf": [_NUMBER, _LIST, {"type": "array", "items": _LIST}]},
-    lambda value, folder: _numbers(value),
-)
-ROW = Value("a list of numbers", _LIST, lambda value, folder: _vector(value, 0))
 PAIR, TRIPLE = _fixed(2), _fixed(3)
-NUMBER_OR_LIST = Value(
-    "a number or a list of numbers",
-    {"anyOf": [_NUMBER, _LIST]},
-    lambda value, folder: _number_or_list(value),
+NUMBERS = Expected(
+    "a number, a list of numbers, or a matrix as a list of rows of one length",
+    float | list[float] | list[list[float]],
+    _rectangular,
 )
-INTERVAL = Value(
+NUMBER_OR_LIST = Expected("a number or a list of numbers", float | list[float])
+INTERVAL = Expected(
     "a lowest and a highest value, each a number or a list of numbers",
-    {"type": "array", "minItems": 2, "maxItems": 2, "items": {"anyOf": [_NUMBER, _LIST]}},
-    lambda value, folder: _interval(value),
+    Annotated[list[float | list[float]], pydantic.Field(min_length=2, max_length=2)],
+    tuple,
 )
-FILE = Value("the name of a file", _TEXT, in_folder)
-NAMES = Value(
-    "a name or a list of names",
-    {"anyOf": [_TEXT, {"type": "array", "items": _TEXT}]},
-    lambda value, folder: _names(value),
-)
+FILE = Expected("the name of a file", str, in_folder)
+NAMES = Expected("a name or a list of names", str | list[str])
 
 
 def _shown(data: Any) -> str:
@@ -216,18 +170,22 @@ _WORDS = {
 
 
 class Reader(Generic[T]):
-    """Makes a dataclass of plain data, and plain data of it."""
+    """Makes a dataclass of plain data, and plain data of it.
+
+    `families` and `values` are what stands in data for types in annotations; `keys` are those of
+    classes that are no dataclasses, or have other keys than their fields.
+    """
 
     def __init__(
         self,
         form: type[T],
-        families: Mapping[Any, Family] | None = None,
-        values: Mapping[Any, Any] | None = None,
-        keys: Mapping[type, Mapping[str, Key]] | None = None,
+        families: Mapping[Any, Family],
+        values: Mapping[Any, Any],
+        keys: Mapping[type, Mapping[str, Key]],
     ) -> None:
-        self._form, self._families, self._values = form, families or {}, values or {}
-        self._keys, self._types = keys or {}, dict[Any, Any]()
-        self._tags = {c: t for f in self._families.values() for t, c in f.members.items()}
+        self._form, self._families, self._values, self._keys = form, families, values, keys
+        self._types = dict[Any, Any]()
+        self._tags = {c: t for f in families.values() for t, c in f.members.items()}
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(self._type(form))
 
     @cached_property
@@ -260,9 +218,9 @@ class Reader(Generic[T]):
 
     def write(self, value: Any) -> Any:
         """Plain data that read as this value: of a form the keys that differ from the defaults."""
-        if type(value) in self._keys or is_dataclass(value):
+        if self._is_form(type(value)):
             data = {TAG: self._tags[type(value)]} if type(value) in self._tags else {}
-            for name, key in self.keys_of(type(value)).items():
+            for name, key in self._keys_of(type(value)).items():
                 written = self.write(getattr(value, name))
                 if key.default is MISSING or written != self.write(key.default):
                     data[name] = written
@@ -277,34 +235,32 @@ class Reader(Generic[T]):
 
     def put(self, data: Any, key: str, value: Any) -> None:
         """Sets an entry of plain data at a dotted key, in place; chosen names may have dots too."""
-        parts, path, hint = key.split("."), "", self._form
-        if not all(parts):
+        if not all(key.split(".")):
             raise ScenarioError((brief(key), "expected a dotted key, for example start.errors"))
-        while True:
-            has_names = get_origin(_only(hint)) in (dict, Mapping)
-            count = _name_length(data, parts) if has_names else 1
-            slot: Any = ".".join(parts[:count])
+        path, rest, hint = "", key, self._form
+        while rest:
+            slot: Any = rest.partition(".")[0]
             if isinstance(data, list):
                 if not (slot.isascii() and slot.isdecimal() and int(slot) < len(data)):
                     indices = ", ".join(map(str, range(len(data)))) or "none"
                     raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
-                slot = int(slot)
             elif not isinstance(data, dict):
                 raise ScenarioError((path, f"{brief(data)} has no entry '{slot}'"))
-            parts = parts[count:]
-            if not parts:
-                data[slot] = value
-                return
+            elif get_origin(_only(hint)) in (dict, Mapping):
+                inner = [name for name in data if isinstance(data[name], (dict, list))]
+                slot = first_name(inner, rest) or rest
+            rest, path = rest[len(slot) + 1 :], f"{path}.{slot}".lstrip(".")
             if (family := self._family(hint)) is not None:
                 hint = family.members.get(family.tag_of(data) or "")  # type: ignore[assignment]
             hint = self._inside(hint, slot)
-            path = f"{path}.{slot}" if path else str(slot)
-            if isinstance(data, dict) and data.get(slot) is None:
+            slot = int(slot) if isinstance(data, list) else slot
+            if not rest:
+                data[slot] = value
+            elif isinstance(data, dict) and data.get(slot) is None:
                 data[slot] = {}
             data = data[slot]
 
-    def keys_of(self, form: type) -> Mapping[str, Key]:
-        """The keys of a form."""
+    def _keys_of(self, form: type) -> Mapping[str, Key]:
         return self._keys.get(form) or keys_of(form)
 
     def _family(self, hint: Any) -> Family | None:
@@ -316,10 +272,9 @@ class Reader(Generic[T]):
 
     def _type(self, hint: Any) -> Any:
         """The pydantic type of data for an annotation."""
-        if get_origin(hint) is Annotated:
-            inner, *more = get_args(hint)
-            return _annotated(self._type(inner), *more)
-        members = _members(hint)
+        origin, parts, members = get_origin(hint), get_args(hint), _members(hint)
+        if origin is Annotated:
+            return _annotated(self._type(parts[0]), *parts[1:])
         value = next((v for base, v in self._values.items() if _members(base) <= members), None)
         if value is None and (family := self._family(hint)) is not None:
             if id(family) not in self._types:
@@ -331,7 +286,6 @@ class Reader(Generic[T]):
             if hint not in self._types:
                 self._types[hint] = self._data(hint)
             return self._types[hint]
-        origin, parts = get_origin(hint), get_args(hint)
         if origin in (Union, UnionType):
             return Union[tuple(self._type(part) for part in parts)]  # noqa: UP007
         if origin in (list, Sequence):
@@ -343,7 +297,7 @@ class Reader(Generic[T]):
     def _data(self, form: type) -> Any:
         """The type of the data of a form."""
         entries: dict[str, Any] = {}
-        for name, key in self.keys_of(form).items():
+        for name, key in self._keys_of(form).items():
             more = {} if key.default is MISSING else {"default": self.write(key.default)}
             about = pydantic.Field(description=key.text or None, json_schema_extra=more)
             entry = _annotated(self._type(key.hint), about)
@@ -375,44 +329,44 @@ class Reader(Generic[T]):
             return family.members.get(str(part))
         hint = _only(hint)
         if self._is_form(hint):
-            key = self.keys_of(hint).get(str(part))
+            key = self._keys_of(hint).get(str(part))
             return None if key is None else key.hint
         return (get_args(hint) or [None])[-1]
 
     def _problem(self, error: ErrorDetails, data: Any) -> tuple[str, str, str]:
         """The dotted key of a problem, its text, and the key at whose place it is."""
         loc, kind, value = error["loc"], error["type"], error["input"]
-        last = str(loc[-1]) if TAG in loc or kind in ("missing", "extra_forbidden") else ""
+        is_key = kind in ("missing", "extra_forbidden")
+        count = loc.index(TAG) if TAG in loc else len(loc) - is_key
         hint, keys, tag, tags = self._form, list[str](), "", ""
-        for part in loc[: loc.index(TAG)] if TAG in loc else loc[:-1] if last else loc:
+        for part in loc[:count]:
             family, hint = self._family(hint), self._inside(hint, part)
             if family is None:
                 keys, data, tag, tags = [*keys, str(part)], data[part], "", ""
             else:
                 tag, tags = f"{part} ", ", ".join(family.members)
-        key, form = ".".join(keys), _only(hint)
-        names = list(self.keys_of(form)) if self._is_form(form) else []
+        key, place, form = ".".join(keys), ".".join(keys), _only(hint)
+        names = list(self._keys_of(form)) if self._is_form(form) else []
         listed = f"keys: {', '.join(names) or 'none'}"
         if tag and isinstance(data, dict) and TAG not in data:
             listed += f". No tag is given; there are {tags}"
-        place = key
         if TAG in loc:
             text = f"takes no tag, got {data[TAG]}"
         elif kind == "missing":
-            text = f"{tag}needs the key '{last}'; {listed}"
+            text = f"{tag}needs the key '{loc[-1]}'; {listed}"
         elif kind == "extra_forbidden":
-            near = get_close_matches(last, names, n=1)
+            near = get_close_matches(str(loc[-1]), names, n=1)
             listed = f"did you mean '{near[0]}'?" if near else listed
-            text, place = f"{tag}has no key '{last}'; {listed}", ".".join([*keys, last])
+            text, place = f"{tag}has no key '{loc[-1]}'; {listed}", ".".join([*keys, str(loc[-1])])
         elif kind == "value_error":
             text = str(error["ctx"]["error"])
         elif (family := self._family(hint)) is not None:
             also = {str: "text, or ", float: "a number, or "}.get(family.plain or list, "")
             text = f"expected {also}one of {', '.join(family.members)}, got {_shown(value)}"
         else:
-            expected = _WORDS.get(kind, error["msg"].removeprefix("Input should be "))
-            expected = listed if kind == "dict_type" and names else expected
-            text = f"expected {expected}, got {_shown(value)}"
+            words = _WORDS.get(kind, error["msg"].removeprefix("Input should be "))
+            words = listed if kind == "dict_type" and names else words
+            text = f"expected {words}, got {_shown(value)}"
             if kind == "string_type" and isinstance(value, (bool, int, float)):
                 text += "; text that reads as something else goes in quotes"
         return key or "scenario", text, place
@@ -430,31 +384,19 @@ def _members(hint: Any) -> set[Any]:
 
 
 def _only(hint: Any) -> Any:
-    """An annotation without None and without what is said about it."""
-    while get_origin(hint) is Annotated or NoneType in _members(hint):
-        if get_origin(hint) is Annotated:
-            hint = get_args(hint)[0]
-        else:
-            rest = [*(_members(hint) - {NoneType})]
-            hint = rest[0] if len(rest) == 1 else None
-            if hint is None:
-                return None
-    return hint
-
-
-def _name_length(data: Any, parts: Sequence[str]) -> int:
-    """The number of parts of a dotted key that form a name with dots."""
-    for count in range(len(parts), 0, -1) if isinstance(data, dict) else ():
-        name = ".".join(parts[:count])
-        if name in data and (count == len(parts) or isinstance(data[name], (dict, list))):
-            return count
-    return len(parts)
+    """An annotation without None and without what is said about it; None for several types."""
+    while get_origin(hint) is Annotated:
+        hint = get_args(hint)[0]
+    if NoneType not in (members := _members(hint)):
+        return hint
+    rest = [*(members - {NoneType})]
+    return _only(rest[0]) if len(rest) == 1 else None
 
 
 @cache
 def keys_of(form: type) -> Mapping[str, Key]:
     """The keys of a dataclass: the fields that its constructor takes."""
-    hints, texts = get_type_hints(form, include_extras=True), attribute_texts(form)
+    hints, texts = get_type_hints(form, include_extras=True), _attribute_texts(form)
     return {
         item.name: Key(
             hints[item.name],
@@ -466,14 +408,13 @@ def keys_of(form: type) -> Mapping[str, Key]:
     }
 
 
-@cache
 def introduction(docstring: str) -> str:
     """A docstring up to its first section, such as "Attributes:"."""
     text = inspect.cleandoc(docstring)
     return re.split(r"^\w+:$", text, maxsplit=1, flags=re.MULTILINE)[0].strip()
 
 
-def attribute_texts(source: type) -> dict[str, str]:
+def _attribute_texts(source: type) -> dict[str, str]:
     """Name of an attribute -> its text in the docstring of the class or of one of its bases."""
     found: dict[str, str] = {}
     for cls in reversed(source.__mro__):

@@ -235,15 +235,9 @@ _VALUES: dict[Any, Any] = {
 @cache
 def scenario_reader() -> Reader[Scenario]:
     """The reader and writer of scenarios as plain data."""
-    keys: dict[type, dict[str, Key]] = {
-        cls: {  # Points of paths are lists.
-            name: replace(key, hint=Annotated[Any, form.ROW]) if key.hint == ArrayLike else key
-            for name, key in keys_of(cls).items()
-        }
-        for cls in _REFERENCES.values()
-    }
-    start = keys[rs.PointToPointReference]["start_time"]
-    keys[rs.PointToPointReference]["start_time"] = replace(start, default=0.0)
+    move = dict(keys_of(rs.PointToPointReference))
+    move["start_time"] = replace(move["start_time"], default=0.0)
+    keys: dict[type, Mapping[str, Key]] = {rs.PointToPointReference: move}
     keys[SimulatorConfig] = {n: Key(type(v), v, text) for n, (v, text) in _INTEGRATOR.items()}
     return Reader(Scenario, FAMILIES, _VALUES, keys)
 

@@ -1,7 +1,7 @@
 """YAML as plain data and back, where a tag `!Sphere` is an entry "_tag" as Drake has it."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
 
 import yaml  # type: ignore[import-untyped]
@@ -12,10 +12,6 @@ from drake_dae.errors import ScenarioError
 TAG = "_tag"
 """The key under which a mapping holds its tag."""
 
-
-_REDEFINED = ("int", "float", "timestamp")
-"""The types of YAML 1.1 whose forms are replaced below."""
-
 MOST_VALUES, MOST_TEXT = 100_000, 1_000_000
 """The limits of a file; an alias counts as often as it is used. Shipped scenarios have 200 values
 in 4,000 characters."""
@@ -24,47 +20,47 @@ in 4,000 characters."""
 class _Loader(yaml.SafeLoader):
     """YAML 1.1 with numbers as in JSON, unique text keys, and tags."""
 
-    yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, form) for tag, form in resolvers if tag.rpartition(":")[2] not in _REDEFINED]
+    yaml_implicit_resolvers: ClassVar = {  # Without the types whose forms are replaced below.
+        first: [
+            (tag, form)
+            for tag, form in resolvers
+            if tag.rpartition(":")[2] not in ("int", "float", "timestamp")
+        ]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
     def get_single_node(self) -> yaml.Node | None:
         node = super().get_single_node()
         if node is not None:
-            self._check_size(node, {})
+            self._count(node, {})
         return node
 
-    def _check_size(self, node: yaml.Node, sizes: dict[int, int]) -> int:
-        """Counts the values of a node, at most `MOST_VALUES`."""
-        if id(node) not in sizes:
-            sizes[id(node)] = MOST_VALUES  # For an alias inside itself.
-            parts = node.value if isinstance(node, yaml.CollectionNode) else []
-            if isinstance(node, yaml.MappingNode):
-                parts = [part for pair in parts for part in pair]
-            size = 1 + sum(self._check_size(part, sizes) for part in parts)
-            if size > MOST_VALUES:
-                text = f"more than {MOST_VALUES} values, counting aliases as often as they are used"
+    def _count(self, node: yaml.Node, counts: dict[int, int]) -> int:
+        """The number of values of a node, whose keys and texts are checked."""
+        if id(node) in counts:
+            return counts[id(node)]
+        counts[id(node)] = MOST_VALUES  # For an alias inside itself.
+        parts = node.value
+        if isinstance(node, yaml.ScalarNode):
+            parts = []
+            if not can_be_written(node.value):
+                text = "the text has half of a letter (\\ud800 to \\udfff), which no file can hold"
                 raise self._error(text, node)
-            sizes[id(node)] = size
-        return sizes[id(node)]
-
-    def construct_scalar(self, node: yaml.ScalarNode) -> Any:
-        value = super().construct_scalar(node)
-        if not can_be_written(value):
-            text = "the text has half of a letter (\\ud800 to \\udfff), which no file can hold"
+        elif isinstance(node, yaml.MappingNode):
+            names = set()
+            for key, _ in node.value:
+                if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
+                    raise self._error(f"the key {brief(key.value)} is not text; quote it", key)
+                if key.value in names:
+                    raise self._error(f"the key '{key.value}' is given twice", key)
+                names.add(key.value)
+            parts = [part for pair in node.value for part in pair]
+        count = 1 + sum(self._count(part, counts) for part in parts)
+        if count > MOST_VALUES:
+            text = f"more than {MOST_VALUES} values, counting aliases as often as they are used"
             raise self._error(text, node)
-        return value
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
-        names = set()
-        for key, _ in node.value:
-            if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
-                raise self._error(f"the key {brief(key.value)} is not text; quote it", key)
-            if key.value in names:
-                raise self._error(f"the key '{key.value}' is given twice", key)
-            names.add(key.value)
-        return super().construct_mapping(node, deep)
+        counts[id(node)] = count
+        return count
 
     def construct_tagged(self, tag: str, node: yaml.Node) -> dict[str, Any]:
         if not isinstance(node, yaml.MappingNode):
@@ -148,13 +144,17 @@ def _line_of(node: yaml.Node, key: str) -> int | None:
             entries = {name.value: (name, part) for name, part in node.value}
         else:
             return None
-        found = [name for name in entries if f"{key}.".startswith(f"{name}.")]
-        if not found:
+        if (name := first_name(entries, key)) is None:
             return None
-        name = max(found, key=len)
         start, node = entries[name]
         line, key = start.start_mark.line + 1, key[len(name) + 1 :]
     return int(line)
+
+
+def first_name(names: Iterable[str], key: str) -> str | None:
+    """The longest of some names with which a dotted key begins; None if it begins with none."""
+    found = [name for name in names if f"{key}.".startswith(f"{name}.")]
+    return max(found, key=len, default=None)
 
 
 def dump_yaml(data: Any, on_one_line: bool = False) -> str:

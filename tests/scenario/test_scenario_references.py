@@ -73,7 +73,7 @@ def refusal(form):
             "!Line {start: [0.2], end: [0.3], limits: 3}",
             ".limits: ",
         ),
-        (f"!Line {{start: [0.2], end: 1, {GENTLE}}}", ".end: "),
+        (f"!Line {{start: [0.2], end: [[1]], {GENTLE}}}", ": end"),
         (f"!Line {{start: [0.2], end: [0.2], {GENTLE}}}", ": start and end"),
         (f"!Line {{start: [0.2], end: [1], order: 99, {GENTLE}}}", ": order"),
         ("!Circle {center: [0, 0], radius: 1}", ": "),

@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-import numpy as np
+from pydantic import Field, ValidationInfo
 
 from drake_dae.arrays import positive
 from drake_dae.robots import Load, Vector
-from drake_dae.scenario.form import FILE, Value, in_folder
-from drake_dae.scenario.typed_yaml import TAG
+from drake_dae.scenario.form import FILE, Expected, in_folder
 
 
 @dataclass(frozen=True)
@@ -59,46 +58,21 @@ class Payload:
         positive("the mass of a payload", self.mass)
 
 
-def _actuators(value: Any, folder: Path) -> Any:
-    if value == "all" or (isinstance(value, list) and all(isinstance(v, str) for v in value)):
-        return value
-    if not isinstance(value, dict) or TAG in value:
-        return None
-    limits = [limit for limit in value.values() if limit is not None]
-    return value if all(type(x) in (int, float) and 0 < x < np.inf for x in limits) else None
-
-
-ACTUATORS = Value(
+ACTUATORS = Expected(
     "all, a list of joints, or joints with effort limits in N m or N, positive, or nothing for "
     "that of the file",
-    {
-        "anyOf": [
-            {"const": "all"},
-            {"type": "array", "items": {"type": "string"}},
-            {"type": "object", "additionalProperties": {"type": ["number", "null"]}},
-        ]
-    },
-    _actuators,
+    Literal["all"] | list[str] | dict[str, Annotated[float, Field(gt=0.0)] | None],
 )
 
 
-def _robot_file(value: Any, folder: Path) -> Any:
-    is_package = isinstance(value, str) and value.startswith("package://")
-    return value if is_package else in_folder(value, folder)
+def _robot_file(name: str, info: ValidationInfo) -> str:
+    return name if name.startswith("package://") else in_folder(name, info)
 
 
-ROBOT_FILE = Value("the name of a file", {"type": "string"}, _robot_file)
-
-
-def _part(value: Any, folder: Path) -> Any:
-    is_part = isinstance(value, str) and 0 < value.find("/") < len(value) - 1
-    return value if is_part or value in ("inertia", "empty_limits") else None
-
-
-LEFT_OUT = Value(
+ROBOT_FILE = Expected("the name of a file", str, _robot_file)
+LEFT_OUT = Expected(
     '"<parent>/<name>" of an element or attribute, inertia, or empty_limits',
-    {"type": "string"},
-    _part,
+    Annotated[str, Field(pattern="^[^/]+/[^/]|^inertia$|^empty_limits$")],
 )
 
 
