@@ -8,7 +8,7 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.manifold import coordinates
-from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
+from drake_dae.dae.pinned_motion import PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
@@ -201,28 +201,27 @@ class Equilibria:
         if direct.size and not self._clocks.any():
             pinned = self.pinned.at(reference, parameters)
             still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
-            slopes, rate = pinned.slopes_along(state, still, by), pinned.rate(state)
+            slopes, rate = pinned.slopes(state, still, by), pinned.rate(state)
             if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
                 nearest = -np.linalg.pinv(slopes / scale[:, None], DEPENDENT) @ (rate / scale)
                 reference[direct] = nearest
         return reference
 
-    def find(self, pinned: PinnedSet, guess: FloatArray) -> FloatArray:
-        """Returns the equilibrium at which a search from a guess ends, shape (n,)."""
-        rest = self.search(pinned, guess)
-        unrest = rest.unrest or ("the Jacobian is singular" if rest.degenerate else "")
+    def find(self, pinned: PinnedSet, guess: FloatArray, regular: bool = True) -> Rest:
+        """Returns the state at rest at which a search from a guess ends."""
+        rest = self._search(pinned, guess)
+        unrest = rest.unrest
+        if regular and rest.degenerate and not unrest:
+            unrest = "the Jacobian is singular"
         if unrest:
-            raise InconsistentStateError(self.none(pinned, rest.state, unrest), rest.rate)
-        return rest.state
+            raise InconsistentStateError(
+                f"{self.pinned.system.name}: {pinned.describe()} have no regular state at rest "
+                f"near the given one: the search ends at x = {show(rest.state)}, where {unrest}",
+                rest.rate,
+            )
+        return rest
 
-    def none(self, pinned: PinnedSet, state: FloatArray, unrest: str) -> str:
-        """Returns in words that a search ended at a state that is no equilibrium."""
-        return (
-            f"{self.pinned.system.name}: {pinned.describe()} have no regular state at rest near "
-            f"the given one: the search ends at x = {show(state)}, where {unrest}"
-        )
-
-    def search(self, pinned: PinnedSet, guess: FloatArray) -> Rest:
+    def _search(self, pinned: PinnedSet, guess: FloatArray) -> Rest:
         """Searches by Newton's method for C(x) = 0 and T^T x' = 0."""
         system, scale = self.pinned.system, self.pinned.system.scale
         if self._clocks.any():

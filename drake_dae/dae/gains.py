@@ -9,9 +9,10 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, show, vector
+from drake_dae.arrays import FloatArray, brief, numbers, show, vector
 from drake_dae.dae.signals import DerivativeLayout
 from drake_dae.errors import GainError
+from drake_dae.trace.expressions import result_of
 
 
 @checked(GainError)
@@ -189,6 +190,23 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
         return FeedbackGains(tuple(names), tuple(degrees), matrix)
 
     return design
+
+
+def designed(
+    what: str, design: GainDesign | FeedbackGains, names: tuple[str, ...], degrees: tuple[int, ...]
+) -> FeedbackGains:
+    """Returns finished gains, or designs them; raises GainError if they are for other signals."""
+    gains = design
+    if not isinstance(gains, FeedbackGains):
+        gains = result_of(what, gains, names, degrees, error=GainError)
+    if not isinstance(gains, FeedbackGains):
+        raise GainError(f"{what} must be a design such as poles(-4.0), got {brief(gains)}")
+    if (gains.names, gains.degrees) != (names, degrees):
+        raise GainError(
+            f"{what} must be for {', '.join(names) or 'none'} with {degrees} poles, and is for "
+            f"{', '.join(gains.names)} with {gains.degrees}"
+        )
+    return gains
 
 
 def _per_output(
