@@ -1,6 +1,6 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from math import isfinite
 
@@ -16,27 +16,8 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction, count_operations
-from drake_dae.trace.newton import (
-    PRECISION,
-    ROUNDING,
-    NewtonModel,
-    newton,
-    norm,
-    shortest_steps,
-)
+from drake_dae.trace.newton import ROUNDING, NewtonModel, newton, norm, shortest_steps
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
-
-NEWTON_STEPS = 6
-"""The number of Newton steps in one function. One or two lead from the end of a simulation step to
-N*, the others reduce the error to round-off. One projection in a thousand takes more."""
-
-STAYS, FOUND, NOT_FOUND = 0.0, 1.0, 2.0
-"""The outcome of these steps: the state is already consistent, they converged to a consistent
-state, or they did not converge."""
-
-DOUBT = 0.03
-"""Gradients are checked for near dependence if the part of one that is orthogonal to those before
-it is shorter than usual by this factor."""
 
 PROBE = 1e-4
 """The distance at which poles show, in states over their scale."""
@@ -65,7 +46,6 @@ class Manifold:
         self.residual_function = system.trace("manifold", {"residual": self.residual_expression})
         outputs = {"gradient": self.gradient}
         self._gradient = system.trace("manifold gradient", outputs, often=False)
-        self._first_steps = self._trace_first_steps()
         self._settling = Settling(system, self.layout, self.gradient, self.gradients, self.residual)
 
     @property
@@ -104,36 +84,28 @@ class Manifold:
 
     @cached_property
     def newton_step(self) -> TracedFunction:
-        """The Newton step of least norm from a state, divided by the scale of the states."""
+        """The Newton step of least norm from a state, divided by the scale of the states.
+
+        A function of the state, a second state at which the gradients are taken, and parameters.
+        With C the gradients and S the scale it is -(C S)' N^-1 residual, N = C S (C S)', each row
+        by its largest entry: the squares of entries may be too large for a number. An error of N^-1
+        grows with the square of the condition of C, and only makes Newton's method slower.
+        """
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(self.short_gradient, state, other)
-        step = _shortest_step(gradient, ca.SX(self.scale))[0](self.residual_expression)
+        step = ca.SX(gradient.shape[1], 1)
+        if gradient.shape[0]:
+            scaled = ca.mtimes(gradient, ca.diag(ca.SX(self.scale)))
+            largest = [ca.norm_inf(row) for row in ca.vertsplit(scaled)]
+            sizes = ca.vertcat(*[ca.if_else(size > 0, size, 1) for size in largest])
+            scaled = ca.sparsify(scaled / ca.repmat(sizes, 1, scaled.shape[1]))
+            normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
+            # CasADi lets the infinities of constant gradients cancel each other.
+            regular = ca.if_else(normal.pivot > 0, 0, ca.SX.nan())
+            solved = normal.solve(self.residual_expression / sizes)
+            step = regular - ca.mtimes(scaled.T, solved)
         inputs = {"other": other}
         return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
-
-    def _trace_first_steps(self) -> TracedFunction:
-        """Traces the first Newton steps from a state, all with the gradients at that state."""
-        system = self.system
-        usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
-        usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
-        start, p, scale = system.state, system.parameter_symbol, ca.SX(self.scale)
-        # The steps hold them often: common subexpressions are removed once here, not from the
-        # whole.
-        expression, gradient = ca.cse([self.residual_expression, self.short_gradient])
-        function = ca.Function("residual", [start, p], [expression], {"cse": False})
-        (step_for, pivots), steps, state = _shortest_step(gradient, scale), list[ca.SX](), start
-        for _ in range(NEWTON_STEPS):
-            steps.append(scale * step_for(function(state, p)))
-            state = state + steps[-1]
-        unit = ca.fmax(scale, ca.fabs(start))
-        lengths = [ca.norm_2(step / scale) for step in steps]
-        sizes = [ca.norm_2(step / unit) for step in steps[:2]]
-        moved, outcome = _followed(start, steps, lengths, *sizes)
-        outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": moved, "step": steps[0]}
-        # A cheap test in place of the sines, which are computed only where this one fails.
-        heads = [ca.fabs(pivots[i]) / usual[i] for i in self.layout.heads.tolist()]
-        doubt = ca.mmin(ca.vertcat(1, *heads)) - DOUBT
-        return system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
     def _relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
@@ -144,22 +116,65 @@ class Manifold:
         length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)
         return norm(residual / positive(length))
 
+    @np.errstate(all="ignore")
+    def _steps(
+        self, state: FloatArray, p: FloatArray, downhill: bool = False
+    ) -> NewtonModel | None:
+        """Shortest Newton steps in scaled states, or such that decrease the scaled residual."""
+        gradients = self.gradients(state, p) * self.scale
+
+        def residual(z: FloatArray) -> FloatArray:
+            return self.residual_function.evaluate(self.scale * z, p)[0]
+
+        steps = shortest_steps(gradients, residual)
+        if steps is None or not downhill:
+            return steps
+        length = positive(np.linalg.norm(gradients, axis=1))
+        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
+
+    @np.errstate(all="ignore")
+    def _step(self, state: FloatArray, p: FloatArray) -> FloatArray | None:
+        """The Newton step in scaled states; None where the gradients are dependent or infinite."""
+        steps = self._steps(state, p)
+        if steps is None or not steps.is_regular:
+            return None
+        step = steps.step(state / self.scale)
+        return step if isfinite(norm(step)) else None
+
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
         """Returns whether a state is on N* up to round-off: whether Newton's step is short."""
         x, p = self._state(state), self.system.parameter_vector(parameters)
-        reach = float(self._first_steps.evaluate(x, p)[0][1])
-        if isfinite(reach) and reach > 0.0:
-            is_near = reach <= CONSISTENT * norm(x / self.scale) + FLOOR
+        step = self._step(x, p)
+        if step is not None and norm(step) > 0.0:
+            is_near = norm(step) <= CONSISTENT * norm(x / self.scale) + FLOOR
             return is_near and not self._is_at_pole(x, p)
         # Dependent gradients, a residual of zero, or one that no state changes.
         return self._relative_size(x, p) <= CONSISTENT
 
     def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
-        """Returns the consistent state next to a state, to round-off, by Newton's method."""
+        """Returns the consistent state next to a state, to round-off, by Newton's method.
+
+        A state that is already consistent is returned as it is.
+
+        Raises:
+            InconsistentStateError: Newton's method does not reach N*.
+        """
         start, p = self._state(state), self.system.parameter_vector(parameters)
-        found = self.projected(start, p)
+        step, found = self._step(start, p), start
+        stays = norm(step) <= ROUNDING if step is not None else not self.residual(start, p).any()
+        if not stays:
+            first = start / self.scale
+            z, converged = newton(first, lambda z: self._steps(self.scale * z, p))
+            if not converged:
+                # Gradients are dependent or steps diverge: least squares with decreasing residual.
+                z, converged = newton(first, lambda z: self._steps(self.scale * z, p, True))
+            found = start + self.scale * (z - first)
+            # Otherwise the residual is round-off in coarse units.
+            if not converged and not self._relative_size(found, p) <= CONSISTENT:
+                residual = self.residual(found, p)
+                raise InconsistentStateError(self._why(found, p, residual), residual)
         if self._is_at_pole(found, p):
-            left = self.residual_function(found, p)[0]
+            left = self.residual(found, p)
             worst = int(np.argmax(np.abs(left)))
             raise InconsistentStateError(
                 f"{self.system.name}: {self.residual_signals[worst].name} = {left[worst]:.3g} is "
@@ -171,62 +186,18 @@ class Manifold:
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
-        """Whether the residual is large though Newton's step is short."""
-        step = self._first_steps.evaluate(x, p)[2]
-        length = norm(step / self.scale)
-        if not (isfinite(length) and length > 0.0):
+        """Whether the residual is large though Newton's step is short.
+
+        Near a pole the step is the distance to it. The residual then falls along the step, while it
+        grows from a consistent state, whose own is round-off.
+        """
+        step = self._step(x, p)
+        if step is None or not norm(step) > 0.0:
             return False
-        here, there = (
-            self.residual_function(state, p)[0] for state in (x, x + PROBE / length * step)
-        )
         lengths = positive(np.linalg.norm(self.gradients(x, p) * self.scale, axis=1))
-        return bool(norm(there / lengths) < norm(here / lengths))
-
-    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
-        function, scale = self._first_steps, self.scale
-        sizes, moved, _ = function.evaluate(start, p)
-        outcome, first = sizes.item(0), sizes.item(1)
-        if outcome == STAYS and function.is_finite:
-            return start
-        if outcome == FOUND and function.is_finite:
-            return moved.copy()
-        if function.is_finite and first == 0.0 and not self.residual(start, p).any():
-            return start
-
-        def linearize(z: FloatArray) -> NewtonModel:
-            x = scale * z
-            step = self.newton_step
-            return NewtonModel(lambda z: step.evaluate(scale * z, x, p)[0].copy(), True)
-
-        z, converged = newton(start / scale, linearize)
-        if not converged:
-            # Gradients are dependent or steps diverge: least squares with decreasing residual.
-            z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
-        state = scale * z
-        if converged and not np.array_equal(state, start):
-            return state
-        # Otherwise the residual is round-off in coarse units, or no state changes it.
-        if self._relative_size(state, p) <= CONSISTENT:
-            return state
-        residual = self.residual(state, p)
-        if converged and function.evaluate(state, p)[1].any():
-            return state
-        raise InconsistentStateError(self._why(state, p, residual), residual)
-
-    def _downhill(self, state: FloatArray, parameters: FloatArray) -> NewtonModel | None:
-        """Least-squares steps that decrease the residual; its rows are scaled to length one."""
-        scale = self.scale
-        gradients = self.gradients(state, parameters) * scale
-        length = positive(np.linalg.norm(gradients, axis=1))
-
-        def residual(z: FloatArray) -> FloatArray:
-            return self.residual_function(scale * z, parameters)[0]
-
-        steps = shortest_steps(gradients, residual)
-        if steps is None:
-            return None
-        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
+        along = PROBE / norm(step) * self.scale * step
+        here, there = (norm(self.residual(state, p) / lengths) for state in (x, x + along))
+        return there < here
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
         """Returns in words why a Newton iteration that ended at a state failed."""
@@ -266,8 +237,8 @@ class Manifold:
         residual = self.residual(start, p)
         if not residual.any():
             return start
-        outcome, first = self._first_steps.evaluate(start, p)[0][:2]
-        if self._first_steps.is_finite and outcome != NOT_FOUND and 0.0 < first <= FLOOR:
+        step = self._step(start, p)
+        if step is not None and 0.0 < norm(step) <= FLOOR:
             return self.project(start, p)  # It was there up to round-off, which no level moves.
         chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
         error = InconsistentStateError(
@@ -308,46 +279,6 @@ class Manifold:
                 f"{self.system.name}: a state has shape ({self.system.num_states},), got {x.shape}"
             )
         return x
-
-
-def _followed(
-    start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
-) -> tuple[ca.SX, ca.SX]:
-    """The state that `newton` reaches by these first steps, and the outcome."""
-    # Newton's method ends at the start, or after its first step; then it is polished.
-    at_start = size <= ROUNDING
-    after_one = ca.logic_and(ca.logic_not(at_start), left * left <= PRECISION * size)
-    goes_on = ca.logic_and(at_start, lengths[0] > 0)
-    moved = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
-    for number in range(1, len(steps)):
-        shorter = ca.logic_and(goes_on, lengths[number] < 0.5 * lengths[number - 1])
-        goes_on = shorter if number > 1 else ca.logic_or(after_one, shorter)
-        goes_on = ca.logic_and(goes_on, lengths[number] > 0)
-        moved += ca.if_else(goes_on, steps[number], 0)
-    ends = ca.logic_and(ca.logic_or(at_start, after_one), ca.logic_not(goes_on))
-    # A first step of length zero does not tell whether the start is consistent.
-    moves = ca.logic_or(after_one, lengths[0] > 0)
-    outcome = ca.if_else(ca.logic_and(ends, moves), FOUND, NOT_FOUND)
-    stays = ca.logic_and(lengths[0] > 0, lengths[0] <= ROUNDING)
-    return moved, ca.if_else(stays, STAYS, outcome)
-
-
-def _shortest_step(
-    gradient: ca.SX, scale: ca.SX
-) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
-    """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale."""
-    if not gradient.shape[0]:
-        return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
-    scaled = ca.mtimes(gradient, ca.diag(scale))
-    # By their largest entries: the squares of entries may be too large for a number.
-    largest = [ca.norm_inf(row) for row in ca.vertsplit(scaled)]
-    sizes = ca.vertcat(*[ca.if_else(size > 0, size, 1) for size in largest])
-    scaled = ca.sparsify(scaled / ca.repmat(sizes, 1, scaled.shape[1]))
-    normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
-    lengths = [size * length for size, length in zip(largest, normal.lengths, strict=True)]
-    # CasADi lets the infinities of constant gradients cancel each other.
-    regular = ca.if_else(normal.pivot > 0, 0, ca.SX.nan())
-    return lambda residual: regular - ca.mtimes(scaled.T, normal.solve(residual / sizes)), lengths
 
 
 def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
