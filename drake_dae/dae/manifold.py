@@ -16,7 +16,14 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction, count_operations
-from drake_dae.trace.newton import ROUNDING, NewtonModel, newton, norm, shortest_steps
+from drake_dae.trace.newton import (
+    PRECISION,
+    ROUNDING,
+    NewtonModel,
+    newton,
+    norm,
+    shortest_steps,
+)
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
 PROBE = 1e-4
@@ -117,28 +124,13 @@ class Manifold:
         return norm(residual / positive(length))
 
     @np.errstate(all="ignore")
-    def _steps(
-        self, state: FloatArray, p: FloatArray, downhill: bool = False
-    ) -> NewtonModel | None:
-        """Shortest Newton steps in scaled states, or such that decrease the scaled residual."""
-        gradients = self.gradients(state, p) * self.scale
-
-        def residual(z: FloatArray) -> FloatArray:
-            return self.residual_function.evaluate(self.scale * z, p)[0]
-
-        steps = shortest_steps(gradients, residual)
-        if steps is None or not downhill:
-            return steps
-        length = positive(np.linalg.norm(gradients, axis=1))
-        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
-
-    @np.errstate(all="ignore")
     def _step(self, state: FloatArray, p: FloatArray) -> FloatArray | None:
         """The Newton step in scaled states; None where the gradients are dependent or infinite."""
-        steps = self._steps(state, p)
+        gradients = self.gradients(state, p) * self.scale
+        steps = shortest_steps(gradients, lambda z: self.residual_function.evaluate(state, p)[0])
         if steps is None or not steps.is_regular:
             return None
-        step = steps.step(state / self.scale)
+        step = steps.step(state)
         return step if isfinite(norm(step)) else None
 
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
@@ -154,25 +146,11 @@ class Manifold:
     def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns the consistent state next to a state, to round-off, by Newton's method.
 
-        A state that is already consistent is returned as it is.
-
         Raises:
             InconsistentStateError: Newton's method does not reach N*.
         """
-        start, p = self._state(state), self.system.parameter_vector(parameters)
-        step, found = self._step(start, p), start
-        stays = norm(step) <= ROUNDING if step is not None else not self.residual(start, p).any()
-        if not stays:
-            first = start / self.scale
-            z, converged = newton(first, lambda z: self._steps(self.scale * z, p))
-            if not converged:
-                # Gradients are dependent or steps diverge: least squares with decreasing residual.
-                z, converged = newton(first, lambda z: self._steps(self.scale * z, p, True))
-            found = start + self.scale * (z - first)
-            # Otherwise the residual is round-off in coarse units.
-            if not converged and not self._relative_size(found, p) <= CONSISTENT:
-                residual = self.residual(found, p)
-                raise InconsistentStateError(self._why(found, p, residual), residual)
+        p = self.system.parameter_vector(parameters)
+        found = self.projected(self._state(state), p)
         if self._is_at_pole(found, p):
             left = self.residual(found, p)
             worst = int(np.argmax(np.abs(left)))
@@ -183,6 +161,53 @@ class Manifold:
                 left,
             )
         return found
+
+    @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
+    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """Acts as `project`, without checks; returns the start itself if it is consistent."""
+        scale, step_from = self.scale, self.newton_step.evaluate
+        step = step_from(start, start, p)[0]
+        length = norm(step)
+        if length <= ROUNDING and (length > 0.0 or not self.residual(start, p).any()):
+            return start
+        moved = start + scale * step
+        step = step_from(moved, start, p)[0]
+        left = norm(step)
+        if left * left <= PRECISION * length:  # The test of `newton`, without its overhead.
+            while ROUNDING < left < 0.5 * length:
+                moved, length = moved + scale * step, left
+                step = step_from(moved, start, p)[0]
+                left = norm(step)
+            return moved
+
+        def linearize(z: FloatArray) -> NewtonModel:
+            x = scale * z
+            return NewtonModel(lambda z: step_from(scale * z, x, p)[0].copy(), True)
+
+        first = start / scale
+        z, converged = newton(first, linearize)
+        if not converged:
+            # Gradients are dependent or steps diverge: least squares with decreasing residual.
+            z, converged = newton(first, lambda z: self._downhill(scale * z, p))
+        found: FloatArray = start + scale * (z - first)
+        # Otherwise the residual is round-off in coarse units, or no state changes it.
+        if not converged and not self._relative_size(found, p) <= CONSISTENT:
+            residual = self.residual(found, p)
+            raise InconsistentStateError(self._why(found, p, residual), residual)
+        return found
+
+    def _downhill(self, state: FloatArray, p: FloatArray) -> NewtonModel | None:
+        """Least-squares steps that decrease the residual; its rows are scaled to length one."""
+        gradients = self.gradients(state, p) * self.scale
+        length = positive(np.linalg.norm(gradients, axis=1))
+
+        def residual(z: FloatArray) -> FloatArray:
+            return self.residual_function(self.scale * z, p)[0]
+
+        steps = shortest_steps(gradients, residual)
+        if steps is None:
+            return None
+        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
