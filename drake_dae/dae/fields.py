@@ -4,7 +4,6 @@ CasADi's own messages do not say which function of (1)-(3) is wrong, or how to c
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from inspect import signature
 from types import SimpleNamespace
 from typing import Any
 
@@ -218,31 +217,13 @@ def _called(
     try:
         value = function(*arguments)
     except Exception as error:
-        why = _explained(error, function, arguments)
+        given = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
         raise ModelError(
             f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
-            f"states: {why}"
+            f"states: {error}. It is called with {given}; use CasADi's own functions (casadi.sin) "
+            "or plain operators. A condition, as in if, max or min, is not smooth: write the "
+            "branch in which the state remains"
         ) from error
     if value is None:
         raise ModelError(f"{owner}: function {letter} returned nothing")
     return as_expression(owner, letter, value)
-
-
-def _explained(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
-    text = str(error)
-    try:
-        signature(function).bind(*arguments)
-    except TypeError:
-        called = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
-        return f"{text}. It is called with {called}"
-    except ValueError:
-        pass  # Built-in functions have no signature.
-    if "truth value" in text:
-        return (
-            "it asks whether a condition on the state is true, as in if, max or min. Conditions "
-            "are not smooth, and the theory differentiates: write the branch in which the state "
-            "remains, or a smooth function"
-        )
-    if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
-        return f"no parameter '{error.name}'; there are {', '.join(vars(error.obj))}"
-    return f"{text}. Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"
