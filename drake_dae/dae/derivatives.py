@@ -15,8 +15,6 @@ so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and 
 """
 
 from collections.abc import Sequence
-from typing import Any
-from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -25,17 +23,20 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import (
     Factorization,
-    Factors,
     PositiveDefiniteFactorization,
     block_stages,
     nonzeros,
     saddle_point_solver,
 )
-from drake_dae.trace.functions import count_operations
 
 
 class Derivatives:
-    """The motion of a system on N* and its time derivatives, for a constant control."""
+    """The motion of a system on N* and its time derivatives, for a constant control.
+
+    `constraint` is the column c. Its rate c' is 0, or minus `damping`, an expression that vanishes
+    on N*; its higher derivatives are 0 in both cases. `pivot` is 0 exactly where A(x) is singular;
+    with frictional contacts it is not positive where the Painleve paradox occurs.
+    """
 
     def __init__(self, system: DaeSystem, constraint: ca.SX, damping: ca.SX | None = None) -> None:
         self.system = system
@@ -70,11 +71,10 @@ class Derivatives:
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
         if system.agree(gradient, g_rows):
             gradient = g_rows
-        self._matrix = ca.blockcat(
-            mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
-        )
+        E = mass[self._rows, self._rows]
+        self._matrix = ca.blockcat(E, -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1]))
         self._unknowns, self.constraint_matrix, self.pivot = saddle_point_solver(
-            _factors_of(system, self._rows), g_rows, gradient
+            PositiveDefiniteFactorization(E), g_rows, gradient
         )
         if system.frictional_contacts:
             self.pivot = ca.fmin(
@@ -140,7 +140,14 @@ class Derivatives:
     def inverse(
         self, expression: ca.SX, desired: ca.SX, shown: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """Returns the control for which an expression of the motion has desired values."""
+        """Returns the control for which an expression of the motion has desired values.
+
+        The equations of the motion and `expression = desired` are solved together for the control
+        and for the unknowns that it moves, block by block along their structure (Dulmage and
+        Mendelsohn 1958). So B(x) of (16) is not formed, and with rigid joints no inverse of M(q):
+        it is inverse dynamics. Also returns a scalar that is 0 exactly where the control is not
+        determined, and what is shown; None if the equations are not linear in what it moves.
+        """
         shown = ca.SX(0, 1) if shown is None else shown
         orders = self._orders_in(ca.vertcat(expression, shown))
         symbols = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
@@ -267,30 +274,6 @@ class Derivatives:
             return expression
         symbols = ca.vertcat(*self._symbols[1 : orders + 1])
         return ca.substitute(expression, symbols, ca.vertcat(*self._values[:orders]))
-
-
-_CHOSEN: WeakKeyDictionary[Any, tuple[list[int], ca.SX, Factors]] = WeakKeyDictionary()
-"""`DaeSystem.factorize` -> rows, E of these rows and columns, and factors: a robot's systems with
-and without a disturbance have the same."""
-
-
-def _factors_of(system: DaeSystem, rows: list[int]) -> Factors:
-    """Factors of some rows and columns of E, by `DaeSystem.factorize` if they are shorter."""
-    mass, factorize = system.mass_matrix[rows, rows], system.factorize
-    if factorize is None:
-        return PositiveDefiniteFactorization(mass)
-    before, same, chosen = _CHOSEN.get(factorize, (None, mass, None))
-    if chosen is not None and before == rows and ca.is_equal(same, mass):
-        return chosen
-    chosen = triangle = PositiveDefiniteFactorization(mass)
-    if (other := factorize(rows)) is not None:
-        right = ca.SX.sym("right", len(rows))
-        solutions = other.solve(right), triangle.solve(right)
-        counts = [count_operations(solution) for solution in solutions]
-        if counts[0] < counts[1] and system.agree(*solutions, right):
-            chosen = other
-    _CHOSEN[factorize] = rows, mass, chosen
-    return chosen
 
 
 def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:

@@ -26,8 +26,11 @@ from drake_dae.trace.newton import (
 )
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
-PROBE = 1e-4
-"""The distance at which poles show, in states over their scale."""
+POLE = 1e-3
+"""A larger residual, over its usual change by the scale of the states, is no round-off."""
+
+NEAR_POLE = 1e-6, 1e-3
+"""The distances at which poles show, in states over their scale."""
 
 RESTARTS = 12
 """The number of random starts of `Manifold.settle`."""
@@ -53,6 +56,9 @@ class Manifold:
         self.residual_function = system.trace("manifold", {"residual": self.residual_expression})
         outputs = {"gradient": self.gradient}
         self._gradient = system.trace("manifold gradient", outputs, often=False)
+        usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
+        # Of the residuals: how much they change while the states change by their scale.
+        self._usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
         self._settling = Settling(system, self.layout, self.gradient, self.gradients, self.residual)
 
     @property
@@ -141,7 +147,7 @@ class Manifold:
             is_near = norm(step) <= CONSISTENT * norm(x / self.scale) + FLOOR
             return is_near and not self._is_at_pole(x, p)
         # Dependent gradients, a residual of zero, or one that no state changes.
-        return self._relative_size(x, p) <= CONSISTENT
+        return self._relative_size(x, p) <= CONSISTENT and not self._is_at_pole(x, p)
 
     def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns the consistent state next to a state, to round-off, by Newton's method.
@@ -211,18 +217,17 @@ class Manifold:
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
-        """Whether the residual is large though Newton's step is short.
+        """Whether the residual is large, or not finite, though Newton's step may be short.
 
-        Near a pole the step is the distance to it. The residual then falls along the step, while it
-        grows from a consistent state, whose own is round-off.
+        Near a pole the step is the distance to it. At a pole the residual may be 0 by round-off;
+        it is large next to it, and falls with the distance, while it grows from a consistent state.
         """
-        step = self._step(x, p)
-        if step is None or not norm(step) > 0.0:
-            return False
-        lengths = positive(np.linalg.norm(self.gradients(x, p) * self.scale, axis=1))
-        along = PROBE / norm(step) * self.scale * step
-        here, there = (norm(self.residual(state, p) / lengths) for state in (x, x + along))
-        return there < here
+        away = self.scale * np.random.default_rng(0).normal(size=x.size)
+        left, near, far = (
+            norm(self.residual_function.evaluate(state, p)[0] / np.maximum(self._usual, 1.0))
+            for state in (x, x + NEAR_POLE[0] * away, x + NEAR_POLE[1] * away)
+        )
+        return not left <= POLE or bool(near > 1.0 and near > far)
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
         """Returns in words why a Newton iteration that ended at a state failed."""
@@ -263,7 +268,8 @@ class Manifold:
         if not residual.any():
             return start
         step = self._step(start, p)
-        if step is not None and 0.0 < norm(step) <= FLOOR:
+        is_there = step is not None and 0.0 < norm(step) <= FLOOR
+        if is_there and not self._is_at_pole(start, p):
             return self.project(start, p)  # It was there up to round-off, which no level moves.
         chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
         error = InconsistentStateError(

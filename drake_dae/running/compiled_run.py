@@ -49,65 +49,60 @@ class CompiledRun:
     """A diagram in which one block has the place of all that can be traced, beside the rest.
 
     The rest, such as Drake's MultibodyPlant and sources of random numbers, are copies. States, logs
-    and time of the diagram as wired follow after every few steps.
-
-    Attributes:
-        composed: The block.
-        steps: The number of steps until the context was set.
+    and time of the diagram as wired follow after every few steps; `steps` counts these.
     """
 
     def __init__(self, diagram: Diagram, context: Context, config: SimulatorConfig) -> None:
         self._context, self.steps, leaves = context, 0, Leaves.of(diagram)
-        self._logs = [s for s in leaves.systems if isinstance(s, VectorLogSink)]
-        kept = [s for s in leaves.systems if s not in self._logs and not _is_traced(s)]
-        copies = {system: _copy(system) for system in (*self._logs, *kept)}
+        logs = [s for s in leaves.systems if isinstance(s, VectorLogSink)]
+        rest = logs + [s for s in leaves.systems if s not in logs and not _is_traced(s)]
         outputs = {
-            f"{system.get_name()}.{port.get_name()}": leaves.sources[system, i]
-            for system in (*self._logs, *kept)
+            f"{system.get_name()}.{system.get_input_port(i).get_name()}": (system, i)
+            for system in rest
             for i in range(system.num_input_ports())
-            for port in [system.get_input_port(i)]
             if (system, i) in leaves.sources and _is_traced(leaves.sources[system, i][0])
         }
-        ports = {name: system.get_output_port(i) for name, (system, i) in outputs.items()}
+        sources = {name: leaves.sources[place] for name, place in outputs.items()}
+        ports = {name: system.get_output_port(i) for name, (system, i) in sources.items()}
         self.composed = composed = compose(
             diagram, ports, context=context, merge=True, is_whole=True
         )
         (choice, *_) = [p.dae.compiled for p in plants_in(diagram)]
         builder = DiagramBuilder()
-        self._block = builder.AddSystem(TracedSystem(composed.block, compiled=choice))
-        self._copies = {system: builder.AddSystem(copy) for system, copy in copies.items()}
+        self._block = block = builder.AddSystem(TracedSystem(composed.block, compiled=choice))
+        self._copies = copies = {system: builder.AddSystem(_copy(system)) for system in rest}
         for (system, i), (source, k) in leaves.sources.items():
-            if system in self._copies and source in self._copies:
-                written = self._copies[source].get_output_port(k)
-                builder.Connect(written, self._copies[system].get_input_port(i))
-        for system in (*self._logs, *kept):
-            for i in range(system.num_input_ports()):
-                port = system.get_input_port(i)
-                if (name := f"{system.get_name()}.{port.get_name()}") in outputs:
-                    written = self._block.GetOutputPort(name)
-                    builder.Connect(written, self._copies[system].get_input_port(i))
+            if system in copies and source in copies:
+                written = copies[source].get_output_port(k)
+                builder.Connect(written, copies[system].get_input_port(i))
+        for name, (system, i) in outputs.items():
+            builder.Connect(block.GetOutputPort(name), copies[system].get_input_port(i))
         for name, (source, k) in composed.cuts.items():
-            written = self._copies[source].get_output_port(k)
-            builder.Connect(written, self._block.GetInputPort(name))
+            builder.Connect(copies[source].get_output_port(k), block.GetInputPort(name))
         self._diagram = builder.Build()
         self._own = own = self._diagram.CreateDefaultContext()
         own.SetTime(context.get_time())
-        for system in kept:
-            local = self._copies[system].GetMyMutableContextFromRoot(own)
-            local.SetStateAndParametersFrom(system.GetMyContextFromRoot(context))
-            _copy_fixed(system, context, self._copies[system], local, leaves)
-        at_block = self._block.GetMyMutableContextFromRoot(own)
+        for system in rest[len(logs) :]:
+            copy, at_system = copies[system], system.GetMyContextFromRoot(context)
+            local = copy.GetMyMutableContextFromRoot(own)
+            local.SetStateAndParametersFrom(at_system)
+            for i in range(system.num_input_ports()):  # Those with a fixed value.
+                port = system.get_input_port(i)
+                is_vector = port.get_data_type() == PortDataType.kVectorValued
+                if (system, i) not in leaves.sources and is_vector and port.HasValue(at_system):
+                    copy.get_input_port(i).FixValue(local, port.Eval(at_system))
+        at_block = block.GetMyMutableContextFromRoot(own)
         for name, (system, i) in composed.fixed.items():
             port, local = system.get_input_port(i), system.GetMyContextFromRoot(context)
             if port.HasValue(local):
-                self._block.GetInputPort(name).FixValue(at_block, port.Eval(local))
+                block.GetInputPort(name).FixValue(at_block, port.Eval(local))
         self._simulator = Simulator(self._diagram, own)
         ApplySimulatorConfig(config, self._simulator)
         own.SetAccuracy(config.accuracy)
         self._simulator.Initialize(NO_EVENTS)
-        self._block.begin_run(at_block)
-        for log in self._logs:  # The log as wired has the start already.
-            self._copies[log].FindMutableLog(own).Clear()
+        block.begin_run(at_block)
+        for log in logs:  # The log as wired has the start already.
+            copies[log].FindMutableLog(own).Clear()
 
     @classmethod
     def of(
@@ -200,18 +195,6 @@ def _copy(system: System) -> System:
     copy = system.Clone() if again is None else again()
     copy.set_name(system.get_name())
     return copy
-
-
-def _copy_fixed(
-    system: System, context: Context, copy: System, local: Context, leaves: Leaves
-) -> None:
-    """Fixes the input ports of a copy that have fixed values in the original."""
-    at_system = system.GetMyContextFromRoot(context)
-    for i in range(system.num_input_ports()):
-        port = system.get_input_port(i)
-        is_vector = port.get_data_type() == PortDataType.kVectorValued
-        if (system, i) not in leaves.sources and is_vector and port.HasValue(at_system):
-            copy.get_input_port(i).FixValue(local, port.Eval(at_system))
 
 
 def _copy_state(source: Context, target: Context) -> None:

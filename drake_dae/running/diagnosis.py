@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from drake_dae.arrays import FloatArray, show_state
 from drake_dae.blocks.failures import cannot_go_on, singular_configuration
 from drake_dae.dae import ConstraintStructure, EndCause, MotionEnd, Signal, Structure, ZeroDynamics
+from drake_dae.diagrams.record import computed_record, recorded_values
 from drake_dae.errors import (
     DrakeDaeError,
     PainleveError,
@@ -18,8 +19,9 @@ from drake_dae.errors import (
     SingularityError,
     WiringError,
 )
+from drake_dae.running.divergence import DivergenceWatch
 from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.drives import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
@@ -48,7 +50,7 @@ LONGEST = 1.7
 imaginary axis, where elastic joints are."""
 
 EVERY, COLLAPSED = 32, 1e-5
-"""Each so many steps their mean is compared with the longest one; below this share it collapsed."""
+"""A run is looked at each so many steps; below this share of the longest mean they collapsed."""
 
 PACE, MANY = 2000, 100_000
 """The steps after which the pace of a run is looked at; as many as this in all are told of."""
@@ -69,34 +71,29 @@ def explained(
     structure: Structure | None = None,
     reference: Callable[[float], FloatArray] | None = None,
     start: tuple[float, FloatArray] | None = None,
-    parameters: FloatArray | None = None,
 ) -> SimulationError:
     """The error of a run with its cause: A(x) or B(x) is singular, or a path leaves its reach."""
-    name, state = plant.dae.name, error.state
+    name, state, own = plant.dae.name, error.state, getattr(plant, "structure", None)
     if isinstance(error, PainleveError) or (
         isinstance(error, SingularityError) and error.constraints
     ):
         return error
     if state.size != plant.dae.num_states or not np.isfinite(state).all():
         state = np.zeros(0)
-    own = getattr(plant, "structure", None)
     if state.size and plant.is_ideal and isinstance(own, ConstraintStructure):
-        values = plant.dae.parameter_values if parameters is None else parameters
-        margin, _ = _margin(own, own.elimination.constraint_matrix, state, values)
-        if margin < SINGULAR and _is_near_manifold(own, state, values):
-            names = own.dependent_constraints(state, values)
+        margin, _ = _margin(own, own.elimination.constraint_matrix, state)
+        if margin < SINGULAR and _is_near_manifold(own, state):
+            names = own.dependent_constraints(state, plant.dae.parameter_values)
             return singular_configuration(name, error.time, state, names)
     if structure is None:
         return error
-    system, ending = structure.system, None
+    system, ending, limit = structure.system, None, SINGULAR
     if reference is not None and start is not None and not system.exogenous.moving:
         ending = _end_of_path(structure, reference, start, error.time)
-    outputs: tuple[str, ...] = ()
-    constraints: tuple[str, ...] = ()
-    limit = SINGULAR
     if ending is not None and ending.state is not None and ending.matrix:
         # Singular where the path ends, and nearly so where the run did.
         state, limit = ending.state, NEARLY
+    outputs, constraints = tuple[str, ...](), tuple[str, ...]()
     if state.size == system.num_states:
         signals = system.output_signals
         outputs = _dependent(structure, structure.control_matrix, signals, state, limit)
@@ -134,24 +131,21 @@ def _dependent(
 ) -> tuple[str, ...]:
     """The signals whose rows in a matrix depend on each other at a state, but for rows of 0."""
     rows = [i for i in range(matrix.rows()) if matrix[i, :].nnz()]
-    values = structure.system.parameter_values
-    margin, part = _margin(structure, matrix[rows, :], state, values)
+    margin, part = _margin(structure, matrix[rows, :], state)
     if not margin < limit:
         return ()
     return tuple(signals[rows[i]].name for i in np.flatnonzero(part > PART * part.max()))
 
 
-def _is_near_manifold(
-    structure: ConstraintStructure, state: FloatArray, parameters: FloatArray
-) -> bool:
+def _is_near_manifold(structure: ConstraintStructure, state: FloatArray) -> bool:
     """Whether a state is no farther off N* than a few steps lead; elsewhere A(x) says nothing."""
-    manifold, scale = structure.manifold, structure.scale
-    usual = np.linalg.norm(manifold.gradients(structure.states[0]) * scale, axis=1)
-    return bool(np.all(np.abs(manifold.residual(state, parameters)) <= OFF * usual))
+    manifold, values = structure.manifold, structure.system.parameter_values
+    usual = np.linalg.norm(manifold.gradients(structure.states[0]) * structure.scale, axis=1)
+    return bool(np.all(np.abs(manifold.residual(state, values)) <= OFF * usual))
 
 
 def _margin(
-    structure: ConstraintStructure, matrix: ca.SX, state: FloatArray, parameters: FloatArray
+    structure: ConstraintStructure, matrix: ca.SX, state: FloatArray
 ) -> tuple[float, FloatArray]:
     """The smallest singular value of a scaled matrix, and the parts of its rows in it."""
     if not matrix.numel():
@@ -159,10 +153,9 @@ def _margin(
     function = structure.system.trace("margin", {"matrix": matrix}, often=False)
 
     def at(x: FloatArray) -> FloatArray:
-        return function(x, parameters)[0].reshape(matrix.shape).copy()
+        return function(x, structure.system.parameter_values)[0].reshape(matrix.shape).copy()
 
-    sizes = np.mean([np.abs(at(x)) for x in structure.states], axis=0)
-    rows, columns = equilibration(sizes)
+    rows, columns = equilibration(np.mean([np.abs(at(x)) for x in structure.states], axis=0))
     value = at(state) / rows[:, None] / columns
     if not np.isfinite(value).all():
         return 0.0, np.ones(len(rows))
@@ -180,72 +173,104 @@ def _end_of_path(
     if not time > begin:
         return None
     times = np.linspace(begin, time + BEYOND * (time - begin), PLACES)
+    zero = ZeroDynamics(structure.system, structure=structure)
     try:
-        ending = (
-            ZeroDynamics(structure.system, structure=structure)
-            .motion(reference, times, guess)
-            .ending
-        )
+        ending = zero.motion(reference, times, guess).ending
     except DrakeDaeError:
         return None
     told = (EndCause.OUT_OF_REACH, EndCause.SINGULAR, EndCause.NO_WAY_ON)
     return ending if ending is not None and ending.cause in told else None
 
 
-class RunDiagnosis:
-    """What is needed to say why a simulation of a diagram ends."""
+_Rows = dict[str, tuple[FloatArray, Sequence[Signal]]]
+"""Name of a signal -> its present values, with their names and units."""
+
+
+class RunWatch:
+    """Looks at a simulation: does it diverge, stop, or take very many steps, and why did it end.
+
+    The errors of a `Controller` are looked at if there is exactly one `Plant`.
+    """
 
     def __init__(
         self, diagram: System, context: Context, config: SimulatorConfig, duration: float
     ) -> None:
         self._diagram, self._config, self._time = diagram, config, context.get_time()
-        self._end = self._time + duration
+        self._duration = duration
         blocks = list(blocks_of(diagram))
-        plants = [block for block in blocks if isinstance(block, Plant)]
-        self._plant = plants[0] if len(plants) == 1 else None
-        self._law = next((b.law for b in blocks if isinstance(b, Controller)), None)
+        self._plants = [block for block in blocks if isinstance(block, Plant)]
+        self._plant = self._plants[0] if len(self._plants) == 1 else None
+        self._controller = next((b for b in blocks if isinstance(b, Controller)), None)
         self._generator = next((b for b in blocks if isinstance(b, ReferenceGenerator)), None)
         self._limits = next((b for b in blocks if isinstance(b, ControlLimits)), None)
+        self._watches = dict[Plant, DivergenceWatch]()
         self._start = context.get_continuous_state_vector().CopyToVector()
-        self._steps, self._mark, self._is_watched = 0, self._time, config.use_error_control
-        self._seen, self._longest, self._collapsed = (self._time, 0), 0.0, np.inf
-        self._is_watched &= not config.integration_scheme.startswith(IMPLICIT)
-        self._state = np.zeros(0)
-        if self._plant is not None:
-            self._state = self._plant.state(self._plant.GetMyContextFromRoot(context))
+        self._state = self._state_in(context)
+        self._steps, self._mark, self._is_warning = 0, self._time, config.use_error_control
+        self._is_warning &= not config.integration_scheme.startswith(IMPLICIT)
+        self._seen, self._longest, self._collapsed = self._time, 0.0, np.inf
+
+    def begin(self, context: Context) -> None:
+        """From here on divergence is an error."""
+        self._watches = {plant: DivergenceWatch(plant, self._duration) for plant in self._plants}
+        self._check_divergence(context)
+
+    @property
+    def sees(self) -> bool:
+        """Whether there is a plant that may diverge."""
+        return bool(self._watches)
+
+    def look(self, context: Context, steps: int = 0, *, is_last: bool = False) -> None:
+        """Looks at the run after some accepted steps, of single ones at every 32nd."""
+        before, self._steps = self._steps, self._steps + steps
+        is_due = self._steps // EVERY > before // EVERY
+        if is_due or is_last:
+            self._check_divergence(context, is_last=is_last)
+        if is_due and self._plant is not None:
+            self._check_collapse(context, self._plant)
+        if self._is_warning and before // PACE < self._steps // PACE:
+            self._check_pace(context)
 
     def explain(self, error: DrakeDaeError | RuntimeError, context: Context) -> DrakeDaeError:
         """The error with its cause.
 
-        Looked for in this order: ports without wires, a singular A(x) or B(x) and the reach of the
-        path, drives at their limits, and steps that are too long for a stiff loop.
+        Looked for in this order: divergence within a few steps, ports without wires, a singular
+        A(x) or B(x) and the reach of the path, drives at their limits, and steps that are too long
+        for a stiff loop.
         """
+        try:
+            self._check_divergence(context, states_only=True)
+        except SimulationError as diverged:
+            error = diverged
         if not isinstance(error, DrakeDaeError) and (ports := self._without_wires(context, error)):
             return WiringError(f"no wire to {', '.join(ports)}: connect or fix each input port")
         if isinstance(error, WiringError):
             return error  # It names its cause.
         state = context.get_continuous_state_vector().CopyToVector()
         if self._plant is not None:
-            state = self._plant.state(self._plant.GetMyContextFromRoot(context))
+            state = self._state_in(context)
         told = error
         if not isinstance(told, SimulationError):
             told = cannot_go_on(context.get_time(), state, str(error))
         elif not told.state.size:
             told = told.retold(str(told), told.time, state)
-        if self._plant is not None:
-            found = self._explained(told)
-            if found is not told:
-                return found
+        if self._plant is not None and (found := self._explained(told, self._plant)) is not told:
+            return found
         if names := self._cut_off(context):
             text = f"{', '.join(names)} cut off at their limits: slower references need less"
             return told.retold(f"{text}. {told}", told.time, told.state)
         return too_long(told, self._diagram, context, self._config, (self._time, self._start))
 
-    def _explained(self, error: SimulationError) -> SimulationError:
-        assert self._plant is not None
-        structure = None if self._law is None else self._law.structure
+    def _state_in(self, context: Context) -> FloatArray:
+        """The state of the only plant; empty where there are others or none."""
+        if self._plant is None:
+            return np.zeros(0)
+        return self._plant.state(self._plant.GetMyContextFromRoot(context))
+
+    def _explained(self, error: SimulationError, plant: Plant) -> SimulationError:
+        structure = None if self._controller is None else self._controller.law.structure
         reference = None if self._generator is None else self._generator.reference
-        return explained(error, self._plant, structure, reference, (self._time, self._state))
+        return explained(error, plant, structure, reference, (self._time, self._state))
 
     def _without_wires(self, context: Context, error: RuntimeError) -> list[str]:
         """The input ports without a value that Drake misses."""
@@ -261,43 +286,80 @@ class RunDiagnosis:
         """The controls beyond the limits of the drives."""
         if self._limits is None or self._plant is None:
             return []
+        port, local = (
+            self._limits.GetOutputPort("excess"),
+            self._limits.GetMyContextFromRoot(context),
+        )
         try:
-            excess = self._limits.GetOutputPort("excess").Eval(
-                self._limits.GetMyContextFromRoot(context)
-            )
+            excess = port.Eval(local)
         except (DrakeDaeError, RuntimeError):
             return []
         signals = self._plant.dae.control_signals
         return [signals[i].name for i in np.flatnonzero(excess)]
 
-    def look(self, context: Context, steps: int) -> None:
-        """Looks at the pace of a run under error control, from time to time."""
-        before, self._steps = self._steps, self._steps + steps
-        if self._steps // EVERY > before // EVERY:
-            self._check_collapse(context)
-        if not self._is_watched or before // PACE == self._steps // PACE:
-            return
+    def _check_divergence(
+        self, context: Context, *, is_last: bool = False, states_only: bool = False
+    ) -> None:
+        for plant, watch in self._watches.items():
+            local, dae = plant.GetMyContextFromRoot(context), plant.dae
+            rows: _Rows = {"state": (plant.state(local), dae.state_signals)}
+            if self._controller is not None and self._plant is not None and not states_only:
+                rows |= self._compared(context, plant, self._controller)
+            row = {name: recorded_values(one[None], tuple(of)) for name, (one, of) in rows.items()}
+            watch.look(computed_record(np.array([context.get_time()]), row), is_last=is_last)
+
+    def _compared(self, context: Context, plant: Plant, controller: Controller) -> _Rows:
+        """Present values of force, control and outputs, and what outputs are compared with."""
+        local, dae = plant.GetMyContextFromRoot(context), plant.dae
+
+        def value(name: str) -> FloatArray:
+            if name == "state":
+                return plant.state(local)
+            if name != "control":
+                return np.array(plant.GetOutputPort(name).Eval(local))
+            port = plant.GetInputPort("control")
+            if port.HasValue(local):
+                return np.array(port.Eval(local))
+            # The plant evaluates the law itself.
+            if not self._diagram.HasOutputPort("control"):
+                return np.zeros(0)
+            return np.array(self._diagram.GetOutputPort("control").Eval(context))
+
+        rows: _Rows = {"constraint_force": (value("constraint_force"), dae.force_signals)}
+        if (control := value("control")).size:
+            rows["control"] = control, dae.control_signals
+        compared = controller.compared(controller.GetMyContextFromRoot(context), value)
+        if compared is None:
+            return rows | {"controlled_output": (value("controlled_output"), dae.output_signals)}
+        outputs, wanted, signals = compared
+        return rows | {
+            "controlled_output": (outputs, signals),
+            "desired_output": (wanted, signals),
+        }
+
+    def _check_pace(self, context: Context) -> None:
+        """Warns of a stiff loop in a run of very many steps."""
         time = context.get_time()
         pace, self._mark = (time - self._mark) / PACE, time
-        if not pace > 0.0 or self._steps + (self._end - time) / pace < MANY:
+        count = self._steps + (self._time + self._duration - time) / pace if pace > 0.0 else 0.0
+        if count < MANY:
             return
         state = context.get_continuous_state_vector().CopyToVector()
         rate = fastest_rate(self._diagram, context, time, state)
         if rate * pace > 1.0:
-            self._is_watched = False
-            count = self._steps + (self._end - time) / pace
+            self._is_warning = False
             warnings.warn(stiffness(rate, pace, count, IN_SIMULATE), stacklevel=2)
 
-    def _check_collapse(self, context: Context) -> None:
-        time, pace = context.get_time(), self._steps - self._seen[1]
-        step = (time - self._seen[0]) / pace
-        self._seen, self._longest = (time, self._steps), max(self._longest, step)
-        if self._plant is None or step > min(COLLAPSED * self._longest, 0.01 * self._collapsed):
+    def _check_collapse(self, context: Context, plant: Plant) -> None:
+        """Ends a run whose steps become ever shorter, if there is a cause."""
+        time = context.get_time()
+        step = (time - self._seen) / EVERY
+        self._seen, self._longest = time, max(self._longest, step)
+        if step > min(COLLAPSED * self._longest, 0.01 * self._collapsed):
             return
         self._collapsed = step
-        state = self._plant.state(self._plant.GetMyContextFromRoot(context))
-        short = SimulationError("steps have become too short", time, state)
-        if (found := self._explained(short)) is not short:
+        short = SimulationError("steps have become too short", time, self._state_in(context))
+        if (found := self._explained(short, plant)) is not short:
             raise found
 
 
@@ -306,14 +368,7 @@ IN_ROLLOUT = "Run it by simulate with integration_scheme 'radau3', or choose a s
 
 
 def stiffness(rate: float, pace: float, count: float, remedy: str) -> str:
-    """The warning of a stiff loop.
-
-    Args:
-        rate: Its fastest rate in 1/s.
-        pace: The mean step in s.
-        count: The number of steps of the run.
-        remedy: `IN_SIMULATE` or `IN_ROLLOUT`.
-    """
+    """The warning of a stiff loop, with its fastest rate in 1/s and the mean step in s."""
     return (
         f"the loop is stiff: its fastest rate of {rate:.3g} 1/s, not the accuracy, makes explicit "
         f"steps of {pace:.2g} s, of which this run needs about {count:.2g}. {remedy}"

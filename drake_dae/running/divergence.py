@@ -3,19 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.systems.framework import Context, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal
-from drake_dae.diagrams.record import Record, computed_record, recorded_values
+from drake_dae.diagrams.record import Record
 from drake_dae.errors import SimulationError
-from drake_dae.running.diagnosis import blocks_of
 from drake_dae.running.judgement import unit_sizes
-from drake_dae.systems.control.contract import Controller
 from drake_dae.systems.plants.contract import Plant
-
-EVERY = 32
-"""The number of steps from one check to the next, since each check evaluates output ports."""
 
 LASTING, ENORMOUS = 100.0, 1e6
 """The ratio of an error to the size of its output that is divergence: as a mean over the `WINDOW`,
@@ -32,10 +26,6 @@ peak of an impact hardly counts."""
 MEANINGFUL = 1e-6
 """Outputs and controls whose size is below this fraction of the largest number at the start are not
 judged: their size may be round-off."""
-
-
-_Rows = dict[str, tuple[FloatArray, Sequence[Signal]]]
-"""Name of a signal -> its present values, with their names and units."""
 
 
 class _Growth:
@@ -155,78 +145,3 @@ class DivergenceWatch:
             self._sizes[unit] = float(grown[-1])
             along[:, columns] = grown[:, None]
         return self._meaningful(along)
-
-
-class DiagramWatch:
-    """`DivergenceWatch` of each `Plant` in a diagram while it runs.
-
-    The errors of a `Controller` are checked if there is exactly one plant.
-    """
-
-    def __init__(self, diagram: System, context: Context, duration: float) -> None:
-        blocks = list(blocks_of(diagram))
-        plants = [block for block in blocks if isinstance(block, Plant)]
-        self._controller = next((b for b in blocks if isinstance(b, Controller)), None)
-        self._watches = {plant: DivergenceWatch(plant, duration) for plant in plants}
-        self._diagram, self._steps = diagram, 0
-        self.look(context, always=True)
-
-    @property
-    def sees(self) -> bool:
-        """Whether there is a plant to check."""
-        return bool(self._watches)
-
-    def look(
-        self,
-        context: Context,
-        steps: int = 1,
-        *,
-        always: bool = False,
-        is_last: bool = False,
-        states_only: bool = False,
-    ) -> None:
-        """Checks an accepted step; of consecutive steps only every 32nd is checked."""
-        self._steps += steps
-        if self._steps < EVERY and not (always or is_last or states_only):
-            return
-        self._steps = 0
-        for plant, watch in self._watches.items():
-            at_plant, dae = plant.GetMyContextFromRoot(context), plant.dae
-            rows: _Rows = {"state": (plant.state(at_plant), dae.state_signals)}
-            if self._controller is not None and len(self._watches) == 1 and not states_only:
-                rows |= self._outputs(context, plant, at_plant)
-            signals = {
-                name: recorded_values(values[None], tuple(of))
-                for name, (values, of) in rows.items()
-            }
-            watch.look(computed_record(np.array([context.get_time()]), signals), is_last=is_last)
-
-    def _outputs(self, context: Context, plant: Plant, at_plant: Context) -> "_Rows":
-        """The signals of the plant with what its controller compares."""
-        dae, controller = plant.dae, self._controller
-        assert controller is not None
-
-        def value(name: str) -> FloatArray:
-            if name == "state":
-                return plant.state(at_plant)
-            if name != "control":
-                return np.array(plant.GetOutputPort(name).Eval(at_plant))
-            port = plant.GetInputPort("control")
-            if port.HasValue(at_plant):
-                return np.array(port.Eval(at_plant))
-            # The plant evaluates the law itself.
-            if not self._diagram.HasOutputPort("control"):
-                return np.zeros(0)
-            return np.array(self._diagram.GetOutputPort("control").Eval(context))
-
-        force, control = value("constraint_force"), value("control")
-        rows: _Rows = {"constraint_force": (force, dae.force_signals)}
-        if control.size:
-            rows["control"] = control, dae.control_signals
-        compared = controller.compared(controller.GetMyContextFromRoot(context), value)
-        if compared is not None:
-            outputs, wanted, signals = compared
-            rows |= {"controlled_output": (outputs, signals), "desired_output": (wanted, signals)}
-        else:
-            rows["controlled_output"] = value("controlled_output"), dae.output_signals
-        return rows

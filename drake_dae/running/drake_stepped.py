@@ -21,10 +21,6 @@ class DrakeSteps:
 
     The states are those of a Simulator, bit by bit. A Simulator takes longer: at each step it
     collects the events of all systems, and copies all their states.
-
-    Args:
-        plant: The plant, with an input port "control".
-        context: Its context at the start; it is changed in place.
     """
 
     def __init__(self, plant: System, context: Context) -> None:
@@ -42,11 +38,7 @@ class DrakeSteps:
         self._part, self._local = stated[0] if len(stated) == 1 else (plant, context)
 
     def step(self, time: float, control: FloatArray) -> None:
-        """Makes the step at a time in s.
-
-        Raises:
-            RuntimeError: Drake finds no step.
-        """
+        """Makes the step at a time in s; a RuntimeError of Drake where it finds none."""
         self._input.GetMutableData().get_mutable_value().SetFromVector(control)
         self._context.SetTime(time)
         self._part.ExecuteForcedEvents(self._local, False)

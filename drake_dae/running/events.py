@@ -23,12 +23,8 @@ def events_within(
     """The times of updates in s, and which rates are due at each, as bits; shapes (k,).
 
     As in Drake, two updates are of one instant if their times offset + k period are the same to the
-    last bit; those of times that differ by round-off follow each other.
-
-    Args:
-        rates: Period and offset of each.
-        times: The times of the rows in s; an update close to one of them is moved to it.
-        with_end: Whether updates at the end count.
+    last bit; those of times that differ by round-off follow each other. An update close to the time
+    of a row is moved to it.
     """
     due: dict[float, int] = {}
     for number, (period, offset) in enumerate(rates):
@@ -69,15 +65,7 @@ def source_period(source: RandomSource) -> float:
 def drawn_noise(
     source: RandomSource, start: float, times: FloatArray, period: float, seed: int | None
 ) -> FloatArray:
-    """The output of Drake's source at the start, and after each of its updates; shape (k + 1, q).
-
-    Args:
-        source: The source.
-        start: The start of the run, in s.
-        times: Its updates, in s.
-        period: Their period, in s.
-        seed: The seed; for None, the numbers are the same in all runs.
-    """
+    """The output of Drake's source at the start and after each of its updates; shape (k + 1, q)."""
     context = source.CreateDefaultContext()
     context.SetTime(start)
     if seed is not None:

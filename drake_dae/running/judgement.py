@@ -7,7 +7,7 @@ from enum import StrEnum
 import numpy as np
 
 from drake_dae.analysis import LimitKind, SignalRange
-from drake_dae.arrays import FloatArray, by_columns
+from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record
 from drake_dae.systems.control.contract import PhaseChange
@@ -52,17 +52,7 @@ class FindingKind(StrEnum):
 
 @dataclass(frozen=True)
 class RunFinding:
-    """What a run shows, as data.
-
-    Attributes:
-        kind: What it is about.
-        text: It in words.
-        decides: The outcome that it leads to; None for a remark.
-        signal: The output, control, force, joint or link, with the unit of the numbers.
-        value, limit: The number found, and the one allowed.
-        time: When, in s.
-        cause: The likely cause, or what to change.
-    """
+    """What a run shows, as data, and the outcome that it leads to; None for a remark."""
 
     kind: FindingKind
     text: str
@@ -76,16 +66,10 @@ class RunFinding:
 
 @dataclass(frozen=True)
 class OutputQuality:
-    """How well an output followed its reference, in its unit.
+    """How well an output followed its reference: z - r, in its unit.
 
-    Attributes:
-        signal: The output.
-        start, largest, final: z - r at the start, the largest |z - r|, and z - r at the end.
-        late_rms: The root mean square of z - r in the second half of the run.
-        off_prediction: The largest deviation of z - r from the predicted error (30).
-        tolerance: The tolerated |z - r|.
-        within_since: The time from which |z - r| stayed within the tolerance, in s; None if it was
-            outside at the end.
+    `off_prediction` is the largest deviation from the predicted error (30); `within_since` the time
+    in s from which |z - r| stayed within the tolerance, None if it was outside at the end.
     """
 
     signal: Signal
@@ -100,14 +84,9 @@ class OutputQuality:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """Whether a run succeeded, and why.
+    """Whether a run succeeded, and why: what decided first, then what else was found.
 
-    Attributes:
-        outcome: Good, bad, or undecided if the run is too short to tell, or is off the prediction
-            for no known reason.
-        findings: What decided first, then what else was found.
-        outputs: The quality of each output.
-        ranges: The forces, controls and joints of the robot beside their limits.
+    It is undecided if it is too short to tell, or is off the prediction for no known reason.
     """
 
     outcome: Outcome
@@ -176,11 +155,8 @@ def _of_task(changes: Sequence[PhaseChange]) -> Iterator[RunFinding]:
         left = ""
         if last.phase == "held" and failures and changes[-2].phase == "leave":
             last, left = failures[-1], ", and has left the contact"
-        text, decides = (
-            f"the task was given up at {last.time:.4g} s{left}: {last.reason}",
-            Outcome.BAD,
-        )
-        failures = []
+        text = f"the task was given up at {last.time:.4g} s{left}: {last.reason}"
+        decides, failures = Outcome.BAD, []
     elif last.phase == "held":
         text, failures = f"the task ended as chosen at {last.time:.4g} s: {last.reason}", []
     elif last.phase == "done":
@@ -294,25 +270,16 @@ def qualities(
     record: Record, predicted: FloatArray, tolerances: Mapping[str, float]
 ) -> list[OutputQuality]:
     """How well each output of a record followed its reference; arguments as of `judge`."""
-    error, times, signals = record["tracking_error"], record.time, record.signals["tracking_error"]
+    error, times = record["tracking_error"], record.time
     if not error.size:
         return []
-    late, default = late_rms(times, error), SHARE * _ranges(record, predicted)
-    found = []
-    for i, signal in enumerate(signals.signals):
+    late, default, found = late_rms(times, error), SHARE * _ranges(record, predicted), []
+    for i, signal in enumerate(record.signals["tracking_error"].signals):
         values, tolerance = error[:, i], tolerances.get(signal.name, float(default[i]))
-        found.append(
-            OutputQuality(
-                signal,
-                start=float(values[0]),
-                largest=float(np.max(np.abs(values))),
-                final=float(values[-1]),
-                late_rms=float(late[i]),
-                off_prediction=float(np.max(np.abs(values - predicted[:, i]))),
-                tolerance=tolerance,
-                within_since=within_since(times, values, tolerance),
-            )
-        )
+        off = float(np.max(np.abs(values - predicted[:, i])))
+        largest, since = float(np.max(np.abs(values))), within_since(times, values, tolerance)
+        ends = float(values[0]), largest, float(values[-1])
+        found.append(OutputQuality(signal, *ends, float(late[i]), off, tolerance, since))
     return found
 
 
@@ -324,8 +291,9 @@ def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
     units = np.array([signal.unit for signal in record.signals["desired_output"].signals])
     for i, unit in enumerate(units.tolist()):
         span = ranges[units == unit].max()
-        is_pure = unit in ("", "rad")
-        sizes[i] = max(span, 1.0) if is_pure else span or largest[units == unit].max() or sizes[i]
+        sizes[i] = span or largest[units == unit].max() or sizes[i]
+        if unit in PURE:
+            sizes[i] = max(span, 1.0)
     return sizes
 
 
@@ -373,15 +341,12 @@ def within_since(times: FloatArray, error: FloatArray, tolerance: float) -> floa
 
 def late_rms(times: FloatArray, errors: FloatArray) -> FloatArray:
     """Root mean squares over the second half of the times, of errors linear between them."""
-    values, middle = by_columns(errors), 0.5 * (times[0] + times[-1])
-    first = int(np.searchsorted(times, middle, side="right"))
-    if first == times.size:
-        return np.abs(values[..., -1])
-    before, after = values[..., first - 1], values[..., first]
-    begin = (after - before) / (times[first] - times[first - 1]) * (middle - times[first - 1])
-    lines = np.concatenate([(before + begin)[..., None], values[..., first:]], axis=-1)
-    steps = np.diff(np.concatenate([[middle], times[first:]]))
-    begins, ends = lines[..., :-1], lines[..., 1:]
+    middle = 0.5 * (times[0] + times[-1])
+    late = np.concatenate([[middle], times[times > middle]])
+    if late.size == 1:
+        return np.abs(errors[-1])
+    lines = np.array([np.interp(late, times, column) for column in errors.T])
+    begins, ends, steps = lines[:, :-1], lines[:, 1:], np.diff(late)
     squares = (begins**2 + begins * ends + ends**2) / 3.0
     sizes: FloatArray = np.sqrt(squares @ steps / steps.sum())
     return sizes

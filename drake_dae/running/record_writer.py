@@ -31,16 +31,11 @@ class RecordWriter:
         with RecordWriter("run.part", loop.record) as writer:
             simulate(loop.diagram, context, 10.0, config, look=writer.update)
 
-    `Record.load` reads the file up to the last append, however the process ends: a line of JSON
-    with names and units, and rows of little-endian float64, the time in s and the signals. It never
-    replaces another file. If an append fails, as on a full disk, a warning is printed once, and the
-    next one is tried later; the run continues.
-
-    Args:
-        path: The file.
-        record: A function of a context and a time in s (or None) that returns the record after this
-            time, such as `ClosedLoop.record`.
-        about: The data to repeat the run, as in `Record`.
+    `record` is a function of a context and a time in s (or None) that returns the record after this
+    time; `about` is that of `Record`. `Record.load` reads the file up to the last append, however
+    the process ends: a line of JSON with names and units, and rows of little-endian float64, the
+    time in s and the signals. It never replaces another file. If an append fails, as on a full
+    disk, a warning is printed once, and the next one is tried later; the run continues.
     """
 
     def __init__(
@@ -70,9 +65,6 @@ class RecordWriter:
         """Appends the new part of the record, if an update is due, without its last row.
 
         At the end of a run the row after the projection replaces it.
-
-        Warns:
-            UserWarning: The file cannot be written to; once.
         """
         if time.perf_counter() < self._next:
             return
@@ -93,12 +85,7 @@ class RecordWriter:
         self._next = done + max(PERIOD, (done - began) / _SHARE)
 
     def finish(self, context: Context) -> None:
-        """Appends the rest of the record.
-
-        Raises:
-            ModelError: The function `record` fails.
-            OSError: The file cannot be written to; it keeps what fits.
-        """
+        """Appends the rest of the record; an OSError if it does not fit."""
         self._append(self._made(context), keep_last=False)
 
     def _made(self, context: Context) -> Record:

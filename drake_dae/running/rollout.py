@@ -8,21 +8,30 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.systems.analysis import SimulatorConfig
+from pydrake.systems.analysis import InitializeParams, Simulator, SimulatorConfig
 from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers
-from drake_dae.blocks.interpreted import run_interpreted
-from drake_dae.blocks.machine import (
-    Stepper,
-    run_alone,
-    run_several,
+from drake_dae.blocks.failures import (
+    cannot_go_on,
+    endless_steps,
+    no_step_leads_on,
+    off_manifold,
+    spoilt_step,
 )
+from drake_dae.blocks.interpreted import PACE_STEPS, run_interpreted
+from drake_dae.blocks.machine import run_alone, run_several
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepSettings
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
-from drake_dae.errors import ModelError, SimulationError
+from drake_dae.errors import (
+    DrakeDaeError,
+    InconsistentStateError,
+    ModelError,
+    NonFiniteError,
+    SimulationError,
+)
 from drake_dae.running.diagnosis import (
     IN_ROLLOUT,
     MANY,
@@ -33,9 +42,9 @@ from drake_dae.running.diagnosis import (
 )
 from drake_dae.running.drake_stepped import run_stepped
 from drake_dae.running.events import Seed
-from drake_dae.running.rollout_failures import failure_of
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, program_of
 from drake_dae.running.simulate import check_config
+from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.compiled import Compiled, check_choice
 
 SEVERAL = 8
@@ -81,17 +90,9 @@ class Rollout:
 def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArray, FloatArray]:
     """Returns start and parameters of a closed loop, or of any diagram, for `rollout`.
 
-    Args:
-        loop: The closed loop or the diagram.
-        context: Its context.
-
-    Returns:
-        The start, shape (n,): the continuous states of all blocks in Drake's order, and then their
-        discrete states, such as the last value of a sensor that samples. The numeric parameters,
-        shape (m,): in a closed loop those of the plant, then of the law's model, and its gains.
-
-    Raises:
-        ModelError: A block cannot be traced; the message has its name and the reason.
+    The start, shape (n,): the continuous states of all blocks in Drake's order, and then their
+    discrete states, such as the last value of a sensor that samples. The numeric parameters,
+    shape (m,): in a closed loop those of the plant, then of the law's model, and its gains.
     """
     program = program_of(loop)
     state, held, values = program.values_in(context)
@@ -117,14 +118,11 @@ def rollout(
     Drake's, with states before their projection. Under error control, steps are those of DOP853
     (Hairer, Norsett and Wanner, 1993) with a thousandth of the accuracy as their error, and rows
     between them are on N*. If a C compiler is found, the whole diagram becomes machine code;
-    otherwise CasADi interprets its functions. If the plant and the model of the law have equal
-    parameters, the plant's acceleration is that which the law commands. Drake steps a
-    `ContactPlant`.
+    otherwise CasADi interprets its functions. Drake steps a `ContactPlant`.
 
     Args:
-        loop: The closed loop, as `make_closed_loop` or `build_scenario` returns it, or any diagram
-            of blocks that can be traced; its record has the vector-valued output ports. Loggers and
-            visualizers in it are ignored.
+        loop: The closed loop, or any diagram of blocks that can be traced; its record has the
+            vector-valued output ports. Loggers and visualizers in it are ignored.
         starts: The states and discrete states at the start, as `start_values` returns them, shape
             (n,) for all runs or (k, n).
         parameters: All parameters, as `start_values` returns them, shape (m,) for all runs or
@@ -138,12 +136,10 @@ def rollout(
             runs have the same noise.
 
     Returns:
-        k runs: one for each start, row of parameters or seed. A run that fails has its failure, and
-        its record ends there.
+        k runs, in the order of starts. A run that fails has its failure, and its record ends there.
 
     Raises:
-        ModelError: Arguments have wrong shapes; or a block cannot be traced, with its name and the
-            reason.
+        ModelError: Shapes are wrong; or a block cannot be traced, with its name and the reason.
         InconsistentStateError: A start is not on N*.
 
     Warns:
@@ -167,9 +163,8 @@ def diagnosed(loop: ClosedLoop, rollout: Rollout, config: SimulatorConfig | None
     if failure is rollout.failure:
         context = loop.diagram.CreateDefaultContext()
         loop.plant.set_state(loop.plant.GetMyMutableContextFromRoot(context), start[1])
-        state = context.get_continuous_state_vector().CopyToVector()
-        config = config or SimulatorConfig()
-        failure = too_long(failure, loop.diagram, context, config, (start[0], state))
+        begun = start[0], context.get_continuous_state_vector().CopyToVector()
+        failure = too_long(failure, loop.diagram, context, config or SimulatorConfig(), begun)
     return replace(rollout, failure=failure)
 
 
@@ -187,12 +182,10 @@ def run_loop(
 ) -> list[Rollout]:
     """Runs as `rollout`; the runs may be some of many, and may be stopped.
 
-    Args:
-        lasting: The total duration of all runs in s, if these are some of many. It alone then
-            decides on machine code, whatever the cache contains: so the numbers do not depend on
-            when they are computed. None if these are all.
-        look: Called from time to time with a function: time in s, or None -> the record after it.
-            Returns whether to stop the run; its record then ends there.
+    `lasting` is the duration of all runs in s, if these are some of many: it alone then decides on
+    machine code, whatever the cache contains, so that numbers do not depend on when they are
+    computed. `look` is called from time to time with a function: time in s, or None -> the record
+    after it; it returns whether to stop the run.
     """
     config = config or SimulatorConfig()
     check_config(config)
@@ -200,7 +193,11 @@ def run_loop(
         program = program_of(loop)
         choice: Compiled = program.choice if compiled is None else compiled
         check_choice("rollout", choice)
-        moments = _times(times)
+        moments = numbers("times", times)
+        if moments.ndim != 1 or moments.size < 2 or not np.isfinite(moments).all():
+            raise ModelError(f"times must be two or more finite numbers, shape (j,), got {times!r}")
+        if not (moments[1:] > moments[:-1]).all():
+            raise ModelError("times must be strictly increasing")
         problems = program.problems(starts, parameters, moments, seeds)
         is_shared = program.shares(problems.parameters, len(problems.state))
 
@@ -208,7 +205,7 @@ def run_loop(
         return look is not None and look(lambda after: program.record(moments, rows(), after))
 
     seconds = len(problems.state) * float(np.ptp(moments)) if lasting is None else lasting
-    is_all, runs = lasting is None, dict[int, Run]()
+    runs = dict[int, Run]()
     for of in (True, False):
         indices = np.flatnonzero(is_shared == of)
         if not indices.size:
@@ -217,12 +214,23 @@ def run_loop(
             kind = program.shared if of else program
             some = kind.reduced(problems, indices)
             settings = StepSettings.of(config, kind.functions, stop)
-            calls = seconds * _calls_per_second(kind, settings)
-            code = kind.machine_code(choice, calls, is_all)
-            lanes = None
+            calls: float = STAGES_PER_SECOND
+            if settings.tableau is not None:
+                calls = len(settings.tableau.b) / settings.longest
+            calls = seconds * (calls + sum(1.0 / rate.period for rate in kind.functions.rates))
+            lanes, code = None, kind.machine_code(choice, calls, lasting is None)
             if code is not None and look is None and indices.size >= SEVERAL:
-                lanes = kind.lanes(choice, FASTER * calls, is_all)
-        runs |= zip(indices.tolist(), _runs(kind, some, settings, code, lanes), strict=True)
+                lanes = kind.machine_code(choice, FASTER * calls, lasting is None, several=True)
+        if code is not None and lanes is not None:
+            made = run_several(lanes, code, some, settings)
+        elif code is not None:
+            made = run_alone(code, some, settings)
+        elif kind.drake is not None:
+            made = [run_stepped(kind, some.run(i), settings) for i in range(indices.size)]
+        else:
+            each = map(some.run, range(indices.size))
+            made = [run_interpreted(kind.functions, one, settings) for one in each]
+        runs |= zip(indices.tolist(), made, strict=True)
     if settings.tableau is None:
         _warn_of_stiffness(program, max(runs.values(), key=lambda run: run.steps), problems)
     found = []
@@ -230,7 +238,7 @@ def run_loop(
         failure = None
         if runs[i].ending not in (RunEnding.DONE, RunEnding.PAUSED):
             with MAKING:
-                failure = failure_of(program, problems.run(i), runs[i])
+                failure = _failure(program, problems.run(i).parameters, runs[i])
         found.append(Rollout(runs[i].steps, failure, program, moments, runs[i].rows))
     return found
 
@@ -246,41 +254,60 @@ def _warn_of_stiffness(program: RolloutProgram, run: Run, problems: RunProblem) 
         warnings.warn(stiffness(rate, pace, run.steps, IN_ROLLOUT), stacklevel=4)
 
 
-def _runs(
+def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> SimulationError:
+    """The exception that the same run raises in Drake's Simulator."""
+    if isinstance(run.error, SimulationError):
+        return run.error
+    plants = [s for s in program.composed.states if isinstance(s, Plant)]
+    state = run.state[program.composed.states[plants[0]] if plants else slice(program.num_states)]
+    trial = None
+    if np.isfinite(run.trial_time) and run.trial is not None:
+        trial = _reason(program, parameters, run.trial_time, run.trial, run.held)
+    match run.ending:
+        case RunEnding.OFF_MANIFOLD:
+            try:
+                program.functions.projected(run.time, run.state, run.held, parameters)
+            except InconsistentStateError as error:
+                return off_manifold(run.time, state, error)
+        case RunEnding.SLOW:
+            return endless_steps(program.name, PACE_STEPS, run.mark, run.time, state)
+        case RunEnding.SPOILT:
+            return spoilt_step(program.name, run.time, run.next, state, trial)
+        case RunEnding.STUCK if trial is not None:
+            return no_step_leads_on(program.name, run.time, state, trial)
+        case RunEnding.STUCK:
+            reason = "no step, however short, is as accurate as it should be"
+            return cannot_go_on(run.time, state, reason, "choose a lower accuracy")
+    found = _reason(program, parameters, run.time, run.state, run.held) or trial
+    return found or NonFiniteError(
+        f"{program.name}: a signal has no value at t = {run.time:.6g} s", run.time, state
+    )
+
+
+def _reason(
     program: RolloutProgram,
-    problems: RunProblem,
-    settings: StepSettings,
-    code: Stepper | None,
-    lanes: Stepper | None,
-) -> list[Run]:
-    """Makes runs, by machine code if there is any, and side by side if there are lanes."""
-    if code is not None and lanes is not None:
-        return run_several(lanes, code, problems, settings)
-    if code is not None:
-        return run_alone(code, problems, settings)
-    each = [problems.run(i) for i in range(len(problems.state))]
-    if program.drake is not None:
-        return [run_stepped(program, problem, settings) for problem in each]
-    return [run_interpreted(program.functions, problem, settings) for problem in each]
-
-
-def _calls_per_second(program: RolloutProgram, settings: StepSettings) -> float:
-    """The number of evaluations in a simulated second."""
-    updates = sum(1.0 / rate.period for rate in program.functions.rates)
-    if settings.tableau is None:
-        return STAGES_PER_SECOND + updates
-    return len(settings.tableau.b) / settings.longest + updates
-
-
-def _times(times: ArrayLike) -> FloatArray:
-    """The times of a record as an array.
-
-    Raises:
-        ModelError: They are not two or more finite numbers that increase.
-    """
-    moments = numbers("times", times)
-    if moments.ndim != 1 or moments.size < 2 or not np.isfinite(moments).all():
-        raise ModelError(f"times must be two or more finite numbers, shape (j,), got {times!r}")
-    if not (moments[1:] > moments[:-1]).all():
-        raise ModelError("times must be strictly increasing")
-    return moments
+    parameters: FloatArray,
+    time: float,
+    state: FloatArray,
+    held: FloatArray,
+) -> SimulationError | None:
+    """What the diagram as wired raises at these values, or within its next samples; or None."""
+    if not np.isfinite(state).all():
+        return None
+    context, diagram = program.context.Clone(), program.diagram
+    program.put(context, time, state, held, parameters)
+    try:
+        diagram.EvalTimeDerivatives(context)
+        for port in program.ports.values():
+            system = port.get_system()
+            port.Eval(context if system is diagram else system.GetMyContextFromRoot(context))
+        if program.functions.rates:
+            simulator = Simulator(diagram, context)
+            simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+            simulator.AdvanceTo(time + 1e-6 * min(r.period for r in program.functions.rates))
+            simulator.AdvancePendingEvents()
+    except SimulationError as error:
+        return error
+    except (DrakeDaeError, RuntimeError):
+        return None
+    return None

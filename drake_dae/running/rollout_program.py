@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise, starmap
 from numbers import Integral
 from threading import RLock
 from typing import Any
@@ -41,36 +42,32 @@ MAKING = RLock()
 
 
 class RolloutProgram:
-    """A diagram as a rollout steps it: its block, whose inputs became parameters and held values.
+    """A closed loop, or any diagram, as a rollout steps it.
 
-    Args:
-        diagram: The diagram.
-        signals: The columns of a row: name of an output port -> names and units of its entries.
-        name: Its name in messages.
-        complete: Adds derived signals to a record.
-        choice: Whether it becomes machine code by default.
-        like: The same without shared parameters; None for that one.
-        context: A context in which input ports without a wire have values; the default if None.
+    It is one block, whose inputs became parameters and held values.
 
     Attributes:
         functions: The functions of the block.
         drake: The `ContactPlant` that Drake steps; None without one.
-
-    Raises:
-        ModelError: A system cannot be traced.
+        signals: The columns of a row: name of an output port -> names and units of its entries.
+        choice: Whether it becomes machine code by default.
     """
 
     def __init__(
         self,
-        diagram: Diagram,
-        signals: Mapping[str, Sequence[Signal]] | None,
-        name: str,
-        complete: Callable[[Record], Record] = lambda record: record,
-        choice: Compiled = "auto",
-        like: "RolloutProgram | None" = None,
+        loop: ClosedLoop | Diagram,
         context: Context | None = None,
+        like: "RolloutProgram | None" = None,
     ) -> None:
-        self.diagram, self.name, self.choice, self._complete = diagram, name, choice, complete
+        """`context` has values of ports without a wire; `like` has no shared parameters."""
+        signals = dict[str, Sequence[Signal]]()
+        self.choice: Compiled = "auto"
+        if isinstance(loop, ClosedLoop):
+            self.diagram, self.name = loop.diagram, loop.plant.get_name()
+            signals, self.choice = {**loop.signals}, loop.plant.dae.compiled
+        else:
+            self.diagram, self.name = loop, loop.get_name() or "the diagram"
+        diagram, self.loop = self.diagram, loop
         self.context, leaves = context or diagram.CreateDefaultContext(), Leaves.of(diagram)
         self.laws = laws_of(leaves.systems)
         for plant, law in self.laws.items() if like is not None else ():
@@ -91,9 +88,7 @@ class RolloutProgram:
         self.composed = composed = compose(
             diagram, wanted, context=self.context, shares=like is not None
         )
-        inside = [self.drake]
-        if isinstance(self.drake, Diagram):
-            inside = Leaves.of(self.drake).systems
+        inside = Leaves.of(self.drake).systems if isinstance(self.drake, Diagram) else [self.drake]
         self.stepped = {name: cut for name, cut in composed.cuts.items() if cut[0] in inside}
         self.block = block = self._without_inputs()
         outputs = {each: block.outputs[each] for each in signals or self.ports}
@@ -115,16 +110,18 @@ class RolloutProgram:
                 "the diagram has no output port with a vector, so that a rollout has nothing to "
                 "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
             )
-        sources = [name for name, (s, _) in composed.cuts.items() if isinstance(s, RandomSource)]
-        self.sources = {each: composed.cuts[each][0] for each in sources}
-        places, first = {}, 0
-        for group, held in self.block.held.items():
-            places[group] = slice(first, first + held.symbol.numel())
-            first += held.symbol.numel()
-        self.held_places, drawn = places, np.zeros(first, dtype=bool)
-        for each in sources:
-            drawn[places[each]] = True
-        self.kept_places = np.flatnonzero(~drawn)
+        self.sources = {
+            name: source
+            for name, (source, _) in composed.cuts.items()
+            if isinstance(source, RandomSource)
+        }
+        sizes = [held.symbol.numel() for held in block.held.values()]
+        ends = np.cumsum([0, *sizes]).tolist()
+        self.held_places = dict(zip(block.held, starmap(slice, pairwise(ends)), strict=True))
+        every = np.arange(ends[-1])
+        drawn = [every[self.held_places[name]] for name in self.sources]
+        self.drawn_places = np.concatenate([every[:0], *drawn])
+        self.kept_places = np.setdiff1d(every, self.drawn_places)
         self._like, self._made = like, dict[str, Any]()
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
@@ -141,13 +138,9 @@ class RolloutProgram:
     @property
     def shared(self) -> "RolloutProgram":
         """The program of runs in which each plant and the model of its law have equal numbers."""
-
-        def make() -> RolloutProgram:
-            return RolloutProgram(
-                self.diagram, self.signals, self.name, self._complete, self.choice, self
-            )
-
-        found: RolloutProgram = self.kept("shared", make) if self.laws else self
+        if not self.laws:
+            return self
+        found: RolloutProgram = self.kept("shared", lambda: RolloutProgram(self.loop, like=self))
         return found
 
     def shares(self, parameters: FloatArray, count: int) -> np.ndarray:
@@ -186,33 +179,23 @@ class RolloutProgram:
             noise=noise,
         )
 
-    def machine_code(self, choice: Compiled, calls: float, is_all: bool) -> Stepper | None:
-        """Its machine code; None if compiling takes longer than it saves.
+    def machine_code(
+        self, choice: Compiled, calls: float, is_all: bool, several: bool = False
+    ) -> Stepper | None:
+        """Its code for one run or several; None if compiling takes longer than it saves.
 
         Code that is already in the cache is used in any case, unless further runs will follow.
         """
-        make = self._pays(choice, calls)
+        tries = attempts("auto", self.functions.num_operations)
+        make = choice is True or any(makes and calls >= least for least, makes in tries)
         if choice is False or self.drake is not None or not (make or is_all):
             return None
-        stepper = self._made.get("code") or load(self.functions, choice, make)
-        self._made["code"] = stepper
-        return stepper
-
-    def lanes(self, choice: Compiled, calls: float, is_all: bool) -> Stepper | None:
-        """As `machine_code`, for several runs side by side."""
-        make = self._pays(choice, calls)
-        if not self.kept("can run several", lambda: can_run_several(self.functions)):
+        if several and not self.kept("lanes do", lambda: can_run_several(self.functions)):
             return None
-        if not (make or is_all):
-            return None
-        stepper = self._made.get("lanes") or load(self.functions, choice, make, several=True)
-        self._made["lanes"] = stepper
-        return stepper
-
-    def _pays(self, choice: Compiled, calls: float) -> bool:
-        """Whether machine code pays that saves so many interpreted evaluations."""
-        tries = attempts("auto", self.functions.num_operations)
-        return choice is True or any(makes and calls >= least for least, makes in tries)
+        name = "lanes" if several else "code"
+        self._made[name] = self._made.get(name) or load(self.functions, choice, make, several)
+        code: Stepper | None = self._made[name]
+        return code
 
     @property
     def drake_state(self) -> slice:
@@ -222,12 +205,7 @@ class RolloutProgram:
         return next(part for part in parts if part.stop - part.start == size)
 
     def values_in(self, context: Context) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """State, held values and parameters in a context of the diagram.
-
-        Raises:
-            ModelError: An input port without a wire has no value in it, or it is that of another
-                diagram.
-        """
+        """State, held values and parameters in a context of the diagram."""
         composed, functions = self.composed, self.functions
         state, held = np.zeros(functions.size), np.zeros(functions.sizes[2])
         for system, part in composed.states.items():
@@ -292,12 +270,7 @@ class RolloutProgram:
         times: FloatArray,
         seeds: Sequence[Seed] | None,
     ) -> RunProblem:
-        """The runs of `rollout`, from its arguments.
-
-        Raises:
-            ModelError: The arguments have wrong shapes.
-            InconsistentStateError: A start is not on N*.
-        """
+        """The runs of `rollout`, from its arguments."""
         functions = self.functions
         rates = [(rate.period, rate.offset) for rate in functions.rates]
         # A discrete plant logs its steps before the updates of their times.
@@ -325,12 +298,8 @@ class RolloutProgram:
         noise = np.array([self._noise(times[0], events, due, seed) for seed in different])
         held = np.zeros((count, functions.sizes[2]))
         held[:, self.kept_places] = states[:, self.num_states :]
-        first = 0
-        for name in self.sources:
-            place = self.held_places[name]
-            size = place.stop - place.start
-            held[:, place] = noise[:, 0, first : first + size]
-            first += size
+        if self.sources:
+            held[:, self.drawn_places] = noise[:, 0]
         state = np.zeros((count, functions.size))
         state[:, : self.num_states] = states[:, : self.num_states]
         rows, noise = np.ascontiguousarray(rows), np.ascontiguousarray(noise[:, 1:])
@@ -342,19 +311,18 @@ class RolloutProgram:
         self, start: float, events: FloatArray, due: np.ndarray, seed: Seed | None
     ) -> FloatArray:
         """The numbers of all sources at the start and at each event, shape (k + 1, q)."""
-        columns = []
+        columns = [np.zeros((events.size + 1, 0))]
         for number, (name, source) in enumerate(self.sources.items()):
-            places = self.held_places[name]
-            (rate,) = (i for i, r in enumerate(self.functions.rates) if places.start in r.places)
-            rows = np.flatnonzero(due >> rate & 1)
-            drawn = np.zeros((events.size + 1, places.stop - places.start))
-            period = self.functions.rates[rate].period
+            place = self.held_places[name]
+            (i,) = (i for i, r in enumerate(self.functions.rates) if place.start in r.places)
+            rows, period = np.flatnonzero(due >> i & 1), self.functions.rates[i].period
             chosen = (seed + number * 2**31) % 2**32 if isinstance(seed, int) else None
             if isinstance(seed, Mapping):
                 chosen = seed.get(source.get_name())
+            drawn = np.zeros((events.size + 1, place.stop - place.start))
             drawn[[0, *(rows + 1)]] = drawn_noise(source, start, events[rows], period, chosen)
             columns.append(drawn)
-        return np.concatenate([np.zeros((events.size + 1, 0)), *columns], axis=1)
+        return np.concatenate(columns, axis=1)
 
     def _check_starts(self, problems: RunProblem) -> None:
         """Refuses starts that are off N*."""
@@ -374,9 +342,6 @@ class RolloutProgram:
         """The block with values of unwired inputs as parameters, and what Drake computes as held.
 
         Its only input is "noise", from which sources of random numbers take their next values.
-
-        Raises:
-            ModelError: A system can be neither traced nor stepped beside the block.
         """
         composed, block = self.composed, self.composed.block
         noise, random, stepped = list[ca.SX](), dict[str, Held](), dict[str, Held]()
@@ -409,34 +374,24 @@ class RolloutProgram:
         for name, entries in self.signals.items():
             start, stop = stop, stop + len(entries)
             signals[name] = recorded_values(columns[start:stop].T, tuple(entries))
-        return self._complete(computed_record(times[first:], signals))
+        record = computed_record(times[first:], signals)
+        return self.loop.with_errors(record) if isinstance(self.loop, ClosedLoop) else record
 
 
 def program_of(loop: ClosedLoop | Diagram) -> RolloutProgram:
-    """The program of a closed loop or of any diagram, which is made once.
-
-    Raises:
-        ModelError: A block cannot be traced, with its name and the reason; or a diagram has no
-            output port with a vector.
-    """
+    """The program of a closed loop or of any diagram, which is made once."""
     with MAKING:
         if isinstance(loop, Diagram):
             return _of_diagram(loop)
         if "program" not in loop.memory:
-            loop.memory["program"] = RolloutProgram(
-                loop.diagram,
-                loop.signals,
-                loop.plant.get_name(),
-                loop.with_errors,
-                loop.plant.dae.compiled,
-            )
+            loop.memory["program"] = RolloutProgram(loop)
         program: RolloutProgram = loop.memory["program"]
     return program
 
 
 @lru_cache(maxsize=4)
 def _of_diagram(diagram: Diagram) -> RolloutProgram:
-    return RolloutProgram(diagram, None, diagram.get_name() or "the diagram")
+    return RolloutProgram(diagram)
 
 
 def _table(what: str, given: ArrayLike, size: int) -> FloatArray:

@@ -3,15 +3,13 @@
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from math import isfinite
-from typing import Self
 
 import numpy as np
 from pydrake.systems.analysis import (
@@ -26,29 +24,18 @@ from tqdm import tqdm
 
 from drake_dae.arguments import checked
 from drake_dae.blocks.traced_system import check_context
-from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError, SimulationError
+from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
 from drake_dae.running.compiled_run import NO_EVENTS, CompiledRun
-from drake_dae.running.diagnosis import RunDiagnosis
-from drake_dae.running.divergence import DiagramWatch
+from drake_dae.running.diagnosis import RunWatch
 from drake_dae.running.interruption import Interruption, ending_signals
 
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
 """The time between updates of the progress bar, or between lines without a terminal, in s."""
 
-PATIENCE = 1.0
-"""The time in s after a signal at which a step is ended in its middle."""
-
 
 @dataclass(frozen=True)
 class RunStatistics:
-    """The statistics of a run.
-
-    Attributes:
-        simulated_time: The simulated time, in s.
-        wall_time: The elapsed time, in s.
-        steps: The number of steps of the integrator.
-        interrupted: The signal that ended it early, SIGINT for Ctrl-C; None otherwise.
-    """
+    """Simulated and elapsed time in s, steps, and the signal that ended a run early, if any."""
 
     simulated_time: float
     wall_time: float
@@ -107,61 +94,51 @@ def simulate(
     check_context(diagram, context)
     check_duration(duration)
     check_config(config)
-    _check_times(config.start_time, duration)
+    start = config.start_time
+    if not np.isfinite(start) or np.spacing(abs(start)) > 1e-9 * duration:
+        raise ModelError(
+            f"start_time must be a time from which {duration:g} s can be counted, got {start:g} s"
+        )
     simulator = Simulator(diagram, context)
     ApplySimulatorConfig(config, simulator)
-    _clear_later(diagram, context, config.start_time)
+    _clear_later(diagram, context, start)
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start, going_on = context.get_time(), EventStatus.DidNothing()
     followers = [function for function in (after_step, look) if function is not None]
-    ending = Interruption()
-    began: float | None = None
-    watch: DiagramWatch | None = None
-    steps, composed = 0, None
-    diagnosis = RunDiagnosis(diagram, context, config, duration)
+    began, composed = 0.0, None
+    watch = RunWatch(diagram, context, config, duration)
     accepted = start, context.get_continuous_state_vector().CopyToVector()
 
     def stop(number: signal.Signals) -> None:
         ending(number)
-        if began is not None:
+        if began:
             simulator.set_monitor(monitor)
-            # In the middle of a long step, a second one ends it between two evaluations.
-            impatience.number = number
-            impatience.start()
+            ending.insist()  # It ends a long step between two evaluations.
 
-    with (
-        _Impatience() as impatience,
-        ending_signals(stop),
-        _StepMonitor(duration, progress) as shown,
-    ):
+    def seen(current: Context, steps: int) -> bool:
+        nonlocal accepted
+        accepted = current.get_time(), current.get_continuous_state_vector().CopyToVector()
+        bar.show(current.get_time() - start)
+        for function in followers:
+            function(current)
+        watch.look(current, steps)
+        return ending.signal is None
 
-        def seen(current: Context, steps: int) -> bool:
-            nonlocal accepted
-            state = current.get_continuous_state_vector().CopyToVector()
-            accepted = current.get_time(), state
-            if progress:
-                shown.update(current.get_time() - start)
-            for function in followers:
-                function(current)
-            if watch is not None:
-                watch.look(current, steps)
-            diagnosis.look(current, steps)
-            return ending.signal is None
+    def monitor(current: Context) -> EventStatus:
+        if seen(current, 1):
+            return going_on
+        return EventStatus.ReachedTermination(diagram, "interrupted")
 
-        def monitor(current: Context) -> EventStatus:
-            if seen(current, 1):
-                return going_on
-            return EventStatus.ReachedTermination(diagram, "interrupted")
-
+    bar = _Progress(duration, progress)
+    with closing(bar), Interruption() as ending, ending_signals(stop):
         try:
             simulator.Initialize()
             began = time.perf_counter()
             if not may_diverge:
-                watch = DiagramWatch(diagram, context, duration)
+                watch.begin(context)
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
-            is_needed = progress or followers or (watch is not None and watch.sees)
-            if is_needed or ending.signal is not None:
+            if progress or followers or watch.sees or ending.signal is not None:
                 simulator.set_monitor(monitor)
             if after_step is None and not config.target_realtime_rate:
                 composed = CompiledRun.of(diagram, context, config, duration)
@@ -171,30 +148,24 @@ def simulate(
                 simulator.AdvanceTo(start + duration)
                 steps = simulator.get_num_steps_taken()
                 simulator.AdvancePendingEvents()
-            steps += 0 if composed is None else composed.steps
+            else:
+                steps = 0
             elapsed = time.perf_counter() - began
-            if watch is not None:
-                watch.look(context, is_last=True)
+            watch.look(context, is_last=True)
         except KeyboardInterrupt:
-            if began is None or not impatience.is_over:
+            if not ending.is_over:
                 raise
             context.SetTimeAndContinuousState(*accepted)
-            steps = simulator.get_num_steps_taken() + (0 if composed is None else composed.steps)
-            elapsed = time.perf_counter() - began
+            steps, elapsed = simulator.get_num_steps_taken(), time.perf_counter() - began
         except (DrakeDaeError, RuntimeError) as error:
-            if began is None and isinstance(error, InconsistentStateError):
+            if not began and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.
-            grown: DrakeDaeError | RuntimeError = error
-            if watch is not None:
-                try:
-                    watch.look(context, states_only=True)  # They may diverge within a few steps.
-                except SimulationError as diverged:
-                    grown = diverged
-            told = diagnosis.explain(grown, context)
+            told = watch.explain(error, context)
             if told is error:
                 raise
             raise told from error
-        shown.finish(context.get_time() - start)
+        bar.show(context.get_time() - start, is_last=True)
+        steps += 0 if composed is None else composed.steps
         return RunStatistics(context.get_time() - start, elapsed, steps, ending.signal)
 
 
@@ -215,25 +186,17 @@ def check_duration(duration: float) -> None:
         raise ModelError(f"a duration must be positive, got {duration} s")
 
 
-def _check_times(start: float, duration: float) -> None:
-    """Checks that floating-point numbers can resolve the times of a run."""
-    if not np.isfinite(start) or np.spacing(abs(start)) > 1e-9 * duration:
-        raise ModelError(
-            f"start_time must be a time from which {duration:g} s can be counted, got {start:g} s"
-        )
-
-
 @cache
-def _schemes() -> tuple[str, ...]:
-    """All integration schemes of Drake except CENIC, which simulates only a MultibodyPlant."""
-    return tuple(name for name in GetIntegrationSchemes() if name != "cenic")
-
-
-@cache
-def _has_error_control(scheme: str) -> bool:
-    trial = Simulator(Integrator(1))
-    ApplySimulatorConfig(SimulatorConfig(integration_scheme=scheme, use_error_control=True), trial)
-    return not trial.get_integrator().get_fixed_step_mode()
+def _schemes() -> dict[str, bool]:
+    """The schemes of Drake, and whether they have error control; CENIC needs a MultibodyPlant."""
+    found = dict[str, bool]()
+    for name in GetIntegrationSchemes():
+        if name != "cenic":
+            trial = Simulator(Integrator(1))
+            config = SimulatorConfig(integration_scheme=name, use_error_control=True)
+            ApplySimulatorConfig(config, trial)
+            found[name] = not trial.get_integrator().get_fixed_step_mode()
+    return found
 
 
 def check_config(config: SimulatorConfig) -> None:
@@ -256,82 +219,48 @@ def check_config(config: SimulatorConfig) -> None:
             f"target_realtime_rate must not be negative, got {config.target_realtime_rate}; 0 is "
             "as fast as possible"
         )
-    if config.use_error_control and not _has_error_control(scheme):
+    if config.use_error_control and not schemes[scheme]:
         raise ModelError(
             f"use_error_control: {scheme} has none; set it to false and max_step_size to the "
             "step, or choose runge_kutta5"
         )
 
 
-class _Impatience:
-    """Sends a signal once more if what it should end lasts, as long as the block is open."""
+class _Progress:
+    """Simulated time and speed on stderr: a bar on a terminal, otherwise lines in long runs."""
 
-    def __init__(self) -> None:
-        self.number, self.is_over = signal.SIGINT, False
-        self._timer = threading.Timer(PATIENCE, self._send)
-        self._timer.daemon = True
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._timer.cancel()
-
-    def start(self) -> None:
-        """Starts to wait."""
-        self._timer.start()
-
-    def _send(self) -> None:
-        self.is_over = True
-        os.kill(os.getpid(), self.number)
-
-
-class _StepMonitor:
-    """Shows simulated time and speed on stderr: a bar on a terminal, otherwise periodic lines."""
-
-    def __init__(self, duration: float, enabled: bool) -> None:
-        self._duration = duration
-        self._enabled = enabled
-        self._terminal = sys.stderr.isatty()
-        self._period = BAR_PERIOD if self._terminal else LINE_PERIOD
+    def __init__(self, duration: float, is_shown: bool) -> None:
+        is_terminal = sys.stderr.isatty()
+        self._period = BAR_PERIOD if is_terminal else LINE_PERIOD
         self._bar = tqdm(
             total=duration,
-            disable=not (enabled and self._terminal),
+            disable=not (is_shown and is_terminal),
             file=sys.stderr,
             **default_size(),
             bar_format="{desc}{percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s{postfix}",
         )
-        self._began = self._shown = time.perf_counter()
+        self._is_shown, self._began = is_shown, time.perf_counter()
+        self._last = self._began
 
-    def __enter__(self) -> Self:
-        return self
+    def show(self, simulated: float, *, is_last: bool = False) -> None:
+        """Shows the simulated time in s if it is due; the last one if there are others."""
+        now = time.perf_counter()
+        is_due = is_last and (not self._bar.disable or self._last > self._began)
+        if not self._is_shown or not (is_due or now - self._last >= self._period):
+            return
+        self._last, speed = now, f"{simulated / (now - self._began):.1f} x real time"
+        with suppress(OSError):  # A closed terminal or pipe must not end the run.
+            if self._bar.disable:
+                text = f"{simulated:.2f}/{self._bar.total:.2f} s, {speed}"
+                print(text, file=sys.stderr, flush=True)
+            else:
+                self._bar.set_postfix_str(speed, refresh=False)
+                self._bar.n = min(simulated, self._bar.total)
+                self._bar.refresh()
 
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
         with suppress(OSError):
             self._bar.close()
-
-    def update(self, simulated: float) -> None:
-        """Shows the simulated time in s, if an update is due."""
-        if self._enabled and time.perf_counter() - self._shown >= self._period:
-            self._show(simulated)
-
-    def finish(self, simulated: float) -> None:
-        """Shows the end of the run; as a line only for long runs."""
-        if self._terminal or self._shown > self._began:
-            self._show(simulated)
-
-    def _show(self, simulated: float) -> None:
-        self._shown = time.perf_counter()
-        speed = f"{simulated / (self._shown - self._began):.1f} x real time"
-        # A closed terminal or pipe must not end the run.
-        with suppress(OSError):
-            if self._terminal:
-                self._bar.set_postfix_str(speed, refresh=False)
-                self._bar.n = min(simulated, self._duration)
-                self._bar.refresh()
-            elif self._enabled:
-                text = f"{simulated:.2f}/{self._duration:.2f} s, {speed}"
-                print(text, file=sys.stderr, flush=True)
 
 
 def default_size() -> dict[str, int]:

@@ -41,14 +41,8 @@ _FORCES = (LimitKind.FORCE, LimitKind.CONTROL, LimitKind.EFFORT)
 class RunSummary:
     """What is told about a run: `text` and `data` say the same.
 
-    Attributes:
-        judgement: Whether it succeeded.
-        record: Its record.
-        changes: The starts of phases of a task.
-        statistics: How it ran; None for a failed run, or one of an earlier time.
-        remedies: What to look at next, beside the causes of the findings.
-        notes: What is approximate in it, a sentence each.
-        accuracy: The accuracy of error control; None with fixed steps.
+    `remedies` are what to look at beside the causes of the findings, `notes` what is approximate,
+    and `accuracy` that of error control; statistics are None for a failed run.
     """
 
     judgement: Judgement

@@ -15,7 +15,7 @@ from runs import scenario
 
 from drake_dae import DaePlant, DaeSystem, simulate
 from drake_dae.errors import SimulationError, SingularityError, WiringError
-from drake_dae.running.diagnosis import RunDiagnosis, fastest_rate
+from drake_dae.running.diagnosis import RunWatch, fastest_rate
 from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
 
@@ -128,7 +128,7 @@ def test_a_stiff_loop_says_so_and_an_implicit_scheme_is_silent():
     def told(scheme, duration):
         context = plant.CreateDefaultContext()
         config = SimulatorConfig(integration_scheme=scheme, accuracy=1e-6)
-        watch = RunDiagnosis(plant, context, config, 400.0)
+        watch = RunWatch(plant, context, config, 400.0)
         with warnings.catch_warnings(record=True) as found:
             warnings.simplefilter("always")
             look = lambda now: watch.look(now, 1)  # noqa: E731

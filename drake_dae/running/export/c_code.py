@@ -10,17 +10,21 @@ from typing import Self
 
 import casadi as ca
 import numpy as np
-from pydrake.systems.framework import Context
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import Context, Diagram
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import stacked
-from drake_dae.blocks.compose import Composed
+from drake_dae.blocks.compose import Composed, Port
 from drake_dae.blocks.stepping import StepFunctions
 from drake_dae.dae import Signal
-from drake_dae.errors import ModelError
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.trace.compiled import generate, renamed, without_branches
 
 TEMPLATES = Path(__file__).with_name("c99")
+
+MOST = 2000
+"""The largest number of steps of a run that is played to exported code."""
 
 Vectors = Mapping[str, Sequence[Signal]]
 """Name of a vector -> names and units of its entries."""
@@ -31,16 +35,9 @@ class BlockCode:
     """A block as functions in C, and its numbers at a start.
 
     Each input of the block is a parameter of these functions: first come the parameters of the
-    block, then inputs that keep their value in the context, and last those of each step.
-
-    Attributes:
-        steps: The functions; with "begin", the held values at the start, if some of `held` are nan.
-        inputs: Names of inputs that come with each step, with their signals.
-        outputs: Names of outputs, with their signals.
-        parameters: Names and units of the parameters, without inputs of each step.
-        values: Their defaults.
-        places: Name of an input that keeps its value -> its place among the parameters.
-        held: The held values at the start; nan where "begin" has them.
+    block, then inputs that keep their value in the context (`places`), and last `inputs`, those of
+    each step. `parameters` and `values` are without these. Held values that are nan at the start
+    come from the function "begin".
     """
 
     steps: StepFunctions
@@ -210,3 +207,67 @@ def string(text: str) -> str:
         for byte in text.encode()
     )
     return f'"{"".join(plain)}"'
+
+
+def write_replay(
+    code: BlockCode, kind: str, name: str, folder: str | Path, run: str, words: Mapping[str, str]
+) -> list[Path]:
+    """Writes play_name_kind.c, name_kind_run.csv, a Makefile and the licence; see play.c."""
+    own = identifiers(code.outputs).items()
+    sizes = braced([f"{{{string(key)}, {len(signals)}}}" for key, signals in own])
+    file = f"{file_of(name)}_{kind}"
+    files = {f"play_{file}.c": "play.c", "Makefile": "Makefile", "LICENSE.txt": "LICENSE.txt"}
+    common = {"kind": kind, "KIND": kind.upper(), "most": str(MOST), "output_sizes": sizes}
+    paths = written(folder, files, {**code.words(name), **common, **words})
+    table = Path(folder) / f"{file}_run.csv"
+    table.write_text(run, encoding="utf-8")
+    return [*paths, table]
+
+
+def recorded_run(
+    diagram: Diagram,
+    context: Context,
+    config: SimulatorConfig,
+    times: Sequence[float],
+    code: BlockCode,
+    inputs: Mapping[str, Port],
+    outputs: Mapping[str, Port],
+    acts_at_once: bool = False,
+) -> str:
+    """A run as CSV: each line has the time in s, the inputs, and the resulting outputs.
+
+    Inputs are those before the updates of the instant, outputs those after, or at once before.
+    """
+    simulator = Simulator(diagram, context.Clone())
+    ApplySimulatorConfig(config, simulator)
+    own = simulator.get_mutable_context()
+    own.SetTime(context.get_time())
+    own.SetAccuracy(config.accuracy)
+    simulator.Initialize()
+
+    def values(ports: Mapping[str, Port]) -> list[float]:
+        columns = [
+            system.get_output_port(index).Eval(system.GetMyContextFromRoot(own))
+            for system, index in ports.values()
+        ]
+        return np.concatenate([np.zeros(0), *columns]).tolist()
+
+    vectors = *code.inputs.values(), *code.outputs.values()
+    names = [signal.name.replace(",", " ") for signals in vectors for signal in signals]
+    lines = [",".join(["time", *names])]
+    for time in times:
+        try:
+            if time > own.get_time():
+                simulator.AdvanceTo(time)
+            row = [own.get_time(), *values(inputs)]
+            if acts_at_once:
+                row += values(outputs)
+            simulator.AdvancePendingEvents()
+            if not acts_at_once:
+                row += values(outputs)
+        except SimulationError:
+            if len(lines) == 1:
+                raise
+            break
+        lines.append(",".join(map(repr, row)))
+    return "\n".join([*lines, ""])

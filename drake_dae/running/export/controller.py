@@ -23,14 +23,16 @@ from drake_dae.blocks.compose import Composed, Leaves, Port, compose, leaf_input
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.c_code import (
+    MOST,
     BlockCode,
     Vectors,
     file_of,
     generated,
+    recorded_run,
     signals_of,
+    write_replay,
     written,
 )
-from drake_dae.running.export.replay import MOST, recorded_run, write_replay
 from drake_dae.systems.plants.contract import Plant
 
 CONTROL = "control"
@@ -90,18 +92,20 @@ def export_controller(
         ModelError: The controller acts continuously, or has a block that cannot be exported.
         OSError: A file cannot be written.
     """
-    part, file, start = controller_of(loop, context), file_of(name), context.get_time()
-    ticks, first = part.ticks, part.ticks.at(start)
+    part, diagram = (
+        controller_of(loop, context),
+        loop if isinstance(loop, Diagram) else loop.diagram,
+    )
+    ticks, start, code = part.ticks, context.get_time(), part.code
     count = max(1, min(MOST, floor(duration / ticks.period + 1e-9)))
-    times = [ticks.time(tick) for tick in range(first, first + count)]
-    code, ports = part.code, (part.inputs, part.outputs)
-    given = context, config or SimulatorConfig(), times, code, *ports, part.acts_at_once
-    run = recorded_run(part.diagram, *given)
+    times = [ticks.time(ticks.at(start) + k) for k in range(count)]
+    given = times, code, part.inputs, part.outputs, part.acts_at_once
+    run = recorded_run(diagram, context, config or SimulatorConfig(), *given)
     words = part.words(name, start)
-    files = {f"{file}_controller.{end}": f"controller.{end}" for end in ("h", "c")}
+    files = {f"{file_of(name)}_controller.{end}": f"controller.{end}" for end in ("h", "c")}
     step = {"step": STEP.format(prefix=words["prefix"]), "calls": "1000000"}
-    written_files = written(folder, files, words)
-    return [*written_files, *write_replay(code, "controller", name, folder, run, step)]
+    made = written(folder, files, words)
+    return [*made, *write_replay(code, "controller", name, folder, run, step)]
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,6 @@ class Ticks:
 class ControllerPart:
     """The controller of a diagram, and the ports of its inputs and outputs in the diagram."""
 
-    diagram: Diagram
     code: BlockCode
     ticks: Ticks
     inputs: Mapping[str, Port]
@@ -235,7 +238,6 @@ def controller_of(loop: ClosedLoop | Diagram, context: Context) -> ControllerPar
     inputs = {name: signals for name, signals in inputs.items() if name in measured}
     code = BlockCode.of(replace(composed, block=block), context, inputs, known)
     return ControllerPart(
-        diagram,
         code,
         Ticks.of([(rate.period, rate.offset) for rate in code.steps.rates], plant.time_step),
         {name: leaf_port(measured[name]) for name in inputs},

@@ -14,14 +14,16 @@ from drake_dae.blocks.stepping import FIXED, tableau_of
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import ModelError
 from drake_dae.running.export.c_code import (
+    MOST,
     BlockCode,
     Vectors,
     file_of,
     numbers,
     prefix_of,
+    recorded_run,
+    write_replay,
     written,
 )
-from drake_dae.running.export.replay import MOST, recorded_run, write_replay
 
 SCHEME, LONGEST = "runge_kutta5", 1e-3
 """The method and its longest step in s in place of error control, which no export has."""
@@ -46,15 +48,16 @@ def export_loop(
     config: SimulatorConfig | None = None,
     duration: float = 1.0,
 ) -> list[Path]:
-    """Writes a whole loop as C99 that runs over time, in fixed steps.
+    """Writes a whole loop, or any diagram that can be compiled, as C99 that runs over time.
 
-    Plant, sensors and controller are integrated by the stepper of rollouts; name_loop.h describes
-    the functions. Outputs are the signals of a record; of a diagram, its vector output ports. The
-    program play_name_loop.c compares with a recorded run of Drake's Simulator, name_loop_run.csv,
-    in the same steps; `make` in the folder runs it.
+    Plant, sensors and controller are integrated by the stepper of rollouts, in fixed steps;
+    name_loop.h describes the functions. Outputs are the signals of a record; of a diagram, its
+    vector output ports. The program play_name_loop.c compares with a recorded run of Drake's
+    Simulator from the context on, name_loop_run.csv, in the same steps; `make` in the folder runs
+    it.
 
     Args:
-        loop: The closed loop, or any diagram that can be compiled; see `compile_diagram`.
+        loop: The closed loop or the diagram; see `compile_diagram`.
         context: Its context at the start; not changed.
         name: The name of the files, and, as a C identifier, the prefix of the functions.
         folder: The folder to write to; created if it does not exist. Files are overwritten.
@@ -62,13 +65,9 @@ def export_loop(
             steps are at most 1 ms by `runge_kutta5`.
         duration: The duration of the run that is compared, in s; at most 2000 steps.
 
-    Returns:
-        The paths of the files.
-
     Raises:
         ModelError: It has Drake's own contact, noise, or a block that cannot be traced; or the
             fixed steps are of an implicit method.
-        OSError: A file cannot be written.
     """
     diagram = loop if isinstance(loop, Diagram) else loop.diagram
     known: Vectors = {}
@@ -79,16 +78,14 @@ def export_loop(
     composed = compose(diagram, ports, context=context, shares=False)
     check_traced(composed, "the loop")
     code, start = BlockCode.of(composed, context, {}, known), context.get_time()
-    scheme, longest = fixed_steps(config)
-    same = SimulatorConfig(
-        integration_scheme=scheme, max_step_size=longest, use_error_control=False
-    )
-    times = [start + k * longest for k in range(max(1, min(MOST, round(duration / longest))))]
+    scheme, step = fixed_steps(config)
+    same = SimulatorConfig(integration_scheme=scheme, max_step_size=step, use_error_control=False)
+    times = [start + k * step for k in range(max(1, min(MOST, round(duration / step))))]
     outputs = {n: leaf_port(diagram.GetOutputPort(n)) for n in code.outputs}
     run = recorded_run(diagram, context, same, times, code, {}, outputs)
     files = write_loop(code, start, name, folder, config)
-    step = {"step": STEP.format(prefix=prefix_of(name)), "calls": "20000"}
-    return [*files, *write_replay(code, "loop", name, folder, run, step)]
+    words = {"step": STEP.format(prefix=prefix_of(name)), "calls": "20000"}
+    return [*files, *write_replay(code, "loop", name, folder, run, words)]
 
 
 def check_traced(composed: Composed, what: str) -> None:

@@ -142,6 +142,11 @@ class Mender:
                 f"{place}: no joint of type '{name}' is read, but {', '.join(_TYPES[kind])}; two "
                 "joints that move together are a !JointCoupler under constraints"
             )
+        # Drake damps no free body, and limits no ball joint.
+        part = {"free": "damping", "ball": "range"}.get(name, "") if kind == ".xml" else ""
+        values = [number_in(word) for word in joint.attrib.pop(part, "").split()]
+        if any(values) and (part == "damping" or joint.get("limited") != "false"):
+            self.lost[f"joint/{part}"].append(place)
         for owner in (joint, *(joint.find(way) for way in ("limit", "axis/limit", "axis2/limit"))):
             if owner is None:
                 continue

@@ -12,6 +12,15 @@ ARMATURE = "joint/armature"
 
 _TURNS = {"quat", "axisangle", "euler", "xyaxes", "zaxis"}
 
+_ONE_DEFAULT = {
+    "actuator": ["general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"],
+    "equality": ["equality"],
+}
+"""Parents whose elements have one and the same default -> the names under which it is written."""
+
+_OF_GENERAL = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}
+"""What motors and servos set themselves, whatever is the default."""
+
 
 def prepare(root: Element, file: Path) -> None:
     """Writes an MJCF file so that each element says all that it means, where it means it.
@@ -34,6 +43,11 @@ def prepare(root: Element, file: Path) -> None:
             equality.remove(constraint)
         for constraint in equality:
             constraint.attrib.pop("active", None)
+    for joint in root.iter("joint"):  # MuJoCo takes an empty range for none.
+        if "limited" not in joint.attrib and not any(
+            map(number_in, joint.get("range", "").split())
+        ):
+            joint.attrib.pop("range", None)
     for motor in [*root.iterfind("actuator/motor"), *root.iterfind("actuator/position")]:
         if motor.tag == "position":  # Its control is a position, and has no limit of efforts.
             motor.tag = "motor"
@@ -74,15 +88,20 @@ def _apply_defaults(root: Element) -> None:
     def collect(default: Element, inherited: Mapping[str, dict[str, str]], name: str) -> None:
         own = dict(inherited)
         for node in default:
-            if node.tag != "default":
-                own[node.tag] = own.get(node.tag, {}) | node.attrib
+            tags = (tag for tag, names in _ONE_DEFAULT.items() if node.tag in names)
+            tag = next(tags, node.tag)
+            own[tag] = own.get(tag, {}) | node.attrib
         classes[default.get("class", name)] = own
         for child in default.iterfind("default"):
             collect(child, own, "")
 
     def apply(owner: Element, inherited: str) -> None:
         for node in owner:
-            values = classes.get(node.attrib.pop("class", inherited), {}).get(node.tag, {})
+            tag = owner.tag if owner.tag in _ONE_DEFAULT else node.tag
+            known = classes.get(node.attrib.pop("class", inherited), {})
+            values = {} if node.tag in _ONE_DEFAULT else known.get(tag, {})
+            if node.tag in ("motor", "position"):
+                values = {key: value for key, value in values.items() if key not in _OF_GENERAL}
             if _TURNS & node.attrib.keys():
                 values = {key: value for key, value in values.items() if key not in _TURNS}
             node.attrib.update({**values, **node.attrib})

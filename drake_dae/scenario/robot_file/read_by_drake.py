@@ -20,7 +20,9 @@ robot: drake:linear_spring_damper drake:ball_constraint drake:distance_constrain
 robot: drake:tendon_constraint drake:collision_filter_group
 robot: | version sensor ros2_control disable_collisions link_group group verbose plugin mujoco
 gazebo: | * reference joint=never constraint=never gravity=1 turnGravityOff=0 springStiffness=0
-gazebo: | dampingFactor=0 kinematic=0
+gazebo: velocity_decay | dampingFactor=0 kinematic=0 static=0 link=never model=never axis=never
+gazebo: | inertial=never
+velocity_decay: | linear=0 angular=0
 link: name inertial visual collision contact drake:surface_velocity_axis | gravity=1 kinematic=0
 link: | type origin self_filter collision_checking surface self_collide sensor
 contact: | * inertia_scaling=1
@@ -47,7 +49,7 @@ _SDF = """
 sdf: version model world | light actor
 world: name model frame include joint | light scene physics gui plugin atmosphere wind
 world: | gravity=earth magnetic_field spherical_coordinates audio state population road actor
-include: uri name pose placement_frame static | plugin
+include: uri name pose placement_frame static merge | plugin experimental:params=never
 model: name canonical_link placement_frame pose static link joint frame include model
 model: drake:joint drake:linear_bushing_rpy drake:linear_spring_damper drake:ball_constraint
 model: drake:distance_constraint drake:tendon_constraint drake:collision_filter_group
@@ -157,7 +159,7 @@ def take_lost(
     for child in element:
         parts.append((child.tag, (child.text or "").strip() or child.get("value", ""), child))
     for name, value, node in parts:
-        is_foreign = ":" in name and not name.startswith("drake:")
+        is_foreign = ":" in name and name not in table and not name.startswith("drake:")
         other = (name.startswith("xmlns"), "") if is_foreign else table.get("*", (True, "never"))
         is_read, meant = table.get(name, other)
         part = f"{element.tag}/{name}"

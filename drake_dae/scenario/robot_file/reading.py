@@ -44,7 +44,6 @@ RobotLinks = tuple[MultibodyExpressions, list[Constraint]]
 """The links of a robot, and its loop-closing joints as constraints."""
 
 _REMEDIES = {
-    "inertia": "it takes the nearest possible moments of inertia",
     "friction": "robot.known_forces has friction as a !JointFriction",
     "mimic": "constraints has joints that move together as a !JointCoupler",
     "equality/joint": "constraints has joints that move together as a !JointCoupler",
@@ -234,6 +233,7 @@ def _told(mender: Mender) -> str:
     """The message for what Drake does not read of the files."""
     text = "; ".join(f"{part} ({_listed(places)})" for part, places in mender.lost.items())
     ways = [f"leave_out: [{', '.join(mender.lost)}] under robot"]
+    ways += ["it takes the nearest possible moments of inertia"] if "inertia" in mender.lost else []
     ways += [hint for word, hint in _REMEDIES.items() if any(word in part for part in mender.lost)]
     if any(part.startswith(DRIVES) for part in mender.lost):
         ways.append("or name the driven joints under robot.actuators")

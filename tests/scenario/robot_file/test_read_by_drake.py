@@ -177,6 +177,15 @@ LOST = {
             "</robot>",
             "<gazebo><turnGravityOff>true</turnGravityOff></gazebo></robot>",
         ),
+        "gazebo/inertial": (
+            "</robot>",
+            '<gazebo reference="a"><inertial><mass>9</mass></inertial></gazebo></robot>',
+        ),
+        "gazebo/axis": ("</robot>", '<gazebo reference="j"><axis/></gazebo></robot>'),
+        "velocity_decay/linear": (
+            "</robot>",
+            "<gazebo><velocity_decay><linear>1</linear></velocity_decay></gazebo></robot>",
+        ),
         "link/gravity": ("</link>", "<gravity>0</gravity></link>"),
         "contact/inertia_scaling": (
             "</link>",
@@ -216,6 +225,11 @@ LOST = {
         ),
         "joint/actuatorfrcrange": ('<joint name="l"', '<joint name="l" actuatorfrcrange="-1 1"'),
         "joint/armature": ('<joint name="l"', '<joint type="ball" armature="0.1"'),
+        "joint/damping": (
+            "<worldbody>",
+            '<worldbody><body name="e"><joint type="free" damping="2"/><geom size="1"/></body>',
+        ),
+        "joint/range": ('<joint name="l"', '<joint name="l" type="ball" range="0 1"'),
         "body/gravcomp": ('<body name="b"', '<body name="b" gravcomp="1"'),
         "body/frame": ("<geom", "<frame><body/></frame><geom"),
         "mujoco/tendon": ("<equality>", '<tendon><fixed name="t"/></tendon><equality>'),
@@ -230,6 +244,7 @@ LOST = {
         "inertia": ('"0.3 0.4 0.5"', '"3 0.4 0.5"'),
     },
 }
+READ_IN_PART = "motor/forcerange", "joint/armature", "joint/damping", "joint/range"
 CASES = [(kind, part, *change) for kind, lost in LOST.items() for part, change in lost.items()]
 
 
@@ -249,7 +264,7 @@ def test_what_is_lost_is_an_error_with_its_name_until_it_is_left_out(
     with pytest.raises(ModelError, match=rf"leave_out: \[{part}\]"):
         read_robot(robot)
     finalize(read_robot(Robot(str(file), leave_out=[part]))[0])
-    if "/" not in part or part in ("motor/forcerange", "joint/armature"):
+    if "/" not in part or part in READ_IN_PART:
         return  # Drake refuses it, or reads it in part.
     try:
         assert facts(text, kind) == facts(WHOLE[kind], kind) or part.startswith("transmission")
@@ -259,6 +274,7 @@ def test_what_is_lost_is_an_error_with_its_name_until_it_is_left_out(
 
 HARMLESS = {
     ".urdf": [
+        ("</robot>", "<gazebo><velocity_decay/><static>0</static></gazebo></robot>"),
         ('damping="0.5"/>', 'damping="0.5" friction="0.0"/>'),
         (
             "</link>",
@@ -278,6 +294,8 @@ HARMLESS = {
         ('<joint name="l"', '<joint name="l" stiffness="0" solreflimit="0.1 1" margin="1"'),
         ("<worldbody>", '<default><joint stiffness="0"/></default><sensor/><worldbody><light/>'),
         ("<equality>", '<equality><joint joint1="j" joint2="k" active="false"/>'),
+        ("<worldbody>", '<default><equality solref="0.1 1"/></default><worldbody>'),
+        ('range="-1 2"', 'range="0 0"'),
     ],
 }
 
@@ -289,3 +307,30 @@ def test_what_changes_no_equation_passes(kind: str, old: str, new: str, tmp_path
     assert old in WHOLE[kind]
     (tmp_path / f"robot{kind}").write_text(WHOLE[kind].replace(old, new, 1))
     finalize(read_robot(Robot(str(tmp_path / f"robot{kind}")))[0])
+
+
+@pytest.mark.parametrize("tag", ["motor", "general", "position"])
+def test_all_kinds_of_actuators_have_one_default(tag: str, tmp_path: Path):
+    """MuJoCo keeps one actuator per class: limits in it are of motors and of servos."""
+    default = f'<default><{tag} forcerange="-7 7" gear="3"/></default><worldbody>'
+    text = MJCF.replace("<worldbody>", default).replace(' forcerange="-4 4"', "", 2)
+    text = text.replace('<motor name="n"', '<position name="n" kp="9"')
+    (tmp_path / "robot.xml").write_text(text)
+    plant = read_robot(Robot(str(tmp_path / "robot.xml")))[0]
+    limits = [plant.GetJointActuatorByName(name).effort_limit() for name in "mn"]
+    assert limits == [2.0 * 3.0, 3.0 * 7.0]  # Of m the own gear and control, within 2 times 7.
+
+
+def test_changes_of_an_included_model_are_not_lost(tmp_path: Path):
+    (tmp_path / "arm.sdf").write_text(SDF)
+    text = """<sdf version="1.9" xmlns:experimental="e"><model name="m"><include><uri>arm.sdf</uri>
+    <experimental:params><link element_id="a" action="remove"/></experimental:params>
+    </include></model></sdf>"""
+    (tmp_path / "robot.sdf").write_text(text)
+    with pytest.raises(ModelError, match="include/experimental:params"):
+        read_robot(Robot(str(tmp_path / "robot.sdf")))
+    merged = text[: text.index("<include")] + (
+        '<include merge="true"><uri>arm.sdf</uri></include></model></sdf>'
+    )
+    (tmp_path / "robot.sdf").write_text(merged)
+    assert read_robot(Robot(str(tmp_path / "robot.sdf")))[0].HasJointNamed("j")

@@ -67,8 +67,7 @@ from drake_dae.dae import with_disturbance
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout_program import RolloutProgram
 from drake_dae.systems import CommandedReferences, Observing, PointMaterial
-from drake_dae.systems.control.limits import ControlLimits
-from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.control.drives import ControlHold, ControlLimits, Sampling
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 
@@ -279,7 +278,7 @@ def in_context(name):
         system.set_consistent_state(own, system.structure.states[1])
     elif isinstance(system, TrackingController):
         diagram.GetInputPort("in 0").FixValue(context, system.law.structure.states[1])
-    return system, diagram, context, RolloutProgram(diagram, None, name, context=context.Clone())
+    return system, diagram, context, RolloutProgram(diagram, context.Clone())
 
 
 def check_functions(diagram, context, program, tolerance):
@@ -341,9 +340,7 @@ def test_any_plant_of_equations_is_traced(name):
     diagram, context = alone(plant)
     own = plant.GetMyMutableContextFromRoot(context)
     plant.set_consistent_state(own, plant.structure.states[0])
-    check_functions(
-        diagram, context, RolloutProgram(diagram, None, name, context=context.Clone()), 1e-12
-    )
+    check_functions(diagram, context, RolloutProgram(diagram, context.Clone()), 1e-12)
 
 
 def test_a_system_that_cannot_be_traced_is_named():
@@ -352,7 +349,7 @@ def test_a_system_that_cannot_be_traced_is_named():
     builder.ExportInput(system.get_input_port(0), "in")
     builder.ExportOutput(system.get_output_port(0), "out")
     with pytest.raises(ModelError, match="'my block'"):
-        RolloutProgram(builder.Build(), None, "")
+        RolloutProgram(builder.Build())
 
 
 def test_an_input_without_connection_or_value_is_named():
@@ -361,7 +358,7 @@ def test_an_input_without_connection_or_value_is_named():
     builder.ExportInput(gain.get_input_port(), "in")
     builder.ExportOutput(gain.get_output_port(), "out")
     diagram = builder.Build()
-    program, context = RolloutProgram(diagram, None, ""), diagram.CreateDefaultContext()
+    program, context = RolloutProgram(diagram), diagram.CreateDefaultContext()
     with pytest.raises(ModelError, match="'u0' of 'my gain'"):
         program.values_in(context)
     diagram.get_input_port().FixValue(context, [1.0, -2.0])
