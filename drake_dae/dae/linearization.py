@@ -184,39 +184,20 @@ class _PlantModel:
         rate, force = moved[:n], moved[n:]
         v, u, r = ca.SX.sym("v", m), ca.SX.sym("u", p), ca.SX.sym("r", n)
         balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
-        balance -= ca.mtimes(system.mass_matrix, r)
-        outputs = {
-            "mass": system.mass_matrix,
-            "g": system.g,
-            "h": system.h,
-            "balance": ca.jacobian(balance, x),
-            "k": ca.jacobian(system.k, x),
-            "z": ca.jacobian(system.outputs(v), x),
-            "m": system.m,
-        }
-        dense = {name: ca.densify(value) for name, value in outputs.items()}
-        function = system.trace("linearization", dense, {"r": r, "v": v, "u": u}, often=False)
-        values = function(self.state, rate, force, control, self.parameters)
-        shapes = [value.shape for value in outputs.values()]
-        mass, g, h, slope, k_slope, z_slope, z_force = (
-            value.reshape(shape) for value, shape in zip(values, shapes, strict=True)
-        )
+        rows = ca.vertcat(balance - ca.mtimes(system.mass_matrix, r), system.k, system.outputs(v))
+        slopes = ca.jacobian(rows, ca.vertcat(x, v, u))
+        outputs = {"mass": ca.densify(system.mass_matrix), "slopes": ca.densify(slopes)}
+        function = system.trace("linearization", outputs, {"r": r, "v": v, "u": u}, often=False)
+        mass, whole = function(self.state, rate, force, control, self.parameters)
+        whole = whole.reshape(slopes.shape)
+        A, B, C = whole[: n + m, : n + m], whole[: n + m, n + m :], whole[n + m :, : n + m]
         # In descriptor form, in (x, v).
-        E = np.block([[mass, np.zeros((n, m))], [np.zeros((m, n + m))]])
-        A = np.block([[slope, g], [k_slope, np.zeros((m, m))]])
-        B = np.vstack([h, np.zeros((m, p))])
+        E = np.zeros((n + m, n + m))
+        E[:n, :n] = mass.reshape(n, n)
         unknowns = (*system.state_signals, *system.constraint_input_signals)
         signals = (tuple(inputs), system.output_signals)
-        no_feedthrough = np.zeros((system.num_outputs, forward.shape[1]))
-        descriptor = LinearModel(
-            E,
-            A + B @ feedback,
-            B @ forward,
-            np.hstack([z_slope, z_force]),
-            no_feedthrough,
-            unknowns,
-            *signals,
-        )
+        none = np.zeros((system.num_outputs, forward.shape[1]))
+        descriptor = LinearModel(E, A + B @ feedback, B @ forward, C, none, unknowns, *signals)
         # On N*: (dx', dv) = by_state dx + by_control du, and dv out of du.
         of_x, of_v = feedback[:, :n], feedback[:, n:]
         around = np.eye(p) - of_v @ by_control[n:]
@@ -228,8 +209,8 @@ class _PlantModel:
             np.eye(free.size),
             (by_state[:n] @ basis)[free],
             by_input[free],
-            (z_slope + z_force @ by_state[n:]) @ basis,
-            z_force @ by_input[n:],
+            (C[:, :n] + C[:, n:] @ by_state[n:]) @ basis,
+            C[:, n:] @ by_input[n:],
             tuple(system.state_signals[i] for i in free),
             *signals,
         )

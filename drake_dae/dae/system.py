@@ -325,17 +325,14 @@ class DaeSystem:
         pivot: ca.SX | None = None,
         regular: str = "a matrix",
         often: bool = True,
-        doubt: ca.SX | None = None,
-        lean: bool = False,
     ) -> TracedFunction:
         """Compiles expressions to a function of the state, of other inputs and of the parameters.
 
         Further inputs stand between these; the other arguments are those of `TracedFunction`.
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
-        return TracedFunction(
-            f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled, doubt, lean
-        )
+        whole = f"{self.name} {name}"
+        return TracedFunction(whole, every, outputs, pivot, regular, often, self.compiled)
 
     def agree(self, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
         """Returns whether two expressions agree at random states around the nominal state.
