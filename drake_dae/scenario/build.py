@@ -26,9 +26,7 @@ from drake_dae.dae import (
     with_disturbance,
 )
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.drives import hold_before
-from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.diagrams.state_feedback import make_sensor
+from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.references import Reference

@@ -50,7 +50,7 @@ from drake_dae.scenario.typed_yaml import (
     load_lines,
     load_yaml,
 )
-from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.control.drives import Sampling
 from drake_dae.systems.task import phases
 from drake_dae.trace.compiled import Compiled
 

@@ -105,9 +105,8 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
                 designs[repr(gains)] = controller.law.design(gains.design())
             at_controller = controller.GetMyMutableContextFromRoot(context)
             controller.set_gains(at_controller, designs[repr(gains)])
-    loop.set_seed(context, 0 if force is None else force.seed)
-    if loop.encoders is not None and encoders is not None:
-        loop.encoders.set_seed(context, encoders.seed)
+    seed = 0 if force is None else force.seed
+    loop.set_seed(context, seed, None if encoders is None else encoders.seed)
 
 
 def _at_rest(
