@@ -27,7 +27,7 @@ from drake_dae import (
 from drake_dae.diagrams.record import Record
 from drake_dae.diagrams.wiring import log_steps
 from drake_dae.errors import ModelError
-from drake_dae.scenario.robot_file.reading import add_robot
+from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.systems import PointMaterial
 from drake_dae.systems.plants.contract import Plant
@@ -41,7 +41,7 @@ def contact():
     robot = load_scenario(find_scenario("two_link_wall")).robot
     return ContactPlant(
         found.model,
-        lambda plant, scene_graph: add_robot(robot, plant, scene_graph),
+        lambda plant, scene_graph: read_robot(robot, plant, scene_graph),
         ContactMaterial(),
         structure=found.structure,
     )
