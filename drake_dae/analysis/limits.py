@@ -34,37 +34,31 @@ class LimitKind(StrEnum):
 
 @dataclass(frozen=True)
 class Excess:
-    """A signal where it exceeds its limit most: its value, the time in s, and the limit.
-
-    The limit is 0 for a force that can only push, and for |F_t| - mu F_n of a friction cone.
-    """
+    """A signal where it exceeds its limit most; the limit of a force that can only push is 0."""
 
     signal: Signal
     kind: LimitKind
-    value: float
+    value: float  # Of a friction cone |F_t| - mu F_n, whose limit is 0.
     time: float
     limit: float
 
     def __str__(self) -> str:
-        name, unit = self.signal.name, f" {self.signal.unit}".rstrip()
-        value, limit = f"{abs(self.value):.4g}{unit}", f"{abs(self.limit):.4g}{unit}"
+        name, unit, when = self.signal.name, f" {self.signal.unit}".rstrip(), f"{self.time:.4g} s"
         if self.kind is LimitKind.POSITION:
             value, limit = f"{digits(self.value)}{unit}", f"{digits(self.limit)}{unit}"
-            return f"{name} comes to {value} at {self.time:.4g} s, beyond its limit of {limit}"
+            return f"{name} comes to {value} at {when}, beyond its limit of {limit}"
+        value = f"{abs(self.value):.4g}{unit}"
         if self.kind is LimitKind.CONE:
-            return f"{name} is left by {value} at {self.time:.4g} s"
+            return f"{name} is left by {value} at {when}"
         if not self.limit:
-            return f"{name} would pull with {value} at {self.time:.4g} s: a real contact opens"
-        share = f"{self.value / self.limit:.3g} times its limit of {limit}"
-        return f"{name} has {value} at {self.time:.4g} s, {share}"
+            return f"{name} would pull with {value} at {when}: a real contact opens"
+        share = f"{self.value / self.limit:.3g} times its limit of {abs(self.limit):.4g}{unit}"
+        return f"{name} has {value} at {when}, {share}"
 
 
 @dataclass(frozen=True, eq=False)
 class SignalRange:
-    """The least and the largest value of a signal along a motion with their times, and its limits.
-
-    `beyond_time` is the first time beyond a limit, None if there is none.
-    """
+    """The least and the largest value of a signal along a motion, when they are, and its limits."""
 
     signal: Signal
     kind: LimitKind
@@ -74,7 +68,7 @@ class SignalRange:
     largest_time: float
     low: float
     high: float
-    beyond_time: float | None
+    beyond_time: float | None  # The first time beyond a limit.
 
     @property
     def room(self) -> float:
@@ -111,14 +105,10 @@ class SignalRange:
 
 
 class SignalLimits:
-    """Limits low <= s <= high of signals s(x, u, lambda), where lambda are all constraint forces.
+    """Limits low <= s <= high of k signals s(x, u, lambda), where lambda are all constraint forces.
 
-    Args:
-        system: The system.
-        signals, kinds: Names and units of s, k of them, and what each limit is on.
-        values: s, shape (k, 1), in `system.state` and the symbols.
-        bounds: low and high, shape (2, k), infinite without a limit.
-        symbols: Those of u and lambda.
+    `values` is s in `system.state` and the `symbols` of u and lambda, and `bounds` are low and
+    high, shape (2, k), infinite without a limit.
     """
 
     def __init__(
@@ -140,13 +130,13 @@ class SignalLimits:
     def of_motion(self, motion: PinnedMotion) -> FloatArray:
         """The rows of s along a motion with pinned outputs."""
         rows = motion.states, motion.controls, motion.constraint_inputs, motion.parameters
-        return np.array([self.pinned_values(*row)[0].copy() for row in zip(*rows, strict=True)])
+        return np.array([self.pinned_values(*row)[0] for row in zip(*rows, strict=True)])
 
     def of_record(self, record: Record) -> FloatArray:
         """The rows of s in a record of the system."""
         signals = (record["state"], record["control"], record["constraint_force"])
         p = self.system.parameter_values
-        rows = [self._values(*row, p)[0].copy() for row in zip(*signals, strict=True)]
+        rows = [self._values(*row, p)[0] for row in zip(*signals, strict=True)]
         return np.array(rows).reshape(len(rows), len(self.signals))
 
     def ranges(self, times: FloatArray, values: FloatArray) -> tuple[SignalRange, ...]:
@@ -167,44 +157,25 @@ class SignalLimits:
         return tuple(found)
 
     def worst(self, times: FloatArray, values: FloatArray) -> Excess | None:
-        """The largest excess that depends on the pace, as a share of its limit.
-
-        Of a limit of 0 the share is that of the signal's largest value.
-        """
-        ranges = [r for r in self.ranges(times, values) if r.kind is not LimitKind.POSITION]
-        shares = {
-            excess: abs(excess.value - excess.limit)
-            / (abs(excess.limit) or max(abs(r.least), abs(r.largest)))
-            for r in ranges
-            if (excess := r.excess)
-        }
+        """The excess that depends on the pace and is the largest share of its limit, or signal."""
+        shares = {}
+        for r in self.ranges(times, values):
+            if r.kind is not LimitKind.POSITION and (excess := r.excess):
+                size = abs(excess.limit) or max(abs(r.least), abs(r.largest))
+                shares[excess] = abs(excess.value - excess.limit) / size
         return max(shares, key=lambda excess: shares[excess], default=None)
 
 
 def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> SignalLimits:
-    """The limits of drives, joint forces, positions, speeds, pushing forces and friction cones.
-
-    Raises:
-        ModelError: A cone, of a contact that must not slide, names a force that is not there.
-    """
+    """The limits of drives, joint forces, positions, speeds, pushing forces and friction cones."""
     dae, links, loops = model.dae, model.links, model.loop_joints
-    control = ca.SX.sym("u", dae.num_controls)
-    force, forces = ca.SX.sym("force", len(dae.force_signals)), dae.force_signals
-    names = [signal.name for signal in forces]
-    nq, nv = links.q.numel(), links.v.numel()
+    control, forces = ca.SX.sym("u", dae.num_controls), dae.force_signals
+    force, names = ca.SX.sym("force", len(forces)), [signal.name for signal in forces]
+    nq, nv, half = links.q.numel(), links.v.numel(), len(loops.signals) // 2
     q, v = slice(nq), slice(nq, nq + nv)
-    half = len(loops.signals) // 2
-    pushes = {
-        signal.name
-        for constraint in model.constraints
-        for signal, is_one in zip(constraint.force_signals, constraint.is_unilateral, strict=True)
-        if is_one
-    }
     most, effort, (low, high) = model.control_limits, links.effort_limits, loops.limits
-    least, free = (
-        [0.0 if name in pushes else -np.inf for name in names],
-        np.full(len(names), np.inf),
-    )
+    pushes = [one for constraint in model.constraints for one in constraint.is_unilateral]
+    least, free = np.where(pushes, 0.0, -np.inf), np.full(len(names), np.inf)
     groups: list[tuple[LimitKind, Sequence[Signal], ca.SX, Any, Any]] = [
         (LimitKind.CONTROL, dae.control_signals, control, -most, most),
         (LimitKind.EFFORT, links.actuator_signals, model.joint_force, -effort, effort),
@@ -237,10 +208,9 @@ def robot_limits(model: RobotModel, cones: Sequence[FrictionCone] = ()) -> Signa
 
 @dataclass(frozen=True)
 class LimitsAlong:
-    """The largest excess along references, and the remedy.
+    """The largest excess along references r(t), and the remedy.
 
-    The references r(c t) keep all limits with `rate`, the largest such c in (0, 1); where it is
-    None, `reason` says why.
+    r(c t) keep all limits with `rate`, the largest such c below 1; if None, `reason` says why.
     """
 
     excess: Excess
@@ -261,12 +231,11 @@ def limits_along(
     reference: Callable[[float], FloatArray],
     motion: PinnedMotion,
 ) -> LimitsAlong | None:
-    """Returns which limit references exceed most, and the remedy; None if they keep all limits.
+    """Which limit the reference of a motion exceeds most, and the remedy; None if it keeps all.
 
-    The references r(s) with s = c t have the derivatives c^j r^(j). On Z(R) speeds grow with c, the
-    accelerations in u (28) and v (35) with c^2, gravity and commanded forces not at all. The time
-    with the largest excess is slowed by bisection until its limits hold, then the next one. The
-    motion is that along the reference t -> R(t), of `ZeroDynamics.motion`.
+    r(s) with s = c t has the derivatives c^j r^(j). On Z(R) speeds grow with c, the accelerations
+    in u (28) and v (35) with c^2, gravity and commanded forces not at all. The time with the
+    largest excess is slowed by bisection until its limits hold, then the next one.
     """
     times, p, layout, system = motion.times, motion.parameters, structure.layout, structure.system
     excess = limits.worst(times, limits.of_motion(motion))
@@ -287,7 +256,7 @@ def limits_along(
         at = pinned.at(goal, p[i])
         point = at.point(at.state(motion.states[i]))
         values = limits.pinned_values(point.state, point.control, point.constraint_input, p[i])
-        return values[0].copy()
+        return values[0]
 
     def worst(rate: float, chosen: Sequence[int] = range(times.size)) -> Excess | None:
         return limits.worst(times[list(chosen)], np.array([slowed(i, rate) for i in chosen]))

@@ -15,8 +15,6 @@ so that E and A = dc/dx E^-1 g are factored once. For a robot E holds M(q), and 
 """
 
 from collections.abc import Sequence
-from typing import Any
-from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -25,13 +23,11 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import (
     Factorization,
-    Factors,
     PositiveDefiniteFactorization,
     block_stages,
     nonzeros,
     saddle_point_solver,
 )
-from drake_dae.trace.functions import count_operations
 
 
 class Derivatives:
@@ -85,11 +81,10 @@ class Derivatives:
         gradient = ca.sparsify(self.constraint_gradient[:, self._rows].T)
         if system.agree(gradient, g_rows):
             gradient = g_rows
-        self._matrix = ca.blockcat(
-            mass[self._rows, self._rows], -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1])
-        )
+        E = mass[self._rows, self._rows]
+        self._matrix = ca.blockcat(E, -g_rows, gradient.T, ca.SX(g.shape[1], g.shape[1]))
         self._unknowns, self.constraint_matrix, self.pivot = saddle_point_solver(
-            _factors_of(system, self._rows), g_rows, gradient
+            PositiveDefiniteFactorization(E), g_rows, gradient
         )
         if system.frictional_contacts:
             self.pivot = ca.fmin(
@@ -315,33 +310,6 @@ class Derivatives:
             return expression
         symbols = ca.vertcat(*self._symbols[1 : orders + 1])
         return ca.substitute(expression, symbols, ca.vertcat(*self._values[:orders]))
-
-
-_CHOSEN: WeakKeyDictionary[Any, tuple[list[int], ca.SX, Factors]] = WeakKeyDictionary()
-"""`DaeSystem.factorize` -> rows, E of these rows and columns, and factors: a robot's systems with
-and without a disturbance have the same."""
-
-
-def _factors_of(system: DaeSystem, rows: list[int]) -> Factors:
-    """Returns factors of some rows and columns of E, by `DaeSystem.factorize` if they are shorter.
-
-    They are those of another system with the same function, rows and E, if there is one.
-    """
-    mass, factorize = system.mass_matrix[rows, rows], system.factorize
-    if factorize is None:
-        return PositiveDefiniteFactorization(mass)
-    before, same, chosen = _CHOSEN.get(factorize, (None, mass, None))
-    if chosen is not None and before == rows and ca.is_equal(same, mass):
-        return chosen
-    chosen = triangle = PositiveDefiniteFactorization(mass)
-    if (other := factorize(rows)) is not None:
-        right = ca.SX.sym("right", len(rows))
-        solutions = other.solve(right), triangle.solve(right)
-        counts = [count_operations(solution) for solution in solutions]
-        if counts[0] < counts[1] and system.agree(*solutions, right):
-            chosen = other
-    _CHOSEN[factorize] = rows, mass, chosen
-    return chosen
 
 
 def lie_derivative(expression: ca.SX, field: ca.SX, state: ca.SX) -> ca.SX:

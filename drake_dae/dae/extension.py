@@ -344,7 +344,6 @@ def _integrated(
         nominal_state=np.concatenate([system.nominal_state, nominal]),
         state_scale=scale,
         mass_matrix=ca.diagcat(system.mass_matrix, ca.SX.eye(q)),
-        factorize=None,
         implicit=None,  # The derivatives of the constraints may differ.
     )
 

@@ -127,7 +127,6 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
         system,
         mass_matrix=system.mass_matrix + added,
         implicit=None if inner is None else implicit,
-        factorize=None,
         state_scale=system.scale,
     )
 

@@ -17,7 +17,7 @@ from drake_dae.dae.fields import checked_fields, fields_of_functions
 from drake_dae.dae.signals import Exogenous, Parameter, Signal, parameter_slice, parameter_symbol
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
-from drake_dae.trace.factorization import Factors, PositiveDefiniteFactorization
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
 
@@ -64,7 +64,6 @@ class DaeSystem:
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
         implicit: (x', v) -> E x' - f - g v and the derivatives of L_f^(r_i - 1) k_i along x', if
             that takes fewer operations: for a robot it is inverse dynamics.
-        factorize: Rows of E -> its factors, or None: for a long robot articulated bodies.
         sharing: The forces of redundant constraints, from `share_forces`.
         control_metric, free_control: W, shape (p, p), and u_0: with more controls than outputs (28)
             takes u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0), nearest to u_0. Make the
@@ -98,7 +97,6 @@ class DaeSystem:
     name: str = "system"
     mass_matrix: ca.SX = None
     implicit: Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None = None
-    factorize: Callable[[Sequence[int]], Factors | None] | None = None
     sharing: ForceSharing | None = None
     control_metric: ca.SX = None
     free_control: ca.SX = None
@@ -174,7 +172,6 @@ class DaeSystem:
             h=solved[:, 1 + m :],
             mass_matrix=None,
             implicit=None,
-            factorize=None,
             state_scale=self.scale,
         )
 

@@ -17,10 +17,7 @@ from drake_dae.trace.functions import TracedFunction
 
 @dataclass(frozen=True, eq=False)
 class Wrenches:
-    """The wrenches of k constraints on a robot at one time, in the world, shapes (k, 3).
-
-    Points of application in m, forces at these points in N, and moments in N m.
-    """
+    """The wrenches of k constraints on a robot at one time, in the world, shapes (k, 3)."""
 
     points: FloatArray
     forces: FloatArray
@@ -28,18 +25,9 @@ class Wrenches:
 
 
 class ConstraintWrenches:
-    """The points, forces and moments of the constraints of a robot, as a fast function.
+    """The points, forces and moments of the constraints of a robot that act at a point.
 
-    Args:
-        model: The robot.
-        parameters: Values of all parameters; the defaults if None.
-
-    Attributes:
-        constraints: The constraints that act at a point.
-        frames: The frame that each of these acts on.
-        with_moment: Whether each of these has a moment besides its force.
-        function: (q, v, lambda, parameters) -> points, forces and moments,
-            shapes (3, k).
+    `frames` are those that they act on; `with_moment` says which have a moment besides the force.
     """
 
     def __init__(self, model: RobotModel, parameters: ArrayLike | None = None) -> None:
@@ -81,12 +69,9 @@ def own_values(constraint: Constraint, dae: DaeSystem, parameters: FloatArray) -
 def contact_normals(model: RobotModel) -> TracedFunction:
     """(x, parameters) -> the normal of each constraint of one force, toward the robot, (3 m, 1).
 
-    It is the force on the robot per unit of constraint force without sliding, and so without
-    friction. The component of the contact force along it is the constraint force.
+    It is the force on the robot per unit of constraint force without sliding, so without friction.
     """
-    links = model.links
-    kinematics = links.kinematics()
+    kinematics, v = model.links.kinematics(), model.links.v
     axes = [a.force_axes for _, _, a in ConstraintSet(model.constraints).acting(kinematics)]
-    v = links.v
     normals = ca.substitute(kinematics.value(ca.vertcat(ca.SX(0, 1), *axes)), v, 0 * v)
     return model.dae.trace("normals", {"normals": ca.densify(normals)})

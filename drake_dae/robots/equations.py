@@ -13,7 +13,6 @@ from drake_dae.robots.actuation.stage import ActuationChain, diagonal_parameter
 from drake_dae.robots.constraints.constraint_set import ConstraintSet, LoopState
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.loads import Load
-from drake_dae.trace.factorization import BlockFactors, Factors, PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -59,17 +58,6 @@ def robot_equations(
         stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
         return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
 
-    def factorize(rows: Sequence[int]) -> Factors | None:
-        first = rows[0] if rows else 0
-        if first > nq or list(rows) != list(range(first, nq + nv + k)):
-            return None
-        bodies = links.articulated_bodies(np.diag(reflected) * (not driven.carries_rotors))
-        if bodies is None:
-            return None
-        others = (ca.SX.eye(nq - first), driven.mass)
-        before, after = ((PositiveDefiniteFactorization(e), e.shape[0]) for e in others)
-        return BlockFactors([before, (bodies, nv), after])
-
     return DaeSystem(
         state=ca.vertcat(links.q, links.v, driven.state),
         mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - moved, driven.mass),
@@ -99,7 +87,6 @@ def robot_equations(
         state_scale=np.ones(nq + nv + k),  # For SI units and angles.
         name=name,
         implicit=implicit,
-        factorize=factorize,
         control_metric=ca.diag(choice[0].symbol) if choice else None,
         free_control=choice[1].symbol if choice else None,
         contacts=bound.contacts(links),

@@ -1,6 +1,6 @@
 """A scenario as a closed loop."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, cast
@@ -8,10 +8,10 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.blocks.block import NOTHING, Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
@@ -26,15 +26,11 @@ from drake_dae.dae import (
     with_disturbance,
 )
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.drives import hold_before
-from drake_dae.diagrams.parts import add_block
-from drake_dae.diagrams.recorded import further_signals, log_signals, signals_of_plant
-from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.diagrams.state_feedback import make_sensor
+from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.references import Reference
-from drake_dae.robots import Links, RobotModel, ScaledForce
+from drake_dae.robots import RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.form import at, each
 from drake_dae.scenario.gains import advised
@@ -44,14 +40,11 @@ from drake_dae.scenario.model import (
     references_of,
     scenario_structure,
 )
-from drake_dae.scenario.parts import Poles
-from drake_dae.scenario.plants import IdealConstraints
+from drake_dae.scenario.parts import Poles, ScenarioTask
 from drake_dae.scenario.robot_file.reading import add_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
-from drake_dae.scene.view import add_live_view
 from drake_dae.systems.control.contract import Controller, Derived
-from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.task.contacts import open_contact
 from drake_dae.systems.task.controller import TaskController
@@ -84,10 +77,10 @@ def build_completed(
     """
     # The robot, with the outputs and the start that the scenario leaves out.
     check_task(scenario)
-    scene_graph = SceneGraph()
+    drawn = {"scene_graph": (scene_graph := SceneGraph()), "meshcat": meshcat}
     completed, model, structure = completed_model(scenario, scene_graph)
     if not model.dae.num_controls:
-        return completed, _mechanism(completed.scenario, model, scene_graph, meshcat)
+        return completed, _mechanism(completed.scenario, model, **drawn)
     if structure is None:
         try:
             structure = scenario_structure(model)
@@ -98,21 +91,21 @@ def build_completed(
 
     # The gains, with what belongs to them.
     chosen = advised(completed.scenario, model, structure)
-    scenario, task = chosen.scenario, chosen.scenario.task
+    scenario, task, sensors = chosen.scenario, chosen.scenario.task, chosen.scenario.sensors
 
     # The plant. In an ideal one a payload is a further body, and the course of a disturbance an
     # exogenous signal; the law knows neither. Masses and forces are parameters, set at the start.
-    plant_exogenous, has_more = None, scenario.plant.payloads or scenario.plant.disturbances
-    _check_disturbances(scenario.plant.disturbances, model.links)
-    if has_more and not scenario.plant.carries:
-        pushes = {f"plant_disturbance_{i}": d for i, d in enumerate(scenario.plant.disturbances)}
+    disturbances, plant_exogenous = scenario.plant.disturbances, None
+    each("plant.disturbances", disturbances, lambda d: model.links.position(d.frame, d.point))
+    if (scenario.plant.payloads or disturbances) and not scenario.plant.carries:
+        pushes = {f"plant_disturbance_{i}": d for i, d in enumerate(disturbances)}
         forces = [ScaledForce(d.frame, d.point, name, d.force) for name, d in pushes.items()]
         known = [*scenario.robot.known_forces, *forces]
         moving: dict[str, Any] = {f"{name}.course": [d.course] for name, d in pushes.items()}
         robot = replace(scenario.robot, known_forces=known)
         own = replace(scenario, robot=robot, exogenous={**scenario.exogenous, **moving})
-        scene_graph = SceneGraph()
-        _, of_plant, _ = completed_model(own, scene_graph, scenario.plant.payloads)
+        drawn["scene_graph"] = SceneGraph()
+        _, of_plant, _ = completed_model(own, drawn["scene_graph"], scenario.plant.payloads)
         plant = make_plant(own, of_plant, scenario_structure(of_plant))
         plant_exogenous = exogenous_references(own, plant.dae, plant.exogenous_layout.degrees)
     else:
@@ -127,16 +120,18 @@ def build_completed(
         exogenous = exogenous_references(scenario, law.system, law.exogenous_degrees)
 
     # The parts between plant and law; errors get the key of the part.
-    force = scenario.sensors.force
-    with at("sensors.force"):
-        sensor = None if force is None else force.sensor(model.dae.num_constraints)
-    with at("saturation"):
-        limits = model.control_limits if scenario.saturation else None
-        if limits is not None and not np.any(np.isfinite(limits)):
-            raise ModelError("the robot's file has no effort limits, or not of these controls")
+    sensor, limits = None, None
+    if sensors.force is not None:
+        with at("sensors.force"):
+            sensor = sensors.force.sensor(model.dae.num_constraints)
+    if scenario.saturation:
+        limits = model.control_limits
+        if not np.any(np.isfinite(limits)):
+            text = "the robot's file has no effort limits, or not of these controls"
+            raise ScenarioError(("saturation", text))
     settings = LoopSettings(
         sensor=sensor,
-        encoders=scenario.sensors.encoders,
+        encoders=sensors.encoders,
         sampling=scenario.sampling,
         control_limits=limits,
         observer=scenario.estimator,
@@ -155,19 +150,15 @@ def build_completed(
             make_sensor(plant, settings.encoders, period)
     with at("judgement.tolerances"):
         outputs_named(scenario.judgement.tolerances, model.dae.output_signals)
-        for name, tolerated in scenario.judgement.tolerances.items():
-            if tolerated is not None:
-                positive(name, tolerated)
 
     # The controller and the loop.
-    drawn = {"scene_graph": scene_graph, "meshcat": meshcat}
     if task is not None:
         with at("task"):
-            controller = _task_controller(scenario, model, law, period)
+            controller = _task_controller(scenario, task, model, law, period)
             loop = wire_loop(plant, controller, None, settings, **drawn)
     else:
         keys = ["estimator"] if scenario.estimator is not None else []
-        keys += ["sensors.force"] if force is not None or keys else []
+        keys += ["sensors.force"] if sensor is not None or keys else []
         with at(" or ".join(keys) or "start.positions"):
             loop = make_closed_loop(plant, law, references, settings, **drawn)
     loop.memory["gains"] = {repr(scenario.law.gains): None}  # Those of the law.
@@ -181,17 +172,6 @@ def make_plant(scenario: Scenario, model: RobotModel, structure: ConstraintStruc
         return scenario.plant.plant(model, structure, add)
     except InconsistentStateError as error:  # Its default state is projected.
         raise ScenarioError(("start.positions", str(error))) from error
-
-
-def _check_disturbances(disturbances: Sequence[DisturbanceForce], links: Links) -> None:
-    """Refuses disturbances that do not act on a frame of the robot."""
-
-    def check(disturbance: DisturbanceForce) -> None:
-        links.position(disturbance.frame, disturbance.point)
-        if disturbance.frame == "world":
-            raise ModelError("a disturbance on the world moves nothing; name a frame of the robot")
-
-    each("plant.disturbances", disturbances, check)
 
 
 def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) -> TrackingLaw:
@@ -222,6 +202,12 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             with at("estimator.identify"):
                 observed = with_disturbance(model.dae, velocities, estimator.identify)
             structure = find_structure(observed)
+    # The mean time from a sample to the moment when its control acts, for rigid joints. A plant
+    # that steps by h damps with the speed at the end of each step: h / 2 later than the mean, and h
+    # later than a law without sampling, which acts at each step.
+    sampling, material = scenario.sampling, scenario.plant.material
+    step = 0.0 if material is None else material.time_step
+    latency = step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
     with at(" or ".join(keys)):
         return TrackingLaw(
             structure.system,
@@ -232,21 +218,8 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             constraint_damping=None if damping is None else damping.design(),
             integral=settings.integral or (),
             contact_stiffness=settings.contact_stiffness,
-            latency=latency_of(scenario, model),
+            latency=0.0 if model.stages else latency,
         )
-
-
-def latency_of(scenario: Scenario, model: RobotModel) -> float:
-    """The mean time from a sample to the moment when its control acts, for rigid joints, in s.
-
-    A plant that steps by h damps with the speed at the end of each step: h / 2 later than the mean,
-    and h later than a law without sampling, which acts at each step.
-    """
-    sampling, material = scenario.sampling, scenario.plant.material
-    step = 0.0 if material is None else material.time_step
-    if model.stages:
-        return 0.0
-    return step if sampling is None else sampling.delay + (sampling.period + step) / 2.0
 
 
 def check_task(scenario: Scenario) -> None:
@@ -258,7 +231,7 @@ def check_task(scenario: Scenario) -> None:
         problems.append(("references", "a task has the references of its phases; leave them out"))
     names = [name for name in task.make().watched("signal") if name not in task.signals]
     problems += [(f"task.signals.{name}", "needed: a phase watches it") for name in names]
-    if isinstance(scenario.plant, IdealConstraints):
+    if scenario.plant.material is None:
         text = (
             "ideal constraints neither open nor strike, as a task needs it: take !CompliantContact "
             "or !MultibodyPlant"
@@ -271,23 +244,21 @@ def check_task(scenario: Scenario) -> None:
 
 
 def _task_controller(
-    scenario: Scenario, model: RobotModel, law: TrackingLaw, period: float
+    scenario: Scenario, task: ScenarioTask, model: RobotModel, law: TrackingLaw, period: float
 ) -> TaskController:
     """The controller of a task: the law in contact, and one with the contact open."""
-    task = scenario.task
-    assert task is not None
-    assert scenario.law.gains is not None  # advised.
-    noise = float(np.max(scenario.sensors.force_noise))
     points = opening_contact(scenario, model)
     forces = [signal.name for point in points for signal in point.force_signals]
-    free_system = open_contact(law.system, forces)
+    free_system, gains = open_contact(law.system, forces), task.gains or scenario.law.gains
+    assert gains is not None  # advised.
     with at("task.gains" if task.gains else "law.gains"):
         structure = find_structure(free_system)
-        gains = (task.gains or scenario.law.gains).design()
-        free_law = TrackingLaw(free_system, gains, structure=structure, latency=law.latency)
+        free_law = TrackingLaw(
+            free_system, gains.design(), structure=structure, latency=law.latency
+        )
     # The noise of the sum over the points.
-    made = task.make(noise * len(points) ** 0.5)
-    return TaskController(made, law, free_law, sample_period=period or 1e-3)
+    noise = float(np.max(scenario.sensors.force_noise)) * len(points) ** 0.5
+    return TaskController(task.make(noise), law, free_law, sample_period=period or 1e-3)
 
 
 class _NoLaw:
@@ -335,24 +306,11 @@ class _NoController(TracedSystem, Controller):
         return np.zeros((times.size, 0))
 
 
-def _mechanism(
-    scenario: Scenario, model: RobotModel, scene_graph: SceneGraph, meshcat: Meshcat | None
-) -> ClosedLoop:
+def _mechanism(scenario: Scenario, model: RobotModel, **drawn: Any) -> ClosedLoop:
     """The loop of a mechanism that nothing drives."""
     for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
         if getattr(scenario, key):
             raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
     structure = find_constraint_structure(model.dae)
-    plant, controller = make_plant(scenario, model, structure), _NoController(structure)
-    builder = DiagramBuilder()
-    for block in (plant, controller):
-        add_block(builder, block)
-    builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
-    control = controller.GetOutputPort("control")
-    builder.Connect(control, plant.GetInputPort("control"))
-    named = signals_of_plant(plant, None, None, None, control) | further_signals(plant)
-    log = log_signals(builder, plant, controller, named)
-    if meshcat is not None:
-        add_live_view(builder, plant, scene_graph, meshcat, None)
-    diagram, signals = builder.Build(), {name: tuple(of) for name, (_, of) in named.items()}
-    return ClosedLoop(diagram, plant, controller, None, log, signals, scene_graph)
+    plant = make_plant(scenario, model, structure)
+    return wire_loop(plant, _NoController(structure), **drawn)

@@ -6,25 +6,19 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context
 
 from drake_dae.analysis import (
     Analysis,
     LimitKind,
     LimitsAlong,
-    Part,
-    SignalLimits,
     SignalRange,
     Table,
     along,
     analyze,
-    count_of,
     digits,
-    examine,
     limits_along,
     robot_limits,
-    to_markdown,
     to_text,
 )
 from drake_dae.arrays import FloatArray
@@ -34,7 +28,7 @@ from drake_dae.diagrams.record import Record
 from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
-from drake_dae.robots import Constraint, LinkBehind, RobotModel, links_behind, own_values
+from drake_dae.robots import Constraint, LinkBehind, RobotModel, Surface, links_behind, own_values
 from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
@@ -49,7 +43,6 @@ from drake_dae.scenario.model import (
     references_of,
     scenario_structure,
 )
-from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.trace.functions import TracedFunction
 
@@ -79,20 +72,20 @@ class Feasibility:
     Attributes:
         analysis: The result of `analyze`, around the start and along the reference.
         duration: The duration of the scenario, in s.
-        ranges: Controls, joint forces, positions and speeds of joints, and constraint forces.
+        gains: Why no gains can be computed where they are left out, else empty.
         is_resolved: Whether the times resolve the reference; otherwise values between them are not
             known.
+        ranges: Controls, joint forces, positions and speeds of joints, and constraint forces.
         behind: Links that move behind a contact surface.
-        gains: Why no gains can be computed where they are left out, else empty.
         slowing: How much slower the references keep all limits; None where they keep them.
     """
 
     analysis: Analysis
     duration: float
-    ranges: tuple[SignalRange, ...] = ()
-    is_resolved: bool = True
-    behind: tuple[LinkBehind, ...] = ()
     gains: str = ""
+    is_resolved: bool = True
+    ranges: tuple[SignalRange, ...] = ()
+    behind: tuple[LinkBehind, ...] = ()
     slowing: LimitsAlong | None = None
 
     def of(self, *kinds: LimitKind) -> tuple[SignalRange, ...]:
@@ -113,17 +106,6 @@ class Feasibility:
             found.append(f"most of all {self.slowing.excess}; {self.slowing.remedy}")
         return tuple(found)
 
-    def __repr__(self) -> str:
-        text = count_of(len(self.problems), "problem") if self.problems else "no problem found"
-        return f"Feasibility('{self.analysis.system.name}': {text})"
-
-    def __str__(self) -> str:
-        return to_text(self._parts())
-
-    def to_markdown(self) -> str:
-        """The report with Markdown tables."""
-        return to_markdown(self._parts())
-
     def to_dict(self) -> dict[str, Any]:
         """The report as plain numbers, lists and texts."""
         groups = {
@@ -142,7 +124,7 @@ class Feasibility:
             "problems": list(self.problems),
         }
 
-    def _parts(self) -> list[Part]:
+    def __str__(self) -> str:
         rows = []
         for r in self.of(*LimitKind):
             limits = f"{r.low:.4g} to {r.high:.4g}" if r.low != -r.high else f"{r.high:.4g}"
@@ -169,30 +151,14 @@ class Feasibility:
                 )
             parts.append([text])
         parts.append([f"PROBLEM  {text}" for text in self.problems] or ["no problem found"])
-        return parts
+        return to_text(parts)
 
 
 def find_feasibility(scenario: Scenario) -> Feasibility:
-    """Analyzes the robot of a scenario, and what its reference requires of drives and joints.
-
-    All numbers are those of the law's model without errors: the minimum requirements.
-    """
-    return complete_and_examine(scenario, SceneGraph())[1]
-
-
-def complete_and_examine(
-    scenario: Scenario, scene_graph: SceneGraph, robot: RobotLinks | None = None
-) -> tuple[Scenario, Feasibility]:
-    """Returns a scenario with what `complete_scenario` adds, and what `find_feasibility` finds."""
-    if scenario.task is not None:
-        check_task(scenario)
-    completed, model, _ = completed_model(scenario, scene_graph, drawn=False, robot=robot)
-    return completed.scenario, _feasibility(completed.scenario, model)
-
-
-def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
-    """The feasibility of a completed scenario with its model."""
-    examined = None
+    """Analyzes the robot of a scenario, and what its reference requires of drives and joints."""
+    check_task(scenario)
+    completed, model, _ = completed_model(scenario)
+    scenario, examined, law, gains = completed.scenario, None, None, ""
     try:
         if scenario.task is None:
             examined = examine_scenario(model)
@@ -202,15 +168,14 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
             structure = examined.structure
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
-    gains, law = "", None
     try:
         law = tracking_law(advised(scenario, model, structure).scenario, model, structure)
     except ScenarioError as error:
         if not scenario.is_advised:
             raise
         gains = str(error)
-    if scenario.task is not None:
-        return Feasibility(analyze(model.dae), scenario.duration, gains=gains)
+    if examined is None:
+        return Feasibility(analyze(model.dae), scenario.duration, gains)
     reference, start = reference_and_start(scenario, model, structure)
     degrees = None if law is None or scenario.estimator is not None else law.exogenous_degrees
     exogenous = exogenous_references(scenario, model.dae, degrees)
@@ -224,26 +189,17 @@ def _feasibility(scenario: Scenario, model: RobotModel) -> Feasibility:
 
     begin = scenario.integrator.start_time
     times, is_resolved = sample_times(signals, begin, begin + scenario.duration)
-    analysis = along(
-        examined or examine(model.dae), reference, times, start, period or None, exogenous
-    )
-    motion = analysis.motion
+    analysis = along(examined, reference, times, start, period or None, exogenous)
+    motion, found = analysis.motion, (scenario.duration, gains, is_resolved)
     if motion is None or not motion.times.size:
-        return Feasibility(analysis, scenario.duration, is_resolved=is_resolved, gains=gains)
+        return Feasibility(analysis, *found)
     with at("judgement.friction_cones"):
         limits = robot_limits(model, scenario.judgement.friction_cones)
-    slowing = None
+    ranges = limits.ranges(motion.times, limits.of_motion(motion))
+    behind, slowing = links_behind(model, motion.times, motion.states, motion.parameters), None
     if analysis.structure is not None:
         slowing = limits_along(analysis.structure, limits, reference, motion)
-    return Feasibility(
-        analysis,
-        scenario.duration,
-        limits.ranges(motion.times, limits.of_motion(motion)),
-        is_resolved,
-        links_behind(model, motion.times, motion.states, motion.parameters),
-        gains,
-        slowing,
-    )
+    return Feasibility(analysis, *found, ranges, behind, slowing)
 
 
 def sample_times(
@@ -287,27 +243,41 @@ def judge_run(
     failure: str = "",
 ) -> RunSummary:
     """Judges a run by its record."""
-    model, changes = loop.plant.robot("a scenario"), loop.changes(record)
+    # What exceeds its limits, and which links are behind surfaces. The last numbers of a run that
+    # broke off are not those of its motion.
+    model, changes, stop = loop.plant.robot("a scenario"), loop.changes(record), record.time.size
     limits = robot_limits(model, scenario.judgement.friction_cones)
-    own, stop = loop.plant_parameters(record, context), record.time.size
-    if failure:  # The last numbers of a run that broke off are not those of its motion.
+    if failure:
         first, last = record.time[[0, -1]]
         stop = max(1, int(np.searchsorted(record.time, last - BREAK * (last - first))))
     ranges = limits.ranges(record.time[:stop], limits.of_record(record)[:stop])
     behind = []
+    own = loop.plant_parameters(record, context)
     for link in links_behind(model, record.time, record["state"], own):
         numbers = Signal(link.link, "m"), link.depth, 0.0, link.time
         behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
+
+    # How much slower the references must be to keep the limits.
+    remedies, dae, law = list[str](), model.dae, loop.controller.law
     is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
-    remedies = _slower(loop, model, limits, record) if is_paced else []
+    if is_paced and loop.generator is not None and not dae.exogenous.moving:
+        reference = loop.generator.reference
+        structure = law.structure if law.system is dae else find_structure(dae)
+        times, start = record.time[:: record.time.size // MOST_TIMES + 1], record["state"][0]
+        motion = ZeroDynamics(dae, structure=structure).motion(reference, times, start)
+        found = limits_along(structure, limits, reference, motion)
+        remedies.append("the references alone keep all limits" if found is None else found.remedy)
+
+    # Approximations, and places beyond the data of surfaces.
     notes = []
     for constraint in model.constraints:
-        values = own_values(constraint, model.dae, model.dae.parameter_values)
-        surface = constraint.surface_at(values)
-        if surface is not None and surface.remark:
-            notes.append(f"{constraint.name}: {surface.remark}")
-    notes += [_beyond_edge(constraint, model, record) for constraint in model.constraints]
+        surface = constraint.surface_at(own_values(constraint, dae, dae.parameter_values))
+        if surface is not None:
+            note = f"{constraint.name}: {surface.remark}" * bool(surface.remark)
+            notes += [note, _beyond_edge(constraint, surface, model, record)]
     notes += _remarks([scenario.references, scenario.exogenous, scenario.task])
+
+    # How the run ended, and the judgement.
     ended = failure
     if statistics is not None:
         ended = ended or "interrupted" * (statistics.interrupted is not None)
@@ -332,24 +302,12 @@ def judge_run(
     return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy)
 
 
-def _slower(loop: ClosedLoop, model: RobotModel, limits: SignalLimits, record: Record) -> list[str]:
-    """How much slower the references of a run must be to keep its limits."""
-    dae, law = model.dae, loop.controller.law
-    if loop.generator is None or dae.exogenous.moving:
-        return []
-    reference = loop.generator.reference
-    structure = law.structure if law.system is dae else find_structure(dae)
-    times, start = record.time[:: record.time.size // MOST_TIMES + 1], record["state"][0]
-    motion = ZeroDynamics(dae, structure=structure).motion(reference, times, start)
-    found = limits_along(structure, limits, reference, motion)
-    return ["the references alone keep all limits" if found is None else found.remedy]
-
-
-def _beyond_edge(constraint: Constraint, model: RobotModel, record: Record) -> str:
+def _beyond_edge(
+    constraint: Constraint, surface: Surface, model: RobotModel, record: Record
+) -> str:
     """When a point is beyond the edge of its surface's data first; "" if it is not."""
-    dae = model.dae
-    surface = constraint.surface_at(own_values(constraint, dae, dae.parameter_values))
-    if surface is None or (extent := surface.extent) is None:
+    dae, extent = model.dae, surface.extent
+    if extent is None:
         return ""
     coordinates = constraint.coordinates(model.links)
     if any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):

@@ -3,7 +3,9 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import SceneGraph
@@ -11,14 +13,13 @@ from pydrake.multibody.tree import BodyIndex
 
 from drake_dae.analysis import Analysis, examine, robot_limits
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name
-from drake_dae.dae import DaeSystem, PinnedMotion, Structure, ZeroDynamics, find_structure
+from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.dae import DaeSystem, Structure, ZeroDynamics, find_structure
 from drake_dae.errors import (
     AssumptionError,
     DrakeDaeError,
     GeometryWarning,
     InconsistentStateError,
-    ModelError,
     ScenarioError,
 )
 from drake_dae.references import ConstantReference, Reference
@@ -51,9 +52,6 @@ NOTHING_FOUND = "no start was found"
 
 _TIMES = 201
 """The number of times at which a completed scenario is examined."""
-
-_NEARLY_SINGULAR = 0.1
-"""B(x) is nearly singular where its smallest singular value is this part of the usual one."""
 
 _SLACK = 1e-6
 """The excess over a limit that counts, in its unit."""
@@ -106,19 +104,19 @@ def completed_model(
     scenario: Scenario,
     scene_graph: SceneGraph | None = None,
     payloads: Sequence[Payload] = (),
-    drawn: bool = True,
     robot: RobotLinks | None = None,
 ) -> tuple[Completed, RobotModel, Structure | None]:
-    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads."""
+    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads.
+
+    The structure is there where it was needed.
+    """
     if robot is None:
-        drawn = drawn and scene_graph is not None
+        drawn = scene_graph is not None
         robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)
     links, loops = robot
     constraints = _checked_constraints(scenario, links, loops)
-    guess = start_guess(scenario, links)
-    ways = list[tuple[Completed, RobotModel, Structure | None]]()
-    problems = list[str]()
-    for completed in completions(scenario, links, constraints, guess):
+    best, its_problem = None, ""
+    for completed in completions(scenario, links, constraints, start_guess(scenario, links)):
         model, structure = _model(completed.scenario, links, constraints), None
         if completed.scenario is scenario or scenario.task is not None:
             return completed, model, None
@@ -129,15 +127,14 @@ def completed_model(
             problem = str(error)
         if not problem:
             return completed, model, structure
-        ways.append((completed, model, structure))
-        problems.append(problem)
-    # One that can be examined, if there is any.
-    best = next((i for i, way in enumerate(ways) if way[2] is not None), 0)
-    completed, model, structure = ways[best]
+        if best is None or (best[2] is None and structure is not None):
+            best, its_problem = (completed, model, structure), problem
+    assert best is not None  # There is a completion, or an error.
+    completed, model, structure = best
     note = (
         f"{NOTHING_FOUND} from which the robot keeps its limits along the references; with this "
-        f"one {problems[best]}. Move the surface or the references, make them slower, or give "
-        "other outputs or start.positions"
+        f"one {its_problem}. Move the surface or the references, make them slower, or give other "
+        "outputs or start.positions"
     )
     return Completed(completed.scenario, (*completed.notes, note)), model, structure
 
@@ -146,7 +143,7 @@ def _checked_constraints(
     scenario: Scenario, links: MultibodyExpressions, loops: Sequence[Constraint]
 ) -> list[Constraint]:
     """The constraints, and a check of every key that the model takes, for errors with its place."""
-    name = scenario.robot.title
+    robot, forces, actuation = scenario.robot, scenario.forces, scenario.actuation
     constraints = each("constraints", scenario.constraints, lambda form: make(form, ()))
     names = [constraint.name for constraint in (*plant_constraints(links), *loops)]
     for index, constraint in enumerate(constraints):
@@ -154,46 +151,42 @@ def _checked_constraints(
             if constraint.residual(links).numel() < len(constraint.force_signals):
                 constraint.rate(links.kinematics())
         if not constraint.name or constraint.name in names:
-            key = f"constraints.{index}.name"
             text = f"each constraint needs a name of its own, got '{constraint.name}'"
-            raise ScenarioError((key, text))
+            raise ScenarioError((f"constraints.{index}.name", text))
         names.append(constraint.name)
         _compare_sizes(constraint, links)
     constraints += loops
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
     actuators = (*links.actuator_signals, *bound.motors)
-    if not actuators and scenario.robot.actuators != []:
+    if not actuators and robot.actuators != []:
         text = (
-            f"no joint of '{Path(scenario.robot.file).name or name}' is driven; write all, or a "
-            "list of joints. Without this key those are driven to which the file gives an "
-            "actuator, as a URDF does by a <transmission>"
+            f"no joint of '{Path(robot.file).name or robot.title}' is driven; write all, or a list "
+            "of joints. Without this key those are driven to which the file gives an actuator, as "
+            "a URDF does by a <transmission>"
         )
         raise ScenarioError(("robot.actuators", text))
     _outputs(scenario, constraints, links)
     if links.actuator_signals:
-        each("actuation", scenario.actuation, lambda stage: stage.attach(links))
+        each("actuation", actuation, lambda stage: stage.attach(links))
     with at("actuation"):
-        chain(scenario.actuation, links)
-    forces, known = scenario.forces, scenario.robot.known_forces
+        chain(actuation, links)
     each("forces", forces or (), lambda f: force_rows(as_force_outputs([f], bound), bound, links))
     with at("forces"):
         as_force_outputs(forces, bound)
     for force, value in (scenario.compliances or {}).items():
         with at(f"compliances.{force}"):
             bound.place(force)
-            if not value > 0.0:
-                raise ModelError(f"a compliance must be positive, got {value}")
-    each("robot.known_forces", known, lambda force: force.reaction(links.kinematics()))
+            positive("a compliance", value)
+    each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
     with at("law.control_weights"):
-        choice = control_choice(name, scenario.law.control_weights or None, actuators)
-    with at("exogenous"):
-        attached = [stage.attach(links).parameters for stage in scenario.actuation]
-        members = [one.parameters for one in constraints] + [one.parameters for one in known]
-        groups = [links.parameters, *members, *attached, choice]
-        parameters = [parameter.name for group in groups for parameter in group]
-        for moving in scenario.exogenous:
-            if moving not in parameters:
-                raise ModelError(unknown_name("parameter", moving, parameters))
+        choice = control_choice(robot.title, scenario.law.control_weights or None, actuators)
+    attached = [stage.attach(links) for stage in actuation] if scenario.exogenous else []
+    parts: tuple[Any, ...] = (links, *constraints, *robot.known_forces, *attached)
+    parameters = [p.name for p in (*choice, *(p for part in parts for p in part.parameters))]
+    for moving in scenario.exogenous:
+        if moving not in parameters:
+            text = unknown_name("parameter", moving, parameters)
+            raise ScenarioError(("exogenous", text))
     return constraints
 
 
@@ -296,8 +289,7 @@ def exogenous_references(
     scenario: Scenario, system: DaeSystem, needed: Sequence[int] | None = None
 ) -> list[Reference]:
     """The references of the exogenous parameters, in the order of the system."""
-    moving: list[Reference] = []
-    degrees = list(needed or ())
+    moving, degrees = list[Reference](), iter(needed or ())
     for parameter in system.exogenous.moving:
         key = f"exogenous.{parameter.name}"
         entries = scenario.exogenous[parameter.name]
@@ -306,10 +298,8 @@ def exogenous_references(
         if size != parameter.value.size:
             text = f"{size} values, but the parameter has {parameter.value.size}"
             raise ScenarioError((key, text))
-        for index, reference in enumerate(references if needed is not None else ()):
-            with at(f"{key}.{index}"):
-                reference.derivatives(degrees[: reference.size])
-            del degrees[: reference.size]
+        if needed is not None:
+            each(key, references, lambda r: r.derivatives([*islice(degrees, r.size)]))
         moving += references
     return moving
 
@@ -353,22 +343,6 @@ def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> s
     for one in limits.ranges(motion.times, limits.of_motion(motion)):
         # A start may be on the limit of a joint.
         if one.excess and abs(one.excess.value - one.excess.limit) > _SLACK:
-            return f"{one.excess}{_singularity(model, motion)}"
+            return str(one.excess)
     behind = links_behind(model, motion.times, motion.states, motion.parameters)
     return "; ".join(map(str, behind))
-
-
-def _singularity(model: RobotModel, motion: PinnedMotion) -> str:
-    """A phrase on the time at which B(x) is nearly singular, and the joints that are fast there."""
-    margins = motion.control_margins
-    row = int(np.argmin(margins))
-    if margins[row] > _NEARLY_SINGULAR * np.median(margins):
-        return ""
-    nq, nv = model.links.q.numel(), model.links.v.numel()
-    speeds = np.abs(motion.states[row, nq : nq + nv])
-    first, second = np.sort(np.argsort(-speeds, kind="stable")[:2])
-    names = [signal.name for signal in model.links.position_signals]
-    return (
-        f"; the robot is nearly singular at {motion.times[row]:.4g} s, where {names[first]} and "
-        f"{names[second]} turn fast and the tool hardly moves, as by a straight wrist"
-    )

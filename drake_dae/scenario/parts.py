@@ -363,6 +363,11 @@ class Judgement:
     friction_cones: list[FrictionCone] = field(default_factory=list)
     may_diverge: bool = False
 
+    def __post_init__(self) -> None:
+        for name, tolerated in self.tolerances.items():
+            if tolerated is not None:
+                positive(f"tolerances: {name}", tolerated)
+
     @property
     def tolerated(self) -> dict[str, float]:
         """Output name -> the tolerated error; infinite if it does not count."""

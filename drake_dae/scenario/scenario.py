@@ -43,7 +43,7 @@ from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import shipped_scenarios
 from drake_dae.scenario.typed_yaml import MOST_TEXT, TAG, dump_yaml, load_lines, load_yaml
-from drake_dae.systems.control.sampling import Sampling
+from drake_dae.systems.control.drives import Sampling
 from drake_dae.systems.task import phases
 from drake_dae.trace.compiled import Compiled
 
@@ -212,9 +212,7 @@ FAMILIES: dict[type, Family] = {
     Stage: _family(robots.FlexibleJoints, robots.DcMotors, robots.ElectrohydraulicServos),
     Reference: Family(_REFERENCES, float),
     Load: _family(robots.KnownForce, robots.JointFriction),
-    ScenarioPlant: _family(
-        IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
-    ),
+    ScenarioPlant: _family(IdealConstraints, plants.MultibodyPlant, plants.CompliantContact),
     parts.Gains: _family(parts.Poles, parts.Coefficients, parts.Matrices),
     phases.Phase: _family(
         phases.Approach, phases.Press, phases.Move, phases.Dwell, phases.Release, phases.Retreat

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Signal, ZeroDynamics
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots import Constraint, Links, RobotModel
 from drake_dae.scenario.form import at
 from drake_dae.scenario.scenario import Scenario
@@ -33,26 +33,39 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     _set_numbers(scenario, loop, context)
     model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
     parameters, count = plant.current_parameters(at_plant), len(model.position_signals)
-    forces = np.zeros(model.dae.num_outputs - count)
+    forces, nq = np.zeros(model.dae.num_outputs - count), model.links.q.numel()
     with at("start"):
         if controller.takes_over or not model.dae.num_controls:
             state = _at_rest(scenario, loop, model, forces, parameters)
             plant.set_state(at_plant, state)
         else:
-            outputs = _outputs_at_start(scenario, loop, context.get_time())
+            goal, law = loop.reference.reference(context.get_time()), controller.law
+            outputs = law.layout.values(goal)
+            for name, error in scenario.start.errors.items():
+                with at("start.errors"):
+                    index = _index_of(name, plant.dae.output_signals, "output")
+                    if law.degrees[index] == 0:
+                        raise ModelError(
+                            f"'{name}' has degree 0: the law meets it at once and it has no start "
+                            "error"
+                        )
+                outputs[index] += error
             forces, of_law = outputs[count:], _of_law(loop, parameters)
             state = start_state(scenario, model, outputs, parameters, of_law)
     if not controller.takes_over:
-        moving, speeds = state.copy(), model.links.velocity_signals
+        moving = state.copy()
         with at("start"):
-            if scenario.exogenous:
-                moving = _in_motion(loop, context, outputs, state).copy()
+            if scenario.exogenous:  # The state with these outputs and the rates of the references.
+                goal[law.layout.lowest] = outputs
+                own = controller.current_parameters(controller.GetMyContextFromRoot(context))
+                zeros = ZeroDynamics(law.system, structure=law.structure)
+                moving = zeros.state(goal, state, own).copy()
             for name, value in scenario.start.velocities.items():
                 with at("start.velocities"):
-                    moving[model.links.q.numel() + index_of(name, speeds, "velocity")] = value
+                    moving[nq + _index_of(name, model.links.velocity_signals, "velocity")] = value
             plant.set_consistent_state(at_plant, moving, [*scenario.start.velocities])
     if loop.sensor is not None:
-        force = model.rest_forces(state[: model.links.q.numel()], forces, parameters)
+        force = model.rest_forces(state[:nq], forces, parameters)
         loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), force)
     return context
 
@@ -61,32 +74,24 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
     """Sets all numbers of a context of a closed loop but those that `start` gives."""
     plant, controller, begin = loop.plant, loop.controller, scenario.integrator.start_time
     if begin < 0.0 and (plant.time_step or scenario.sampling):
-        with at("integrator.start_time"):
-            raise ModelError(
-                f"steps and samples begin at 0 s in Drake, and a run with them no earlier, got "
-                f"{begin:g} s"
-            )
+        text = "steps and samples begin at 0 s in Drake, and a run with them no earlier"
+        raise ScenarioError(("integrator.start_time", f"{text}, got {begin:g} s"))
     context.SetTime(begin)
-    at_plant = plant.GetMyMutableContextFromRoot(context)
-    numbers: list[tuple[str, str, ArrayLike]] = []
-    if not scenario.plant.carries:
-        numbers += [("plant.parameters", *entry) for entry in scenario.plant.parameters.items()]
-        numbers += [("plant.payloads", f"{p.name}.mass", p.mass) for p in scenario.plant.payloads]
-        numbers += [
-            ("plant.disturbances", f"plant_disturbance_{index}.force", disturbance.force)
-            for index, disturbance in enumerate(scenario.plant.disturbances)
-        ]
-    values = plant.parameters(at_plant)
-    for key, name, value in numbers:
-        with at(key):
-            # A user's own plant may not let these numbers be set, and has been made with them.
-            is_set = key != "plant.parameters" and np.array_equal(
-                values[plant.dae.parameter_slice(name)], np.ravel(value)
-            )
-            if not is_set:
-                plant.set_parameter(at_plant, name, value)
+    at_plant, of_plant = plant.GetMyMutableContextFromRoot(context), scenario.plant
+    if not of_plant.carries:
+        numbers: dict[str, dict[str, ArrayLike]] = {
+            "plant.parameters": dict(of_plant.parameters),
+            "plant.payloads": {f"{p.name}.mass": p.mass for p in of_plant.payloads},
+            "plant.disturbances": {
+                f"plant_disturbance_{i}.force": d.force for i, d in enumerate(of_plant.disturbances)
+            },
+        }
+        for key, values in numbers.items():
+            with at(key):
+                for name, value in values.items():
+                    plant.set_parameter(at_plant, name, value)
     with at("plant"):
-        scenario.plant.begin(plant, at_plant)
+        of_plant.begin(plant, at_plant)
     force, encoders = scenario.sensors.force, scenario.sensors.encoders
     if loop.sensor is not None and force is not None:
         with at("sensors.force"):
@@ -100,9 +105,8 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
                 designs[repr(gains)] = controller.law.design(gains.design())
             at_controller = controller.GetMyMutableContextFromRoot(context)
             controller.set_gains(at_controller, designs[repr(gains)])
-    loop.set_seed(context, 0 if force is None else force.seed)
-    if loop.encoders is not None and encoders is not None:
-        loop.encoders.set_seed(context, encoders.seed)
+    seed = 0 if force is None else force.seed
+    loop.set_seed(context, seed, None if encoders is None else encoders.seed)
 
 
 def _at_rest(
@@ -124,49 +128,18 @@ def _at_rest(
             "a task begins at rest, and its first phase in contact with a surface that moves "
             "then; begin with a phase without contact, such as Approach"
         )
-    _check_outside(scenario, model, state, model.dae.parameters_of(loop.plant.dae, parameters))
-    return state
-
-
-def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, ...]:
-    """The constraints of the points of the contact of a task."""
-    assert scenario.task is not None
-    fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
-    given = scenario.task.contact
-    names = [given] if isinstance(given, str) and given else list(given)
-    with at("task.contact"):
-        for name in names:
-            if name not in fitting:
-                raise ModelError(
-                    f"'{name}' is not a unilateral constraint with one force; these are "
-                    f"{', '.join(fitting) or 'none'}"
-                )
-        if len(set(names)) < len(names):
-            raise ModelError(f"a point is named twice: {', '.join(names)}")
-        if not names and len(fitting) != 1:
-            raise ModelError(
-                "needed, since the unilateral constraints with one force are "
-                f"{', '.join(fitting) or 'none'}; give one, or a list of points"
-            )
-    return tuple(c for name, c in fitting.items() if not names or name in names)
-
-
-def _check_outside(
-    scenario: Scenario, model: RobotModel, state: FloatArray, parameters: FloatArray
-) -> None:
-    """Refuses a start behind a surface of a task that begins without contact.
-
-    On a contact that gives way it may be as deep as the force that counts as none presses it.
-    """
     task, material = scenario.task, scenario.plant.material
     if task is None or (made := task.make()).contacts[0]:
-        return
+        return state
+    # A task that begins without contact does not begin behind its surface. On a contact that gives
+    # way it may be as deep as the force that counts as none presses it.
     for contact in opening_contact(scenario, model):
         if (touch := contact.touch(model.links)) is None:
             continue
         place = model.links.position(touch.frame, touch.point)
         above = model.dae.trace("start", {"above": touch.clearance(place)}, often=False)
-        depth = -above(state, parameters)[0].item()
+        own = model.dae.parameters_of(loop.plant.dae, parameters)
+        depth = -above(state, own)[0].item()
         if depth > _SLACK and (
             material is None
             or depth * material.stiffness_on(model, task.contact_force) > task.contact_force
@@ -176,6 +149,28 @@ def _check_outside(
                 f"surface, and {made.phases[0].name} begins in front of it; start outside, or "
                 "turn the normal of the surface around if its free side is the other one"
             )
+    return state
+
+
+def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, ...]:
+    """The constraints of the points of the contact of a task."""
+    assert scenario.task is not None
+    fitting = {c.name: c for c in model.constraints if c.is_unilateral == (True,)}
+    given, there = scenario.task.contact, ", ".join(fitting) or "none"
+    names = [given] if isinstance(given, str) and given else list(given)
+    with at("task.contact"):
+        for name in names:
+            if name not in fitting:
+                text = f"'{name}' is not a unilateral constraint with one force; these are {there}"
+                raise ModelError(text)
+        if len(set(names)) < len(names):
+            raise ModelError(f"a point is named twice: {', '.join(names)}")
+        if not names and len(fitting) != 1:
+            raise ModelError(
+                f"needed, since the unilateral constraints with one force are {there}; give one, "
+                "or a list of points"
+            )
+    return tuple(c for name, c in fitting.items() if not names or name in names)
 
 
 def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
@@ -184,39 +179,12 @@ def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
     Exogenous ones are measured: law and plant have the same.
     """
     dae, system = loop.plant.dae, loop.controller.law.system
-    moving = {p.name for p in dae.exogenous.moving}
-    sizes, assumed = {p.name: p.value.size for p in system.parameters}, system.parameter_values
-    of_law = parameters.copy()
+    sizes, of_law = {p.name: p.value.size for p in system.parameters}, parameters.copy()
     for p in dae.parameters:
-        if p.name not in moving and sizes.get(p.name) == p.value.size:
-            of_law[dae.parameter_slice(p.name)] = assumed[system.parameter_slice(p.name)]
+        if not p.exogenous and sizes.get(p.name) == p.value.size:
+            assumed = system.parameter_values[system.parameter_slice(p.name)]
+            of_law[dae.parameter_slice(p.name)] = assumed
     return of_law
-
-
-def _in_motion(
-    loop: ClosedLoop, context: Context, outputs: FloatArray, guess: FloatArray
-) -> FloatArray:
-    """The state with these outputs, whose rates are those of the references."""
-    law, controller = loop.controller.law, loop.controller
-    goal = loop.reference.reference(context.get_time())
-    goal[law.layout.lowest] = outputs
-    parameters = controller.current_parameters(controller.GetMyContextFromRoot(context))
-    return ZeroDynamics(law.system, structure=law.structure).state(goal, guess, parameters)
-
-
-@at("start.errors")
-def _outputs_at_start(scenario: Scenario, loop: ClosedLoop, time: float) -> FloatArray:
-    """z at the start: the references plus the errors, shape (p,)."""
-    law = loop.controller.law
-    outputs = law.layout.values(loop.reference.reference(time))
-    for name, error in scenario.start.errors.items():
-        index = index_of(name, loop.plant.dae.output_signals, "output")
-        if law.degrees[index] == 0:
-            raise ModelError(
-                f"'{name}' has degree 0: the law meets it at once and it has no start error"
-            )
-        outputs[index] += error
-    return outputs
 
 
 def start_state(
@@ -272,16 +240,17 @@ def _unwound(
 ) -> FloatArray:
     """A solution near a guess without the whole turns of joints that Newton's method may add."""
     q, turn, (low, high) = solve(guess), 2 * np.pi, model.links.position_limits
+
+    def is_inside(index: int, value: float) -> bool:
+        return bool(low[index] - _SLACK <= value <= high[index] + _SLACK)
+
     for index, signal in enumerate(model.links.position_signals):
-        is_inside = low[index] - _SLACK <= q[index] <= high[index] + _SLACK
-        if signal.unit != "rad" or (is_inside and abs(q[index] - guess[index]) < np.pi):
+        is_near = is_inside(index, q[index]) and abs(q[index] - guess[index]) < np.pi
+        if signal.unit != "rad" or is_near:
             continue
         nearest = q[index] - turn * np.round((q[index] - guess[index]) / turn)
-        inside = [
-            value
-            for value in (nearest, nearest - turn, nearest + turn)
-            if low[index] - _SLACK <= value <= high[index] + _SLACK
-        ]
+        turned = (nearest, nearest - turn, nearest + turn)
+        inside = [value for value in turned if is_inside(index, value)]
         trial = q.copy()
         trial[index] = min(inside, key=lambda v: abs(v - guess[index]), default=q[index])
         if abs(trial[index] - q[index]) < 1.0:
@@ -297,7 +266,7 @@ def start_guess(scenario: Scenario, links: Links, others: FloatArray | None = No
     """The initial guess of q: start.positions, and other joints at `others` or their defaults."""
     guess = (links.default_positions if others is None else others).copy()
     for name, value in scenario.start.positions.items():
-        index = index_of(name, links.position_signals, "joint position")
+        index = _index_of(name, links.position_signals, "joint position")
         low, high = (limits[index] for limits in links.position_limits)
         if not low <= value <= high:
             unit = links.position_signals[index].unit
@@ -308,7 +277,7 @@ def start_guess(scenario: Scenario, links: Links, others: FloatArray | None = No
     return guess
 
 
-def index_of(name: str, signals: Sequence[Signal], kind: str) -> int:
+def _index_of(name: str, signals: Sequence[Signal], kind: str) -> int:
     """The index of a name among signals."""
     names = [signal.name for signal in signals]
     if name not in names:

@@ -1,7 +1,6 @@
 """Matrices of expressions, factored once for many right sides, and equations in blocks."""
 
-from collections.abc import Callable, Sequence
-from typing import Protocol
+from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
@@ -104,53 +103,20 @@ class PositiveDefiniteFactorization:
             self.pivot = ca.fmin(self.pivot, ca.if_else(matrix[i, i] > 0, square, 0))
 
     def solve(self, right: ca.SX) -> ca.SX:
-        """Returns X of A X = B, shape (n, k), with the structurally zero columns of B."""
+        """X of A X = B, shape (n, k), with the structurally zero columns of B."""
         return self.backward(self.forward(right))
 
     def forward(self, right: ca.SX) -> ca.SX:
-        """Returns Y = L^-1 B, shape (n, k)."""
+        """Y = L^-1 B, shape (n, k)."""
         return right if self._identity else _by_columns(self._lower, right)
 
     def backward(self, half: ca.SX) -> ca.SX:
-        """Returns X = L^-T D^-1 Y, shape (n, k)."""
+        """X = L^-T D^-1 Y, shape (n, k)."""
         return half if self._identity else _by_columns(self._lower.T, self.scaled(half))
 
     def scaled(self, half: ca.SX) -> ca.SX:
-        """Returns D^-1 Y, shape (n, k); the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
+        """D^-1 Y, shape (n, k); the product Y_1^T D^-1 Y_2 is B_1^T A^-1 B_2."""
         return half if self._identity else half / ca.repmat(self._diagonal, 1, half.shape[1])
-
-
-class Factors(Protocol):
-    """A factorization A = L D L^T, as `PositiveDefiniteFactorization`."""
-
-    def solve(self, right: ca.SX) -> ca.SX: ...
-    def forward(self, right: ca.SX) -> ca.SX: ...
-    def backward(self, half: ca.SX) -> ca.SX: ...
-    def scaled(self, half: ca.SX) -> ca.SX: ...
-
-
-class BlockFactors:
-    """The factors of a block-diagonal matrix, from those of its blocks, as `Factors`."""
-
-    def __init__(self, blocks: Sequence[tuple[Factors, int]]) -> None:
-        self._factors = [factors for factors, _ in blocks]
-        self._stops = np.cumsum([0, *[size for _, size in blocks]]).tolist()
-
-    def solve(self, right: ca.SX) -> ca.SX:
-        return self.backward(self.forward(right))
-
-    def forward(self, right: ca.SX) -> ca.SX:
-        return self._each("forward", right)
-
-    def backward(self, half: ca.SX) -> ca.SX:
-        return self._each("backward", half)
-
-    def scaled(self, half: ca.SX) -> ca.SX:
-        return self._each("scaled", half)
-
-    def _each(self, name: str, matrix: ca.SX) -> ca.SX:
-        parts = zip(self._factors, ca.vertsplit(matrix, self._stops), strict=True)
-        return ca.vertcat(*[getattr(factors, name)(part) for factors, part in parts])
 
 
 def _by_columns(triangle: ca.SX, right: ca.SX) -> ca.SX:
@@ -183,7 +149,7 @@ def block_stages(pattern: ca.Sparsity) -> list[list[tuple[list[int], list[int]]]
 
 
 def saddle_point_solver(
-    inertia: Factors, g: ca.SX, gradient: ca.SX
+    inertia: PositiveDefiniteFactorization, g: ca.SX, gradient: ca.SX
 ) -> tuple[Callable[[ca.SX, ca.SX], ca.SX], ca.SX, ca.SX]:
     """Returns a solver of [[E, -g], [c, 0]] (w, v) = -(balance, rate), by factors of E."""
     half = inertia.forward(g)

@@ -215,4 +215,4 @@ def test_shipped_scenarios_have_no_problems(name):
     assert told.problems == ()
     motion = told.analysis.motion
     assert motion.times[-1] == told.duration if motion else name in TASKS
-    assert told.to_markdown().endswith("no problem found")
+    assert str(told).endswith("no problem found")

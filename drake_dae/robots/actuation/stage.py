@@ -23,31 +23,20 @@ from drake_dae.robots.links.links import Links
 class AttachedStage:
     """A stage at the p actuators of one robot: E s' = drift(load) + drive_matrix * drive.
 
-    Attributes:
-        state: s, symbols, shape (k, 1).
-        state_signals: Names and units of s.
-        mass: E, shape (k, k), symmetric positive definite.
-        drift: Takes the load's position and velocity, each of shape (p, 1); returns shape (k, 1).
-        drive_matrix: The input matrix of the drive, shape (k, p).
-        drive_signals: Names and units of the drive, p of them.
-        force: Takes the load's position and velocity; returns the force on the load, shape (p, 1).
-        parameters: The parameters of these expressions.
-        ports: Output port of the plant -> its entries of s.
-        shaft: Position and velocity of the shaft that a next stage drives; None without a shaft.
-        carries_rotors: Whether the plant's rotors move with it instead of the links.
+    The load is given by its position and velocity, shape (p, 1) each.
     """
 
-    state: ca.SX
+    state: ca.SX  # s, symbols, shape (k, 1).
     state_signals: tuple[Signal, ...]
-    mass: ca.SX
-    drift: Callable[[ca.SX, ca.SX], ca.SX]
-    drive_matrix: ca.SX
+    mass: ca.SX  # E, shape (k, k), symmetric positive definite.
+    drift: Callable[[ca.SX, ca.SX], ca.SX]  # The load -> shape (k, 1).
+    drive_matrix: ca.SX  # Shape (k, p).
     drive_signals: tuple[Signal, ...]
-    force: Callable[[ca.SX, ca.SX], ca.SX]
+    force: Callable[[ca.SX, ca.SX], ca.SX]  # The load -> the force on it, shape (p, 1).
     parameters: tuple[Parameter, ...] = ()
-    ports: Mapping[str, slice] = field(default_factory=dict)
-    shaft: tuple[ca.SX, ca.SX] | None = None
-    carries_rotors: bool = False
+    ports: Mapping[str, slice] = field(default_factory=dict)  # Port of the plant -> entries of s.
+    shaft: tuple[ca.SX, ca.SX] | None = None  # Position and velocity of what a next stage drives.
+    carries_rotors: bool = False  # Whether rotors move with it instead of the links.
 
 
 class Stage(ABC):
@@ -72,23 +61,14 @@ class Stage(ABC):
 
 @dataclass(frozen=True, eq=False)
 class ActuationChain:
-    """Stages attached to a robot, wired from the joints to the control.
+    """Stages attached to a robot, from the joints toward the motor: E s' = drift + drive u."""
 
-    Attributes:
-        stages: The stages from the joints toward the motor; none for rigid joints.
-        joint_force: tau(q, v, s), the forces of the stages on the joints, shape (p, 1); 0 for rigid
-            joints.
-        direct: The direct action of u on the joints, shape (p, p): 1 for rigid joints, otherwise 0.
-        mass, drift, drive: E s' = drift + drive u, shapes (k, k), (k, 1), (k, p).
-        control_signals: Names and units of u.
-    """
-
-    stages: tuple[AttachedStage, ...]
-    joint_force: ca.SX
-    direct: ca.SX
-    mass: ca.SX
+    stages: tuple[AttachedStage, ...]  # None for rigid joints.
+    joint_force: ca.SX  # tau(q, v, s), shape (p, 1); 0 for rigid joints.
+    direct: ca.SX  # Of u on the joints, shape (p, p): 1 for rigid joints, otherwise 0.
+    mass: ca.SX  # E, shape (k, k).
     drift: ca.SX
-    drive: ca.SX
+    drive: ca.SX  # Shape (k, p).
     control_signals: tuple[Signal, ...]
 
     @property
@@ -111,12 +91,7 @@ class ActuationChain:
 
 
 def chain(stages: Sequence[Stage], links: Links) -> ActuationChain:
-    """Wires stages from the joints toward the motor: each drives the one before it.
-
-    Raises:
-        ModelError: There are no actuators, a stage follows one without a shaft, two stages carry
-            the rotors, or the actuators do not each drive their own joint velocity.
-    """
+    """Wires stages from the joints toward the motor: each drives the one before it."""
     p = len(links.actuator_signals)
     if not stages:  # Rigid joints: the control is the joint force.
         none = ca.SX(0, 1), ca.SX(0, p)
@@ -196,11 +171,7 @@ def diagonal_parameter(
 def matrix_parameter(
     name: str, value: ArrayLike, size: int, unit: str, definite: bool = True
 ) -> tuple[Parameter, ca.SX]:
-    """A parameter that is a diagonal, or column by column a matrix, and the matrix of symbols.
-
-    Raises:
-        ModelError: The matrix is not symmetric, or not positive definite (semidefinite).
-    """
+    """A parameter that is a diagonal, or column by column a matrix, and the matrix of symbols."""
     array = full_matrix(name, value, size)
     if not np.allclose(array, array.T, rtol=1e-12, atol=0):
         raise ModelError(f"{name} must be symmetric")

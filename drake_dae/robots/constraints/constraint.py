@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import ClassVar, Self
 
 import casadi as ca
-import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import MultibodyConstraintId
@@ -22,43 +21,26 @@ from drake_dae.robots.surfaces.surface import Surface, Vector
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """A contact of a point of a robot with an object that has a free side.
-
-    Attributes:
-        frame: Name of the frame of the point.
-        point: The point in the frame, m, shape (3,).
-        normal: The unit normal toward the free side there, in the world, shape (3, 1).
-        clearance: A point in the world, shape (3, 1) -> its distance into the free side, in m.
-        velocity: A point in the world, shape (3, 1) -> the velocity of the object there, in m/s.
-        is_exact: Whether the distance is exact also off the object; else it is to first order.
-    """
+    """A contact of a point of a robot with an object that has a free side."""
 
     frame: str
-    point: Vector
-    normal: ca.SX
-    clearance: Callable[[ca.SX], ca.SX]
-    velocity: Callable[[ca.SX], ca.SX] = lambda point: ca.SX(3, 1)
-    is_exact: bool = True
+    point: Vector  # In the frame, m.
+    normal: ca.SX  # Toward the free side, in the world, shape (3, 1).
+    clearance: Callable[[ca.SX], ca.SX]  # A point in the world -> its distance into the free side.
+    velocity: Callable[[ca.SX], ca.SX] = lambda point: ca.SX(3, 1)  # Of the object at a point.
+    is_exact: bool = True  # Whether the distance is exact also off the object.
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """The spring, damper, limits and motor of a joint along its coordinate c.
+    """The spring, damper, limits and motor of a joint along its coordinate c; inf for no limit."""
 
-    Attributes:
-        force: (c, c') -> the force of its spring and damper, in N m (N), positive toward larger c.
-        lower, upper: The limits of c, infinite where there are none.
-        velocity_limit: The largest |c'|, infinite where there is none.
-        motor: Name and unit of the control that adds to the force; None without a motor.
-        effort_limit: The largest control, infinite where there is none.
-    """
-
-    force: Callable[[ca.SX, ca.SX], ca.SX]
-    lower: float = -np.inf
-    upper: float = np.inf
-    velocity_limit: float = np.inf
-    motor: Signal | None = None
-    effort_limit: float = np.inf
+    force: Callable[[ca.SX, ca.SX], ca.SX]  # (c, c') -> that of spring and damper, toward larger c.
+    lower: float  # Limits of c.
+    upper: float
+    velocity_limit: float  # The largest |c'|.
+    motor: Signal | None  # The control that adds to the force, if it has one.
+    effort_limit: float  # The largest control.
 
 
 class Constraint(ABC):
@@ -117,12 +99,12 @@ class Constraint(ABC):
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
-        """Names and units of lambda, one per equation: those of `force_units`, after "<name>."."""
+        """Names and units of lambda, one per equation."""
         return tuple(Signal(f"{self.name}.{key}", unit) for key, unit in self.force_units.items())
 
     @property
     def residual_signals(self) -> tuple[Signal, ...]:
-        """Names and units of phi, then of the nonholonomic rows of the rate; likewise."""
+        """Names and units of phi, then of the nonholonomic rows of the rate."""
         units = self.residual_units
         return tuple(Signal(f"{self.name}.{key}", unit) for key, unit in units.items())
 
@@ -198,11 +180,7 @@ class Constraint(ABC):
         return RigidTransform()
 
     def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
-        """Adds it to a plant that is not finalized, and returns Drake's id.
-
-        Raises:
-            ModelError: Drake has no such constraint.
-        """
+        """Adds it to a plant that is not finalized, and returns Drake's id."""
         raise ModelError(
             f"'{self.name}': Drake has no constraint for a {type(self).__name__}; use a "
             "WeldedFrames, a CoincidentPoints with three axes, or ideal constraints"

@@ -86,10 +86,7 @@ class ConstraintSet:
         return links.generalized_force(kinematics, columns)
 
     def implicit(self, links: Links, acceleration: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """M v' + H - G lambda, shape (nv, 1), and phi'' (38), shape (m, 1), by inverse dynamics.
-
-        Neither M nor J is formed: see `Links.inverse_dynamics`.
-        """
+        """M v' + H - G lambda, shape (nv, 1), and phi'', shape (m, 1), without M and J."""  # (38)
         kinematics = links.kinematics(acceleration)
         balance = links.inverse_dynamics(kinematics, self.reaction(kinematics, force))
         return balance, kinematics.value(kinematics.derivative(self.rate(kinematics)))
@@ -104,10 +101,7 @@ class ConstraintSet:
         return total
 
     def acting(self, kinematics: Kinematics) -> list[tuple[Constraint, slice, Application]]:
-        """The constraints that act at a point, the slices of their forces, and their first points.
-
-        Of a constraint that acts at several points, only the first is shown and measured.
-        """
+        """The constraints that act at a point, slices of their forces, and their first points."""
         return [
             (constraint, part, application)
             for constraint, part in self.parts()
@@ -117,11 +111,7 @@ class ConstraintSet:
     def force_on(
         self, frame: str, name: str, kinematics: Kinematics, constraint_force: ca.SX
     ) -> tuple[ca.SX, ca.SX]:
-        """The point and force in N of a constraint on a frame, both in the world, shapes (3, 1).
-
-        Raises:
-            ModelError: There is no such constraint, or it does not act on the frame at one point.
-        """
+        """The point and force in N of a constraint on a frame, both in the world, shapes (3, 1)."""
         parts = {constraint.name: (constraint, part) for constraint, part in self.parts()}
         if name not in parts:
             raise ModelError(unknown_name("constraint", name, parts))
@@ -141,11 +131,9 @@ class ConstraintSet:
     def wrenches(
         self, kinematics: Kinematics, constraint_force: ca.SX
     ) -> tuple[ca.SX, tuple[Signal, ...]]:
-        """The wrench of each constraint on each of its frames, 6 rows each, with names and units.
+        """The moment and force of each constraint on each of its frames, as Drake's SpatialForce.
 
-        A wrench is a moment in N m and a force in N, as in Drake's SpatialForce, both in the world,
-        the force at the frame's origin. Those of one constraint on one frame are added. They are in
-        terms of q, v and parameters, and the signals "<constraint>.<frame>.mx", ..., ".fz".
+        In the world, the force at the frame's origin, with signals "<constraint>.<frame>.mx", ...
         """
         rows, names = [ca.SX(0, 1)], []
         for constraint, part in self.parts():
@@ -191,16 +179,10 @@ class ConstraintSet:
 
 
 class LoopState:
-    """The l joints of a robot that close loops, as expressions of q and v.
+    """The l joints of a robot that close loops: (c, c') as `state`, with `signals` and `limits`.
 
-    Attributes:
-        state: Their coordinates and rates (c, c'), shape (2 l, 1).
-        signals: Their names and units.
-        limits: The lower and the upper limits of (c, c'), shape (2 l,) each, infinite where there
-            are none.
-        columns: The generalized forces of unit efforts in the joints, shape (nv, l).
-        force: The generalized force of their springs and dampers, shape (nv, 1).
-        motors: The generalized forces of their motors, shape (nv, k).
+    `force` is the generalized force of their springs and dampers, shape (nv, 1), `columns` and
+    `motors` are those of unit efforts in all joints and in those with motors, shape (nv, k).
     """
 
     def __init__(self, constraints: ConstraintSet, links: Links) -> None:

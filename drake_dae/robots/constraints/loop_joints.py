@@ -76,10 +76,8 @@ class LoopJoint(Constraint):
     motor: bool = False
     effort_limit: float | None = None
     name: str = "loop"
-    units: ClassVar[tuple[str, str]]
-    """The units of c and of its force."""
-    coordinate: ClassVar[str]
-    """The name of c."""
+    units: ClassVar[tuple[str, str]]  # Of c and of its force.
+    coordinate: ClassVar[str]  # The name of c.
 
     def __post_init__(self) -> None:
         for key in ("damping", "stiffness"):

@@ -1,5 +1,6 @@
 """Blades, wheels and balls: nonholonomic constraints."""
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -18,9 +19,27 @@ from drake_dae.robots.surfaces.surface import Surface, Vector, unit_vector
 from drake_dae.trace.expressions import length_of
 
 
+class _RestingPoint(Constraint):
+    """A point of a frame, at a contact, that has no velocity along some directions."""
+
+    frame: str
+
+    @abstractmethod
+    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """The point in m, its velocity in m/s, (3, 1) each, and the directions, shape (3, m)."""
+
+    def rate(self, kinematics: Kinematics) -> ca.SX:
+        _, velocity, directions = self._contact(kinematics)
+        return ca.mtimes(directions.T, velocity)
+
+    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+        point, _, directions = self._contact(kinematics)
+        return (Application(point, directions, ca.SX(3, directions.shape[1]), self.frame),)
+
+
 @checked(ModelError)
 @dataclass(frozen=True)
-class Blade(Constraint):
+class Blade(_RestingPoint):
     """A blade or a free wheel: a point of a frame has no velocity along an axis of it:
 
         0 = s(q) . p_W'(q, v),
@@ -49,20 +68,15 @@ class Blade(Constraint):
     def __post_init__(self) -> None:
         object.__setattr__(self, "axis", unit_vector("axis", self.axis))
 
-    def rate(self, kinematics: Kinematics) -> ca.SX:
-        return ca.dot(self._side(kinematics), kinematics.velocity(self.frame, self.point))
-
-    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
+    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX, ca.SX]:
         point = kinematics.position(self.frame, self.point)
-        return (Application(point, self._side(kinematics), ca.SX(3, 1), self.frame),)
-
-    def _side(self, kinematics: Kinematics) -> ca.SX:
-        return ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axis))
+        side = ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axis))
+        return point, kinematics.velocity(self.frame, self.point), side
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
-class RollingWheel(Constraint):
+class RollingWheel(_RestingPoint):
     """A wheel rolls on level ground: its contact point has no velocity along the ground:
 
         0 = f . v_c,  0 = s . v_c,    v_c = p_W' - radius (w x u),
@@ -108,46 +122,29 @@ class RollingWheel(Constraint):
 
     @property
     def force_signals(self) -> tuple[Signal, ...]:
-        return signals([f"{self.name}.{kind}" for kind in ("traction", "side_force")], "N")[
-            : self._count
-        ]
+        kinds = ("traction", "side_force") if self.holds_side else ("traction",)
+        return signals([f"{self.name}.{kind}" for kind in kinds], "N")
 
     @property
     def residual_signals(self) -> tuple[Signal, ...]:
-        return signals([f"{self.name}.{kind}" for kind in ("slip", "side_speed")], "m/s")[
-            : self._count
-        ]
+        kinds = ("slip", "side_speed") if self.holds_side else ("slip",)
+        return signals([f"{self.name}.{kind}" for kind in kinds], "m/s")
 
-    def rate(self, kinematics: Kinematics) -> ca.SX:
-        up, directions = self._directions(kinematics)
-        spin = kinematics.angular_velocity(self.frame)
-        lever = self.parameters[0].symbol * up
-        rim = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
-        return ca.mtimes(directions.T, rim)
-
-    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        up, directions = self._directions(kinematics)
-        center = kinematics.position(self.frame, self.center)
-        point = center - self.parameters[0].symbol * up
-        return (Application(point, directions, ca.SX(3, self._count), self.frame),)
-
-    @property
-    def _count(self) -> int:
-        return 2 if self.holds_side else 1
-
-    def _directions(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX]:
-        """u, shape (3, 1), and the constrained directions f and s, shape (3, m)."""
+    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX, ca.SX]:
         n = ca.SX(self.normal)
         axle = ca.mtimes(kinematics.rotation(self.frame), ca.SX(self.axle))
         along = ca.cross(axle, n)
-        heading = along / length_of(along)
-        directions = ca.horzcat(heading, ca.cross(n, heading))
-        return ca.cross(heading, axle), directions[:, : self._count]
+        f = along / length_of(along)
+        lever = self.parameters[0].symbol * ca.cross(f, axle)
+        spin = kinematics.angular_velocity(self.frame)
+        velocity = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
+        point = kinematics.position(self.frame, self.center) - lever
+        return point, velocity, ca.horzcat(f, ca.cross(n, f)) if self.holds_side else f
 
 
 @checked(ModelError)
 @dataclass(frozen=True)
-class RollingBall(Constraint):
+class RollingBall(_RestingPoint):
     """A ball rolls on a surface without slip or separation:
 
         phi(q) = distance(p_W) - radius,    0 = t_1 . v_c,  0 = t_2 . v_c,
@@ -209,23 +206,8 @@ class RollingBall(Constraint):
     def residual(self, frames: Frames) -> ca.SX:
         return self.surface.distance(self._offset(frames)) - self.parameters[1].symbol
 
-    def rate(self, kinematics: Kinematics) -> ca.SX:
-        normal, tangents = self._directions(kinematics)
-        spin = kinematics.angular_velocity(self.frame)
-        lever = self.parameters[1].symbol * normal
-        touching = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
-        distance = kinematics.derivative(self.residual(kinematics))
-        return ca.vertcat(distance, ca.mtimes(tangents.T, touching))
-
     def coordinates(self, frames: Frames) -> ca.SX:
         return self.surface.coordinates(self._offset(frames))
-
-    def applications(self, kinematics: Kinematics) -> tuple[Application, ...]:
-        normal, tangents = self._directions(kinematics)
-        center = kinematics.position(self.frame, self.center)
-        point = center - self.parameters[1].symbol * normal
-        axes = ca.horzcat(normal, tangents), ca.SX(3, 3)
-        return (Application(point, *axes, self.frame),)
 
     def surface_at(self, values: FloatArray) -> Surface:
         return self.surface
@@ -237,9 +219,12 @@ class RollingBall(Constraint):
         """The center relative to the surface's position, m, shape (3, 1)."""
         return frames.position(self.frame, self.center) - self.parameters[0].symbol
 
-    def _directions(self, frames: Frames) -> tuple[ca.SX, ca.SX]:
-        """n, shape (3, 1), and t_1, t_2, shape (3, 2)."""
-        n, along = self.surface.unit_normal(self._offset(frames)), ca.SX(self.along)
+    def _contact(self, kinematics: Kinematics) -> tuple[ca.SX, ca.SX, ca.SX]:
+        n, along = self.surface.unit_normal(self._offset(kinematics)), ca.SX(self.along)
         across = along - n * ca.dot(n, along)
         first = across / length_of(across)
-        return n, ca.horzcat(first, ca.cross(n, first))
+        lever = self.parameters[1].symbol * n
+        spin = kinematics.angular_velocity(self.frame)
+        velocity = kinematics.velocity(self.frame, self.center) - ca.cross(spin, lever)
+        point = kinematics.position(self.frame, self.center) - lever
+        return point, velocity, ca.horzcat(n, first, ca.cross(n, first))

@@ -13,16 +13,12 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import Parameter, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots.links.tree import ArticulatedBodies
 
 ORIGIN = (0.0, 0.0, 0.0)
 
 
 class Frames(ABC):
-    """The poses of frames, as expressions. Frames are given by name; "world" is one.
-
-    `Links` and `Kinematics` are both of this kind, so functions of positions accept either.
-    """
+    """The poses of frames, given by name, as expressions; "world" is one."""
 
     q: ca.SX  # Generalized positions, symbols, shape (nq, 1).
     position_signals: tuple[Signal, ...]  # Names and units of q.
@@ -46,25 +42,17 @@ def position_index(frames: Frames, name: str) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Application:
-    """The action of forces lambda: F = force_axes @ lambda + drag, M = moment_axes @ lambda.
+    """The action of lambda in the world: F = force_axes @ lambda + drag, M = moment_axes @ lambda.
 
-    All vectors are in the world. Frame A exerts F and M on frame B at the point; B exerts the
-    opposite on A at the same point.
-
-    Attributes:
-        point: The point of application of F, in m, shape (3, 1).
-        force_axes: The force in N for a unit of each lambda, shape (3, m).
-        moment_axes: The moment in N m for a unit of each lambda, shape (3, m).
-        frame_b, frame_a: Names of the frames.
-        drag: The part of F in N that acts without constraint forces, shape (3, 1); None if none.
+    Frame A exerts F and M on frame B at the point; B exerts the opposite on A at the same point.
     """
 
-    point: ca.SX
-    force_axes: ca.SX
-    moment_axes: ca.SX
+    point: ca.SX  # Where F acts, m, shape (3, 1).
+    force_axes: ca.SX  # N for a unit of each lambda, shape (3, m).
+    moment_axes: ca.SX  # N m for a unit of each lambda, shape (3, m).
     frame_b: str
     frame_a: str = "world"
-    drag: ca.SX | None = None
+    drag: ca.SX | None = None  # The part of F without constraint forces, N, shape (3, 1).
 
     def force(self, constraint_force: ca.SX) -> ca.SX:
         """F in N, shape (3, 1), for constraint forces of shape (m, 1)."""
@@ -76,13 +64,11 @@ class Application:
 class Reaction:
     """Forces that act on a robot; k columns are k reactions.
 
-    Attributes:
-        generalized: A generalized force, shape (nv, k).
-        wrenches: Frame -> the force in N and the moment in N m on it, both in the world, the
-            force at the frame's origin, shapes (3, k).
+    `wrenches` are frame -> the force in N at its origin and the moment in N m on it, in the world,
+    shapes (3, k).
     """
 
-    generalized: ca.SX
+    generalized: ca.SX  # A generalized force, shape (nv, k).
     wrenches: Mapping[Any, tuple[ca.SX, ca.SX]] = field(default_factory=dict)
 
     def __add__(self, other: Self) -> "Reaction":
@@ -173,8 +159,7 @@ class Links(Frames):
     4. `kinematics(acceleration)` follows the rules of `Kinematics`, with the same frames.
     5. `generalized_force` of a reaction is tau with tau . v = its power.
     6. `inverse_dynamics` of a reaction is M v' + H - tau.
-    7. `articulated_bodies` are factors of M, if the links have them.
-    8. Signals, limits and actuator data have matching sizes; names are unique in `position_signals`
+    7. Signals, limits and actuator data have matching sizes; names are unique in `position_signals`
        and `velocity_signals` together.
     """
 
@@ -193,27 +178,22 @@ class Links(Frames):
     position_limits: tuple[FloatArray, FloatArray]  # Lower and upper ones, shape (nq,) each.
     velocity_limits: tuple[FloatArray, FloatArray]  # The same of v, shape (nv,) each.
     plant: MultibodyPlant | None = None  # Their MultibodyPlant, for Drake's visualization.
-    landmark_names: tuple[str, ...]  # The frames whose origins are landmarks of the robot.
     outlines: tuple[Outline, ...]  # Of the collision geometry of each link, or its origin.
 
     @abstractmethod
     def landmarks(self) -> ca.SX:
-        """Points of the robot for views of it, in m, shape (3, k)."""
+        """Points of the robot for views, in m, shape (3, k); the first is the world's origin."""
 
     @abstractmethod
     def kinematics(self, acceleration: ca.SX | None = None) -> Kinematics:
         """The frames in motion with v' = `acceleration`, a symbol of its own if None."""
-
-    def articulated_bodies(self, rotors: FloatArray) -> ArticulatedBodies | None:
-        """Factors of M, where `rotors`, shape (nv,), are the addition of rotors to its diagonal."""
-        return None
 
     def generalized_force(self, kinematics: Any, reaction: Reaction) -> ca.SX:
         """tau of each column of a reaction in kinematics of these links, shape (nv, k)."""
         return reaction.generalized
 
     def inverse_dynamics(self, kinematics: Any, reaction: Reaction) -> ca.SX:
-        """M(q) v' + H(q, v) - tau of (37), shape (nv, 1), with v' of the kinematics."""
+        """M(q) v' + H(q, v) - tau, shape (nv, 1), with v' of the kinematics."""  # (37)
         inertial = ca.mtimes(self.mass_matrix, kinematics.acceleration) + self.bias
         return inertial - self.generalized_force(kinematics, reaction)
 

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -31,64 +30,16 @@ from pydrake.multibody.tree import (
 from drake_dae.arrays import FloatArray, unknown_name, vector
 from drake_dae.errors import ModelError
 from drake_dae.robots.links.links import Outline
-from drake_dae.robots.links.tree import ElementaryJoint, TreeLink, link_poses
+from drake_dae.robots.links.tree import ElementaryJoint, TreeLink
 
 MOST_CORNERS = 200
 """The largest number of points of a mesh."""
 
 
-class PlantFrames:
-    """The frames of a finalized plant, each fixed to a link of its tree.
-
-    `bodies` is the index of a body -> its link, and its constant pose in that link.
-    """
-
-    def __init__(
-        self,
-        plant: MultibodyPlant,
-        links: Sequence[TreeLink],
-        bodies: dict[int, tuple[int, RigidTransform]],
-    ) -> None:
-        self.plant, self._links, self._bodies = plant, links, bodies
-        self._poses: dict[int, tuple[ca.SX, ca.SX]] = {}
-
-    def find(self, frame: str | Frame) -> Frame:
-        """A frame of the plant by name; "instance::name" if several have that name.
-
-        Raises:
-            ModelError: No frame, or more than one, has that name; or it belongs to another plant.
-        """
-        resolved = frame_named(self.plant, frame) if isinstance(frame, str) else frame
-        if resolved.GetParentPlant() is not self.plant:
-            raise ModelError(f"frame '{resolved.name()}' belongs to another plant")
-        return resolved
-
-    def pose(self, frame: Frame) -> tuple[ca.SX, ca.SX]:
-        """R_WF, shape (3, 3), and p_WF in m, shape (3, 1), as expressions of q."""
-        index = int(frame.index())
-        if index not in self._poses:
-            link, rotation, offset = self.on_link(frame)
-            R_WL, p_WL = self.link_poses[link]
-            self._poses[index] = (R_WL @ ca.SX(rotation), p_WL + R_WL @ ca.SX(offset))
-        return self._poses[index]
-
-    def on_link(self, frame: Frame) -> tuple[int, FloatArray, FloatArray]:
-        """The index of the link that carries a frame; R_LF, shape (3, 3), and p_LF, shape (3,)."""
-        link, X_LB = self._bodies[int(frame.body().index())]
-        return link, *constant_pose(X_LB @ frame.GetFixedPoseInBodyFrame())
-
-    @cached_property
-    def link_poses(self) -> list[tuple[ca.SX, ca.SX]]:
-        """R_WL, shape (3, 3), and p_WL in m, shape (3, 1), of every link."""
-        return link_poses(self._links)
-
-
 def body_with_frame(plant: MultibodyPlant, name: str) -> tuple[RigidBody, RigidTransform]:
-    """A body of a plant that is not finalized, for a constraint of Drake, and a frame's pose in it.
-
-    Drake 1.51 ends the process at a constraint with the world, but not at one with a body that is
-    welded to the world. So a frame of the world is put on such a body, which is added.
-    """
+    """A frame's body in a plant that is not finalized, and its pose: for constraints of Drake."""
+    # Drake 1.51 ends the process at a constraint with the world, but not at one with a body that is
+    # welded to the world. So a frame of the world is put on such a body, which is added.
     frame = frame_named(plant, name)
     body, pose = frame.body(), frame.GetFixedPoseInBodyFrame()
     if body.index() == plant.world_body().index():
@@ -100,11 +51,7 @@ def body_with_frame(plant: MultibodyPlant, name: str) -> tuple[RigidBody, RigidT
 
 
 def frame_named(plant: MultibodyPlant, name: str) -> Frame:
-    """A frame of a plant by its name; "instance::name" if several have that name.
-
-    Raises:
-        ModelError: No frame, or more than one, has that name.
-    """
+    """A frame of a plant by its name; "instance::name" if several have that name."""
     if name == "world":
         return plant.world_frame()
     frames = [plant.get_frame(FrameIndex(i)) for i in range(plant.num_frames())]
@@ -232,9 +179,8 @@ def elementary_joints(
 ) -> tuple[list[ElementaryJoint], FloatArray]:
     """A joint as elementary ones from inboard to outboard, and R with X_FM(q) = R (joints) R^T.
 
-    The constant R, shape (3, 3), turns an oblique axis into a coordinate axis, which saves
-    operations. A `reverse` joint leads from the frame on the child to the one on the parent; Drake
-    allows it for revolute, prismatic and weld joints, where the inverse has the opposite axis.
+    R turns an oblique axis into a coordinate axis, which saves operations. A `reverse` joint leads
+    from child to parent; Drake allows it for revolute, prismatic and weld joints.
     """
     sign = -1.0 if reverse else 1.0
     i, j = joint.position_start(), joint.velocity_start()
@@ -278,28 +224,22 @@ def elementary_joints(
 
 def joint_velocity_map(joint: Joint, q: ca.SX) -> ca.SX:
     """N(q) of one joint, shape (k, k), with q' = N v for its own positions and velocities."""
-    count = joint.num_positions()
-    block = ca.SX.eye(count)
-    if isinstance(joint, (BallRpyJoint, RpyFloatingJoint)):
-        # The velocities are the angular velocity of M in F, not the rates of the angles.
-        s, c, s_yaw, c_yaw = ca.sin(q[1]), ca.cos(q[1]), ca.sin(q[2]), ca.cos(q[2])
-        rates = ca.vertcat(
-            ca.horzcat(c_yaw / c, s_yaw / c, 0),
-            ca.horzcat(-s_yaw, c_yaw, 0),
-            ca.horzcat(c_yaw * s / c, s_yaw * s / c, 1),
-        )
-        block = ca.diagcat(ca.sparsify(rates), ca.SX.eye(count - 3))
-    return block
+    count, start = joint.num_positions(), joint.position_start()
+    if not isinstance(joint, (BallRpyJoint, RpyFloatingJoint)):
+        return ca.SX.eye(count)
+    # The velocities are the angular velocity of M in F, not the rates of the angles.
+    pitch, yaw = q[start + 1], q[start + 2]
+    s, c, s_yaw, c_yaw = ca.sin(pitch), ca.cos(pitch), ca.sin(yaw), ca.cos(yaw)
+    rates = ca.blockcat(
+        [[c_yaw / c, s_yaw / c, 0], [-s_yaw, c_yaw, 0], [c_yaw * s / c, s_yaw * s / c, 1]]
+    )
+    return ca.diagcat(ca.sparsify(rates), ca.SX.eye(count - 3))
 
 
 def read_links(
     plant: MultibodyPlant, q: ca.SX
 ) -> tuple[list[TreeLink], dict[int, tuple[int, RigidTransform]]]:
-    """Reads the tree of a plant whose joints are supported, outward from the world.
-
-    Returns the links, still without inertia, and for every body its index -> its link, and its
-    constant pose in that link.
-    """
+    """The links of a plant, without inertia; and body -> its link and constant pose in that."""
     links = [TreeLink()]
     bodies = {int(plant.world_body().index()): (0, RigidTransform())}
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]

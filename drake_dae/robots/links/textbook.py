@@ -66,18 +66,20 @@ class LinkExpressions(Links):
         self.q, self.v, self.frames, self.parameters = q, v, dict(frames or {}), parameters
         nq, nv = q.numel(), v.numel()
 
+        def fitting(name: str, given: Any, shape: tuple[int, ...]) -> Any:
+            if given.shape != shape:
+                raise ModelError(f"{name} has shape {given.shape}, expected {shape}")
+            return given
+
         def matrix(name: str, given: ca.SX | None, shape: tuple[int, int]) -> ca.SX:
-            if given is None:
-                given = ca.SX.eye(nv)
-            return _fitting(name, as_expression("LinkExpressions", name, given), shape)
+            given = ca.SX.eye(nv) if given is None else given
+            return fitting(name, as_expression("LinkExpressions", name, given), shape)
 
         self.mass_matrix = matrix("mass_matrix", mass_matrix, (nv, nv))
         self.bias = matrix("bias", bias, (nv, 1))
         self.velocity_map = matrix("velocity_map", velocity_map, (nq, nv))
-        B = (
-            np.eye(nv)
-            if actuation_matrix is None
-            else numbers("actuation_matrix", actuation_matrix)
+        B = numbers(
+            "actuation_matrix", np.eye(nv) if actuation_matrix is None else actuation_matrix
         )
         if B.ndim != 2 or B.shape[0] != nv:
             raise ModelError(f"actuation_matrix has shape {B.shape}, expected ({nv}, nu)")
@@ -88,7 +90,7 @@ class LinkExpressions(Links):
 
         def array(name: str, given: ArrayLike | None, size: int, default: float) -> FloatArray:
             values = np.full(size, default) if given is None else numbers(name, given)
-            return _fitting(name, values, (size,))
+            return fitting(name, values, (size,))
 
         self.effort_limits = array("effort_limits", effort_limits, nu, np.inf)
         self.reflected_inertia = array("reflected_inertia", reflected_inertia, nu, 0.0)
@@ -106,11 +108,9 @@ class LinkExpressions(Links):
 
         self.position_limits = limits("position_limits", position_limits, nq)
         self.velocity_limits = limits("velocity_limits", velocity_limits, nv)
-        self.landmark_names = ("world", *self.frames)
-        self.outlines = tuple(Outline(name, name) for name in self.landmark_names)
+        self.outlines = tuple(Outline(name, name) for name in ("world", *self.frames))
 
     def rotation(self, frame: str) -> ca.SX:
-        """R_WF(q), shape (3, 3); ModelError if the frame is unknown or has no rotation."""
         if frame == "world":
             return ca.SX.eye(3)
         pose = self._pose(frame)
@@ -119,11 +119,6 @@ class LinkExpressions(Links):
         return pose[0]
 
     def position(self, frame: str, point: ArrayLike = ORIGIN) -> ca.SX:
-        """p_W(q) in m of a point that is fixed in a frame, shape (3, 1).
-
-        Raises:
-            ModelError: The frame is unknown, or has no rotation and the point is off its origin.
-        """
         offset = numbers("point", point)
         if frame == "world":
             return ca.SX(offset)
@@ -137,19 +132,12 @@ class LinkExpressions(Links):
         return self.frames[frame]
 
     def landmarks(self) -> ca.SX:
-        """The origins of all frames, in m, shape (3, k)."""
         return ca.horzcat(ca.SX(3, 1), *[self.position(frame) for frame in self.frames])
 
     def kinematics(self, acceleration: ca.SX | None = None) -> "TextbookKinematics":
         if acceleration is None:
             acceleration = ca.SX.sym("acceleration", self.v.numel())
         return TextbookKinematics(self, acceleration)
-
-
-def _fitting(name: str, given: Any, shape: tuple[int, ...]) -> Any:
-    if given.shape != shape:
-        raise ModelError(f"{name} has shape {given.shape}, expected {shape}")
-    return given
 
 
 class TextbookKinematics(Kinematics):

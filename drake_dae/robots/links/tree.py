@@ -1,14 +1,13 @@
 """A tree of links, each with its own frame, its inertia and one elementary joint to its parent.
 
-Its algorithms (Featherstone, Rigid Body Dynamics Algorithms, 2008): the composite rigid body
-algorithm and the recursive Newton-Euler algorithm (chapters 5 and 6), in link frames, and the
-articulated-body algorithm (chapter 7). P is the frame of a link's parent, L its own, W the world's.
-Quantities of a link are expressed in L unless said otherwise. A link moves by one elementary joint,
-so that its rotation is sparse; a joint with several is a chain of links, of which the last carries
-the inertia.
+Its algorithms are the composite rigid body algorithm and the recursive Newton-Euler algorithm in
+link frames (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6). P is the frame
+of a link's parent, L its own, W the world's. Quantities of a link are expressed in L unless said
+otherwise. A link moves by one elementary joint, so that its rotation is sparse; a joint with
+several is a chain of links, of which the last carries the inertia.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -18,45 +17,29 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 
 
-def zeros(rows: int, columns: int = 1) -> ca.SX:
-    """A dense column or matrix of zeros, whose entries can be set one by one."""
-    return ca.SX.zeros(rows, columns)
-
-
 @dataclass(frozen=True, eq=False)
 class ElementaryJoint:
     """X_FM(q) of one elementary joint: a rotation about a coordinate axis of F, or a translation.
 
     A joint of a plant is a sequence of these; each starts from the frame where the one before ends.
-
-    Attributes:
-        axis: The coordinate axis of the turn (0, 1, 2), or None for a shift.
-        positions: Indices in q: of the angle in rad, or of the lengths along `directions` in m.
-        velocities: Indices in v that belong to the columns of `directions`.
-        directions: Shape (3, k), constant in F: the angular velocity of M in F (turn), or the
-            velocity of M's origin in F (shift), for a unit of each of these velocities.
     """
 
-    axis: int | None
-    positions: tuple[int, ...]
-    velocities: tuple[int, ...]
-    directions: FloatArray
+    axis: int | None  # Of the turn, 0, 1 or 2; None for a shift.
+    positions: tuple[int, ...]  # In q: of the angle, or of the lengths along `directions`.
+    velocities: tuple[int, ...]  # In v, one for each column of `directions`.
+    directions: FloatArray  # (Angular) velocity of M in F for a unit of each of them, (3, k).
 
 
 @dataclass(eq=False)
 class Inertia:
-    """Mass, and its first and second moment about an origin.
+    """Mass m, and the integrals of r dm and r r^T dm about an origin.
 
-    Attributes:
-        mass: m in kg, a scalar.
-        first: m c in kg m with c the centre of mass, shape (3, 1).
-        second: The integral of r r^T dm in kg m^2, shape (3, 3). The rotational inertia is
-            tr(second) 1 - second.
+    The rotational inertia is tr(second) 1 - second.
     """
 
-    mass: ca.SX = field(default_factory=lambda: zeros(1))
-    first: ca.SX = field(default_factory=lambda: zeros(3))
-    second: ca.SX = field(default_factory=lambda: zeros(3, 3))
+    mass: ca.SX = field(default_factory=lambda: ca.SX.zeros(1))
+    first: ca.SX = field(default_factory=lambda: ca.SX.zeros(3))
+    second: ca.SX = field(default_factory=lambda: ca.SX.zeros(3, 3))
 
     def __add__(self, other: "Inertia") -> "Inertia":
         return Inertia(self.mass + other.mass, self.first + other.first, self.second + other.second)
@@ -64,29 +47,17 @@ class Inertia:
 
 @dataclass(eq=False)
 class TreeLink:
-    """A frame that one elementary joint moves, with the inertia of the bodies fixed to it.
+    """A frame that one elementary joint moves, with the inertia of the bodies fixed to it."""
 
-    Attributes:
-        parent: The index of its parent; -1 for the world, which is link 0.
-        fixed: The constant R_PF, shape (3, 3), where the joint starts.
-        axis: The coordinate axis of the turn, 0, 1 or 2; None for a shift.
-        turn: R_FL(q), shape (3, 3).
-        offset: p_PL in m, expressed in P, shape (3, 1).
-        turning: Index in v -> angular velocity in L for a unit of it, shape (3, 1).
-        shifting: Index in v -> velocity of L's origin in P for a unit of it, shape (3, 1).
-        inertia: The inertia about L's origin.
-        weightless: The part of `inertia` that gravity does not act on.
-    """
-
-    parent: int = -1
-    fixed: FloatArray = field(default_factory=lambda: np.eye(3))
-    axis: int | None = None
-    turn: ca.SX = field(default_factory=lambda: ca.SX.eye(3))
-    offset: ca.SX = field(default_factory=lambda: zeros(3))
-    turning: dict[int, ca.SX] = field(default_factory=dict)
-    shifting: dict[int, ca.SX] = field(default_factory=dict)
-    inertia: Inertia = field(default_factory=Inertia)
-    weightless: Inertia = field(default_factory=Inertia)
+    parent: int = -1  # Of the world, which is link 0.
+    fixed: FloatArray = field(default_factory=lambda: np.eye(3))  # R_PF, where the joint starts.
+    axis: int | None = None  # Of the turn, 0, 1 or 2; None for a shift.
+    turn: ca.SX = field(default_factory=lambda: ca.SX.eye(3))  # R_FL(q)
+    offset: ca.SX = field(default_factory=lambda: ca.SX.zeros(3))  # p_PL in P
+    turning: dict[int, ca.SX] = field(default_factory=dict)  # Index in v -> w in L of a unit.
+    shifting: dict[int, ca.SX] = field(default_factory=dict)  # ... -> velocity of L's origin in P.
+    inertia: Inertia = field(default_factory=Inertia)  # About L's origin.
+    weightless: Inertia = field(default_factory=Inertia)  # What gravity does not act on.
 
     def __post_init__(self) -> None:
         self.rotation = ca.densify(ca.SX(self.fixed) @ self.turn)
@@ -151,7 +122,7 @@ class TreeLink:
 
 def link_poses(links: Sequence[TreeLink]) -> list[tuple[ca.SX, ca.SX]]:
     """R_WL, shape (3, 3), and p_WL in m, shape (3, 1), of every link."""
-    poses = [(ca.SX(np.eye(3)), zeros(3))]
+    poses = [(ca.SX(np.eye(3)), ca.SX.zeros(3))]
     for link in links[1:]:
         rotation, origin = poses[link.parent]
         poses.append((rotation @ link.rotation, origin + rotation @ link.offset))
@@ -189,12 +160,15 @@ def mass_matrix(links: Sequence[TreeLink], reflected_inertia: FloatArray) -> ca.
     return ca.sparsify(symmetric(M))
 
 
-def frame_jacobian(links: Sequence[TreeLink], index: int, origin: ca.SX, size: int) -> ca.SX:
-    """The velocity of a point of a link above its angular velocity, per unit of v, shape (6, nv).
-
-    In the world, as the position `origin` of the point, shape (3, 1); `size` is nv.
-    """
-    poses, result = link_poses(links), ca.SX(6, size)
+def frame_jacobian(
+    links: Sequence[TreeLink],
+    poses: Sequence[tuple[ca.SX, ca.SX]],
+    index: int,
+    origin: ca.SX,
+    size: int,
+) -> ca.SX:
+    """The velocity of a link's point above its spin in the world, per unit of v, shape (6, nv)."""
+    result = ca.SX(6, size)
     while index > 0:
         link, (rotation, position) = links[index], poses[index]
         for j, direction in link.turning.items():
@@ -208,34 +182,31 @@ def frame_jacobian(links: Sequence[TreeLink], index: int, origin: ca.SX, size: i
 
 @dataclass(frozen=True, eq=False)
 class LinkMotion:
-    """The motion of a link, in its own axes; vectors have shape (3, 1).
+    """The motion of a link, in its own axes; a point r has `acceleration` + gradient r.
 
-    Attributes:
-        spin: The angular velocity in rad/s.
-        spin_rate: The derivative of the spin in rad/s^2.
-        velocity: The velocity of the origin, in m/s.
-        acceleration: The acceleration of the origin minus gravity, in m/s^2: gravity is represented
-            by an upward acceleration of the world.
-        gradient: A point r of the link has the acceleration `acceleration` + gradient r, in 1/s^2,
-            shape (3, 3).
+    Gravity is an upward acceleration of the world.
     """
 
     spin: ca.SX
     spin_rate: ca.SX
-    velocity: ca.SX
+    velocity: ca.SX  # Of the origin, as its acceleration minus gravity.
     acceleration: ca.SX
-    gradient: ca.SX
+    gradient: ca.SX  # Shape (3, 3).
 
 
 def link_motions(
     links: Sequence[TreeLink], v: ca.SX, acceleration: ca.SX, gravity: FloatArray
 ) -> list[LinkMotion]:
     """The motion of every link, with v' = `acceleration`; gravity is in the world, in m/s^2."""
-    result = [LinkMotion(zeros(3), zeros(3), zeros(3), ca.SX(-gravity), zeros(3, 3))]
+    result = [
+        LinkMotion(
+            ca.SX.zeros(3), ca.SX.zeros(3), ca.SX.zeros(3), ca.SX(-gravity), ca.SX.zeros(3, 3)
+        )
+    ]
     for link in links[1:]:
         parent, to_link = result[link.parent], link.rotation.T
         turning, turning_rate, shifting, shifting_rate = (
-            sum((rates[j] * d for j, d in directions.items()), zeros(3))
+            sum((rates[j] * d for j, d in directions.items()), ca.SX.zeros(3))
             for directions in (link.turning, link.shifting)
             for rates in (v, acceleration)
         )
@@ -264,18 +235,12 @@ def inverse_dynamics(
     size: int,
     wrenches: Mapping[int, tuple[ca.SX, ca.SX]] = MappingProxyType({}),
 ) -> ca.SX:
-    """Generalized forces, shape (nv, 1), by the recursive Newton-Euler algorithm.
+    """Generalized forces, shape (nv, 1), by the recursive Newton-Euler algorithm; `size` is nv.
 
-    Args:
-        links: The tree, parents before children; the world is link 0.
-        moving: The motion of each link.
-        gravity: Gravity in the world, m/s^2, shape (3,).
-        size: The number of velocities, nv.
-        wrenches: Index of a link -> moment about its origin in N m and force in N that act on it,
-            in the link's axes, each of shape (3, 1).
+    `wrenches` are index of a link -> moment about its origin and force on it, in its axes.
     """
-    tau = zeros(size)
-    moments, forces = [zeros(3) for _ in links], [zeros(3) for _ in links]
+    tau = ca.SX.zeros(size)
+    moments, forces = [ca.SX.zeros(3) for _ in links], [ca.SX.zeros(3) for _ in links]
     poses = link_poses(links)
     for index in range(len(links) - 1, 0, -1):
         link, inertia, weightless = links[index], links[index].inertia, links[index].weightless
@@ -296,138 +261,3 @@ def inverse_dynamics(
         moments[link.parent] += moment
         forces[link.parent] += force
     return tau
-
-
-def is_one_by_one(links: Sequence[TreeLink]) -> bool:
-    """Whether each link moves by one velocity of its own at most, as `ArticulatedBodies` need it.
-
-    A free body, a ball joint or a screw has links that share velocities.
-    """
-    moved = [[*link.turning, *link.shifting] for link in links]
-    owned = [index for indices in moved for index in indices]
-    return len(owned) == len(set(owned)) and all(len(indices) <= 1 for indices in moved)
-
-
-@dataclass(frozen=True, eq=False)
-class ArticulatedInertia:
-    """Moment J w + H a and force H' w + M a of a link's acceleration (w, a), at its origin."""
-
-    J: ca.SX
-    H: ca.SX
-    M: ca.SX
-
-    def __add__(self, other: "ArticulatedInertia") -> "ArticulatedInertia":
-        return ArticulatedInertia(self.J + other.J, self.H + other.H, self.M + other.M)
-
-    def without(self, moment: ca.SX, force: ca.SX, size: ca.SX) -> "ArticulatedInertia":
-        """The inertia that remains where a joint with U = (moment, force) and D = size is free."""
-        return ArticulatedInertia(
-            symmetric(self.J - moment @ moment.T / size),
-            self.H - moment @ force.T / size,
-            symmetric(self.M - force @ force.T / size),
-        )
-
-    def to_parent(self, link: TreeLink) -> "ArticulatedInertia":
-        """The same inertia in the axes of the parent, at its origin."""
-        arm, coupling = ca.skew(link.offset), link.rotation @ self.H @ link.rotation.T
-        force = symmetric(link.to_parent_axes(self.M))
-        shifted = arm @ force
-        half = coupling @ arm.T
-        moment = link.to_parent_axes(self.J) + half + half.T + shifted @ arm.T
-        return ArticulatedInertia(symmetric(moment), coupling + shifted, force)
-
-
-class ArticulatedBodies:
-    """M = L D L' of a tree of links that move one by one, as a `PositiveDefiniteFactorization`.
-
-    By the articulated-body algorithm as a factorization (Jain, Robot and Multibody Dynamics, 2011,
-    chapter 7), with the articulated inertia I of each link, its joint axis S, U = I S and D = S' U
-    + rotor. L and its inverse are recursions along the tree: the operations grow with the number of
-    links and not, as those of a triangular factor, with its square or cube. `rotors`, shape (nv,),
-    are added to the diagonal of M.
-    """
-
-    def __init__(self, links: Sequence[TreeLink], rotors: FloatArray) -> None:
-        self._links = links
-        self._axes: list[list[tuple[int, ca.SX, ca.SX]]] = []
-        self._gains: list[tuple[ca.SX, ca.SX]] = [(zeros(3), zeros(3)) for _ in links]
-        self._sizes = zeros(len(rotors))
-        for link in links:
-            turns = [(j, direction, zeros(3)) for j, direction in link.turning.items()]
-            shifts = [
-                (j, zeros(3), link.rotation.T @ direction) for j, direction in link.shifting.items()
-            ]
-            self._axes.append(turns + shifts)
-        bodies = [
-            ArticulatedInertia(
-                ca.trace(link.inertia.second) * ca.SX.eye(3) - link.inertia.second,
-                ca.skew(link.inertia.first),
-                link.inertia.mass * ca.SX.eye(3),
-            )
-            for link in links
-        ]
-        for index in range(len(links) - 1, 0, -1):
-            body = bodies[index]
-            for j, turn, shift in self._axes[index]:
-                moment, force = body.J @ turn + body.H @ shift, body.H.T @ turn + body.M @ shift
-                size = ca.dot(turn, moment) + ca.dot(shift, force) + rotors[j]
-                self._gains[index], self._sizes[j] = (moment, force), size
-                body = body.without(moment, force, size)
-            parent = links[index].parent
-            if parent > 0:
-                bodies[parent] += body.to_parent(links[index])
-
-    def solve(self, right: ca.SX) -> ca.SX:
-        """Returns X of M X = B, shape (nv, k)."""
-        return self.backward(self.forward(right))
-
-    def forward(self, right: ca.SX) -> ca.SX:
-        """Returns Y = L^-1 B, shape (nv, k): from the tips to the base."""
-        return _by_columns(right, self._forward)
-
-    def scaled(self, half: ca.SX) -> ca.SX:
-        """Returns D^-1 Y, shape (nv, k)."""
-        return half / ca.repmat(self._sizes, 1, half.shape[1])
-
-    def backward(self, half: ca.SX) -> ca.SX:
-        """Returns X = L^-T D^-1 Y, shape (nv, k): from the base to the tips."""
-        return _by_columns(half, self._backward)
-
-    def _forward(self, tau: ca.SX) -> ca.SX:
-        result = ca.densify(tau)
-        moments, forces = [zeros(3) for _ in self._links], [zeros(3) for _ in self._links]
-        for index in range(len(self._links) - 1, 0, -1):
-            link, moment, force = self._links[index], moments[index], forces[index]
-            for j, turn, shift in self._axes[index]:
-                result[j] -= ca.dot(turn, moment) + ca.dot(shift, force)
-                along = result[j] / self._sizes[j]
-                gain = self._gains[index]
-                moment, force = moment + gain[0] * along, force + gain[1] * along
-            moment, force = link.force_to_parent(moment, force)
-            moments[link.parent] += moment
-            forces[link.parent] += force
-        return result
-
-    def _backward(self, half: ca.SX) -> ca.SX:
-        result = ca.densify(half / self._sizes)
-        moving = [(zeros(3), zeros(3))]
-        for index, link in enumerate(self._links[1:], 1):
-            turning, shifting = moving[link.parent]
-            shifting = link.rotation.T @ (shifting + ca.cross(turning, link.offset))
-            turning = link.rotation.T @ turning
-            for j, turn, shift in self._axes[index]:
-                moment, force = self._gains[index]
-                carried = ca.dot(moment, turning) + ca.dot(force, shifting)
-                result[j] -= carried / self._sizes[j]
-                turning, shifting = turning + turn * result[j], shifting + shift * result[j]
-            moving.append((turning, shifting))
-        return result
-
-
-def _by_columns(matrix: ca.SX, function: Callable[[ca.SX], ca.SX]) -> ca.SX:
-    """The function of all columns that are not structurally zero."""
-    result = ca.SX(*matrix.shape)
-    for column in range(matrix.shape[1]):
-        if matrix[:, column].nnz():
-            result[:, column] = function(matrix[:, column])
-    return ca.sparsify(result)

@@ -125,15 +125,11 @@ class Surface(ABC):
         return ()
 
     def layer(self, center: ArrayLike, size: float, depth: float) -> PosedShape:
-        """A mesh of a thickness `depth` below a piece of the surface; arguments as of `picture`.
-
-        Raises:
-            ModelError: The piece is not on the surface everywhere, or too curved.
-        """
-        place, (length, width) = np.asarray(center, float), self._lengths(size)
-        rows, columns = facets_needed(self._patch(place, size, EVEN, EVEN))
-        places = sides(rows, length, depth), sides(columns, width, depth)
-        return layer_below(self._patch(place, size, *places), self._linear(), depth)
+        """A mesh of a thickness `depth` below a piece of the surface; arguments as of `picture`."""
+        place, lengths = np.asarray(center, float), self._lengths(size)
+        counts = facets_needed(self._patch(place, size, EVEN, EVEN))
+        rows, columns = (sides(*side, depth) for side in zip(counts, lengths, strict=True))
+        return layer_below(self._patch(place, size, rows, columns), self._linear(), depth)
 
     def _lengths(self, size: float) -> Pair:
         """The lengths of a patch along rows and columns in m."""
@@ -149,10 +145,9 @@ class Surface(ABC):
     def _patch(
         self, center: FloatArray, size: float, rows: FloatArray, columns: FloatArray
     ) -> FloatArray:
-        """A grid of points on the surface, shape (r, c, 3); NaN where there is none.
+        """A grid of the tangent plane, projected onto the surface; NaN where there is none.
 
-        A grid of the tangent plane below the center, projected onto the surface by Newton's method.
-        The places of rows and columns along the sides are from -1/2 to 1/2.
+        Shape (r, c, 3); the places of rows and columns along the sides are from -1/2 to 1/2.
         """
         function = self._linear()
 
@@ -187,11 +182,7 @@ def with_parameters(name: str, surface: Surface) -> tuple[Surface, tuple[Paramet
 
 
 def tangents(normal: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two unit vectors normal to a unit vector, the second upward if possible.
-
-    For a vertical wall the first is horizontal and the second points up; for a horizontal plane
-    they are x and y.
-    """
+    """Two unit vectors normal to a unit vector, the second upward; x and y for a level plane."""
     n = np.asarray(normal, dtype=float)
     if abs(n[2]) < 0.9:
         second = np.array([0.0, 0.0, 1.0]) - n[2] * n

@@ -141,15 +141,6 @@ def test_mass_matrix_is_one(links, seed):
     assert np.linalg.eigvalsh(mass)[0] > 0.0
 
 
-def test_articulated_bodies_are_factors_of_the_mass_matrix(links):
-    B = links.actuation_matrix
-    bodies = links.articulated_bodies(np.diag(B * links.reflected_inertia @ B.T))
-    if bodies is not None:
-        product = ca.mtimes(links.mass_matrix, bodies.solve(ca.SX.eye(links.v.numel())))
-        (product,), _ = numbers(links, {}, {"product": product})
-        np.testing.assert_allclose(np.atleast_2d(product), np.eye(links.v.numel()), atol=1e-11)
-
-
 def test_frames(links):
     point = np.array([0.3, -0.2, 0.5])
     (rotation, origin, there, still), _ = numbers(

@@ -175,7 +175,7 @@ def test_unknown_frame_lists_near_and_known_names():
     ("function", "broken", "quantity"),
     [
         ("mass_matrix", lambda *args: 1.000001 * args[0], "mass matrix"),
-        ("inverse_dynamics", lambda result: result + 1e-6, "Coriolis and centrifugal forces"),
+        ("inverse_dynamics", lambda result: result + 1e-6, "bias"),
         ("joint_velocity_map", lambda result: 1.000001 * result, "velocity map"),
     ],
 )

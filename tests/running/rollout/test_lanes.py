@@ -14,7 +14,7 @@ from runs import scenario, some
 from drake_dae import build_scenario, rollout
 from drake_dae.blocks import machine
 from drake_dae.blocks.emitter import emitted
-from drake_dae.diagrams.state_feedback import encoder_seed
+from drake_dae.diagrams.parts import encoder_seed
 from drake_dae.errors import MachineCodeWarning, ModelError
 from drake_dae.running import rollout as module
 from drake_dae.running import start_values

@@ -24,7 +24,7 @@ from drake_dae import (
 )
 from drake_dae.blocks import machine
 from drake_dae.diagrams import LoopSettings
-from drake_dae.diagrams.state_feedback import encoder_seed
+from drake_dae.diagrams.parts import encoder_seed
 from drake_dae.errors import (
     InconsistentStateError,
     MachineCodeWarning,

@@ -67,8 +67,7 @@ from drake_dae.dae import with_disturbance
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout_program import RolloutProgram
 from drake_dae.systems import CommandedReferences, Observing, PointMaterial
-from drake_dae.systems.control.limits import ControlLimits
-from drake_dae.systems.control.sampling import ControlHold, Sampling
+from drake_dae.systems.control.drives import ControlHold, ControlLimits, Sampling
 from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 

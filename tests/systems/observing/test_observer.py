@@ -205,13 +205,6 @@ def test_friction_of_an_ideal_contact_is_found_while_it_creeps():
     assert_allclose(record["friction"][-1], 0.3, rtol=0.02)
 
 
-@pytest.mark.slow
-def test_friction_stays_between_zero_and_its_limit():
-    _, record = slide(SWAY, 0.3, Observing(20.0, 20.0, largest_friction=0.2))
-    assert record["friction"].max() == 0.2
-    assert record["friction"].min() >= 0.0
-
-
 def test_friction_stands_still_where_the_contact_is_taken_for_lost():
     _, record = slide(SWAY, 0.1, Observing(20.0, friction_rate=10.0, least_force=100.0))
     assert np.all(record["friction"] == 0.0)
@@ -398,15 +391,6 @@ def test_gradients_of_sliding_span_what_derivatives_of_friction_at_rest_span():
         ]
         assert np.abs(left[0] - d).max() > 0.1
         assert_allclose(left[0], left[1], rtol=0.0, atol=1e-9)
-
-
-def test_law_without_a_disturbance_is_that_of_the_system():
-    model, dae = frictional(0.3)
-    given = TrackingLaw(model.dae, poles(-4.0)), TrackingLaw(dae, poles(-4.0))
-    state = find_structure(model.dae).states[0]
-    reference = np.linspace(0.2, 0.7, given[0].layout.reference_size)
-    controls = [law.control(state, reference) for law in given]
-    assert_allclose(controls[1], controls[0], rtol=1e-12)
 
 
 def test_law_cancels_a_disturbance_that_acts_as_a_known_torque():

@@ -47,6 +47,8 @@ class DisturbanceForce:
     point: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if self.frame == "world":
+            raise ModelError("a disturbance on the world moves nothing; name a frame of the robot")
         positive("the rise of a disturbance", self.rise)
         start = number("the start_time of a disturbance", self.start_time)
         if self.end_time is not None and not self.end_time > start:
@@ -79,16 +81,7 @@ class DisturbanceForce:
 
 
 class AppliedDisturbances(LeafSystem):
-    """Applies disturbance forces to Drake's MultibodyPlant.
-
-    Output port:
-        spatial_forces: The input of its port `applied_spatial_force`.
-
-    Args:
-        plant: The plant, finalized.
-        disturbances: The disturbances.
-        frames: The frame of each.
-    """
+    """Applies disturbance forces to the frames of Drake's MultibodyPlant."""
 
     __slots__ = SHARED_DICTIONARY
 
@@ -118,7 +111,6 @@ class AppliedDisturbances(LeafSystem):
         )
 
     def again(self) -> "AppliedDisturbances":
-        """Another instance, for another diagram."""
         return AppliedDisturbances(*self._arguments)
 
     def _calc(self, context: Context, output: Value) -> None:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +47,6 @@ from drake_dae import (
     PointOnSurface,
     RobotModel,
     Sphere,
-    build_scenario,
     rollout,
     simulate,
 )
@@ -310,15 +308,6 @@ def test_friction_settles_with_fixed_steps_up_to_m_v_s_by_mu_f_n(steps):
     assert off < 1e-8 if steps == 1.0 else off > 0.05, off
 
 
-@pytest.mark.slow
-def test_steps_tend_to_the_continuous_motion_at_first_order():
-    """Sliding at 1.5 times the limit, where both laws of friction are full from 0.1 s on."""
-    exact = 0.1 * (7.5 - 5.0) / 2.1
-    found = [run_sled(step, 7.5, 0.1)[2] - exact for step in (1e-3, 5e-4, 2.5e-4)]
-    for coarse, fine in pairwise(found):
-        assert 1.8 < coarse / fine < 2.2, found
-
-
 def test_a_contact_opens_and_strikes_with_the_restitution_of_hunt_and_crossley():
     """A falling sled, without dissipation, rises to where it fell from: energy is conserved.
 
@@ -427,31 +416,6 @@ def test_gains_of_a_continuous_contact_need_a_period():
     )
     with pytest.raises(ScenarioError, match="sampling"):
         run_scenario(found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "wall_point_contact",
-    ],
-)
-def test_a_run_of_a_shipped_scenario_is_that_of_drakes_plant(name):
-    """What Drake's solver leaves, 1e-6 of each step's change, stays so small in a closed loop.
-
-    The law's gains, 16 1/s for positions, forget it.
-    """
-    drakes = scenario(name, "duration=0.5")
-    _, _, wanted = run_scenario(drakes)
-    own = replace(drakes, plant=drakes.plant.rolled)
-    _, _, found = run_scenario(own)
-    assert_allclose(found["state"], wanted["state"], atol=1e-5)
-    assert_allclose(found["constraint_force"], wanted["constraint_force"], atol=2e-3)
-    loop, context = build_scenario(own)
-    (run,) = rollout(loop, *start_values(loop, context), found.time)
-    assert run.failure is None
-    for signal in ("state", "contact_force", "control"):
-        assert_allclose(run.record[signal], found[signal], atol=1e-9, err_msg=signal)
 
 
 def test_the_continuous_plant_has_the_linear_model_of_differences():
