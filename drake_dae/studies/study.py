@@ -100,11 +100,14 @@ class Study:
 
     def extent(self) -> dict[str, dict[str, float]]:
         """Name of a figure -> its least, median and largest value over the runs that have it."""
-        statistics = {"least": np.nanmin, "median": np.nanmedian, "largest": np.nanmax}
-        return {
-            name: {what: float(of(self.values(name))) for what, of in statistics.items()}
-            for name in self.figures
-        }
+        found = {}
+        for name in self.figures:
+            values = self.values(name)
+            numbers = np.nanmin(values), np.nanmedian(values), np.nanmax(values)
+            found[name] = dict(
+                zip(("least", "median", "largest"), map(float, numbers), strict=True)
+            )
+        return found
 
     def plot(self) -> Figure:
         """Each figure that varies over the first key with numbers that vary, or over the runs.

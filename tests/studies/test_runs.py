@@ -171,7 +171,7 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
 def test_a_rollout_is_that_of_the_scenario_alone():
     """On the contact that rollouts have in place of Drake's, and with its noise."""
     settings = (
-        "plant=!MultibodyPlant {time_step: 1.0e-3}",
+        "plant=!MultibodyPlant {time_step: 1.0e-3, friction: 0.1}",
         "sampling={period: 1.0e-3, delay: 1.0e-3}",
         "sensors.force={sample_period: 1.0e-3, noise_deviation: 0.1}",
     )
