@@ -212,7 +212,9 @@ FAMILIES: dict[type, Family] = {
     Stage: _family(robots.FlexibleJoints, robots.DcMotors, robots.ElectrohydraulicServos),
     Reference: Family(_REFERENCES, float),
     Load: _family(robots.KnownForce, robots.JointFriction),
-    ScenarioPlant: _family(IdealConstraints, plants.MultibodyPlant, plants.CompliantContact),
+    ScenarioPlant: _family(
+        IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
+    ),
     parts.Gains: _family(parts.Poles, parts.Coefficients, parts.Matrices),
     phases.Phase: _family(
         phases.Approach, phases.Press, phases.Move, phases.Dwell, phases.Release, phases.Retreat
