@@ -31,12 +31,11 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         )
     state = ca.vec(state)
     check_choice(name, given["compiled"])
-    for key in ("least_margin", "negligible"):
-        if not 1e-15 <= number(f"{name}: {key}", given[key]) < 1.0:
-            raise ModelError(
-                f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
-                f"{brief(given[key])}"
-            )
+    if not 1e-15 <= number(f"{name}: least_margin", given["least_margin"]) < 1.0:
+        raise ModelError(
+            f"{name}: least_margin must be from 1e-15, which is round-off, to below 1, got "
+            f"{brief(given['least_margin'])}"
+        )
     for key, kind in (("contacts", UnilateralInput), ("parameters", Parameter)):
         items = given[key]
         if not isinstance(items, (list, tuple)) or not all(isinstance(i, kind) for i in items):

@@ -19,7 +19,7 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
+from drake_dae.trace.round_off import SINGULAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,6 @@ class DaeSystem:
             terms of u^T W u comparable, as by 1 / limit^2.
         compiled: Machine code from the first call (True), never, or when it pays ("auto").
         least_margin: A(x) or B(x) is singular where its smallest singular value, scaled, is below.
-        negligible: Entries below this, relative to their row or column, are zero in degrees.
         contacts: Constraint inputs that only push, if one has friction: see `contacts`.
         dry: The names of parameters that are coefficients of Coulomb friction in f.
 
@@ -99,7 +98,6 @@ class DaeSystem:
     compiled: Compiled = "auto"
     contacts: tuple[UnilateralInput, ...] = ()
     least_margin: float = SINGULAR
-    negligible: float = NEGLIGIBLE
     dry: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
