@@ -250,17 +250,15 @@ class RobotModel:
         parameters: ArrayLike | None = None,
         output_parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """q = psi(z_1) of (58): the consistent configuration with given position outputs.
+        """q = psi(z_1) of (58), shape (nq,): the consistent configuration with given outputs.
 
         Args:
             outputs: z_1, shape (nu - k,) where k forces are outputs; None leaves them free.
-            guess: Where Newton's method starts, shape (nq,).
+            guess: Where Newton's method starts, shape (nq,); if the outputs do not determine q, the
+                one next to it is returned.
             parameters: Values of all parameters; the defaults if None.
             output_parameters: Values of all parameters for z_1, such as those that a law assumes
                 for a wall that its constraint has elsewhere; `parameters` if None.
-
-        Returns:
-            q, shape (nq,); if the outputs do not determine it, the one next to the guess.
 
         Raises:
             InconsistentStateError: There is no such configuration near the guess.
@@ -270,54 +268,42 @@ class RobotModel:
         count = 0 if outputs is None else len(self.position_signals)
         wanted = vector(f"{self.name}: outputs", [] if outputs is None else outputs, count)
         values = self.dae.parameter_vector(parameters)
-        of_outputs = values
-        if output_parameters is not None:
-            of_outputs = self.dae.parameter_vector(output_parameters)
-        return self.placing.solve(wanted, q, values, of_outputs)
+        given = parameters if output_parameters is None else output_parameters
+        return self.placing.solve(wanted, q, values, self.dae.parameter_vector(given))
 
     @checked(ModelError)
     def rest_state(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """The state at rest in a configuration with given constraint forces.
+        """x = (q, 0, s), shape (n,), at rest in a configuration q with given force outputs.
 
-        The states of the stages (shaft positions, currents, actuator forces) and the forces that
-        are not outputs are solved for with v = 0, v' = 0, s' = 0.
+        The states s of the stages (shaft positions, currents, actuator forces) and the forces that
+        are not outputs are solved for with v = 0, v' = 0, s' = 0. With rigid joints the forces do
+        not enter it.
 
         Args:
             positions: q, shape (nq,), on the constraints.
             forces: The force outputs z_2, shape (k,): lambda if all forces are outputs.
             parameters: Values of all parameters; the defaults if None.
 
-        Returns:
-            x = (q, 0, s), shape (n,). With rigid joints the forces do not enter it.
-
         Raises:
             ModelError: No drive holds the robot there.
         """
-        values = self.dae.parameter_vector(parameters)
-        q = vector(f"{self.name}: positions", positions, self.links.q.numel())
-        load = vector(f"{self.name}: forces", forces, self._num_forces)
-        return self.balance.state(q, load, values)
+        return self.balance.state(*self._at_rest(positions, forces, parameters))
 
     @checked(ModelError)
     def rest_forces(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """All constraint forces at rest in a configuration, for given force outputs.
+        """lambda, shape (m,), at rest with S lambda = z_2; arguments as of `rest_state`."""
+        return self.balance.rest(*self._at_rest(positions, forces, parameters))[1]
 
-        Args:
-            positions: q, shape (nq,), on the constraints.
-            forces: The force outputs z_2, shape (k,).
-            parameters: Values of all parameters; the defaults if None.
-
-        Returns:
-            lambda, shape (m,), with S lambda = z_2.
-        """
-        values = self.dae.parameter_vector(parameters)
+    def _at_rest(
+        self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
         load = vector(f"{self.name}: forces", forces, self._num_forces)
-        return self.balance.rest(q, load, values)[1]
+        return q, load, self.dae.parameter_vector(parameters)
 
     def _check_outputs(
         self, motors: Sequence[Signal], positions: Sequence[Signal], is_chosen: bool

@@ -71,10 +71,9 @@ class TracedFunction:
         compiled: Compiled = False,
         doubt: ca.SX | None = None,
         lean: bool = False,
-        outside: str = "",
     ) -> None:
         self.name = name
-        self._regular, self._outside = regular, outside
+        self._regular = regular
         self.input_names = tuple(inputs)
         self.output_names = tuple(outputs)
         dense = [ca.densify(expression) for expression in outputs.values()]
@@ -181,17 +180,12 @@ class TracedFunction:
         return isfinite(self._arrays.finite[0])
 
     @property
-    def is_regular(self) -> bool:
-        """Whether the last values are finite and the matrix is regular; ignores the doubt."""
-        return self.is_finite and self.pivot >= SINGULAR_PIVOT
-
-    @property
     def pivot(self) -> float:
         """The pivot of the last evaluation; 1 without a matrix."""
         return float(self._arrays.pivot[0])
 
     def failure(self) -> Failure:
-        """Returns the failure of the last evaluation, if it was not valid."""
+        """The failure of the last evaluation, if it was not valid."""
         for fault, limit in ((FailureKind.INPUT, np.inf), (FailureKind.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(argument) < limit)))
@@ -201,8 +195,6 @@ class TracedFunction:
             if bad:
                 return Failure(self.name, fault, bad)
         # A value may not be finite because the matrix is singular.
-        if self.is_regular and self._outside:
-            return Failure(self.name, FailureKind.OUTSIDE, {}, self._outside)
         is_singular = self.is_finite or self.pivot < SINGULAR_PIVOT
         fault = FailureKind.SINGULAR if is_singular else FailureKind.VALUE
         return Failure(self.name, fault, {}, self._regular)
