@@ -44,7 +44,7 @@ from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import DrakeDaeError
 from drake_dae.references import PathLimits
 from drake_dae.robots import Constraint, Links, Surface
-from drake_dae.scenario.robot_file.reading import add_robot
+from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.shipped import find_scenario
 from drake_dae.systems import Controller, Observing, Plant, PointMaterial
@@ -60,7 +60,7 @@ def loop() -> dd.ClosedLoop:
 
 def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     robot = scenario().robot
-    add_robot(robot, plant, scene_graph)
+    read_robot(robot, plant, scene_graph)
 
 
 @cache

@@ -38,8 +38,11 @@ DOUBT = 0.03
 """Gradients are checked for near dependence if the part of one that is orthogonal to those before
 it is shorter than usual by this factor."""
 
-PROBE = 1e-4
-"""The distance at which poles show, in states over their scale."""
+POLE = 1e-3
+"""A larger residual, over its usual change by the scale of the states, is no round-off."""
+
+NEAR_POLE = 1e-6, 1e-3
+"""The distances at which poles show, in states over their scale."""
 
 RESTARTS = 12
 """The number of random starts of `Manifold.settle`."""
@@ -65,6 +68,9 @@ class Manifold:
         self.residual_function = system.trace("manifold", {"residual": self.residual_expression})
         outputs = {"gradient": self.gradient}
         self._gradient = system.trace("manifold gradient", outputs, often=False)
+        usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
+        # Of the residuals: how much they change while the states change by their scale.
+        self._usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
         self._first_steps = self._trace_first_steps()
         self._settling = Settling(system, self.layout, self.gradient, self.gradients, self.residual)
 
@@ -126,8 +132,6 @@ class Manifold:
         gradients are nearly dependent, by their usual lengths.
         """
         system = self.system
-        usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
-        usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
         start, p, scale = system.state, system.parameter_symbol, ca.SX(self.scale)
         # The steps hold them often: common subexpressions are removed once here, not from the
         # whole.
@@ -143,7 +147,7 @@ class Manifold:
         moved, outcome = _followed(start, steps, lengths, *sizes)
         outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": moved, "step": steps[0]}
         # A cheap test in place of the sines, which are computed only where this one fails.
-        heads = [ca.fabs(pivots[i]) / usual[i] for i in self.layout.heads.tolist()]
+        heads = [ca.fabs(pivots[i]) / self._usual[i] for i in self.layout.heads.tolist()]
         doubt = ca.mmin(ca.vertcat(1, *heads)) - DOUBT
         return system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
 
@@ -164,7 +168,7 @@ class Manifold:
             is_near = reach <= CONSISTENT * norm(x / self.scale) + FLOOR
             return is_near and not self._is_at_pole(x, p)
         # Dependent gradients, a residual of zero, or one that no state changes.
-        return self._relative_size(x, p) <= CONSISTENT
+        return self._relative_size(x, p) <= CONSISTENT and not self._is_at_pole(x, p)
 
     def project(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns the consistent state next to a state, to round-off, by Newton's method.
@@ -187,20 +191,17 @@ class Manifold:
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
-        """Whether the residual is large though Newton's step is short.
+        """Whether the residual is large, or not finite, though Newton's step may be short.
 
-        Near a pole the step is the distance to it. The residual then falls along the step, while it
-        grows from a consistent state, whose own is round-off.
+        Near a pole the step is the distance to it. At a pole the residual may be 0 by round-off;
+        it is large next to it, and falls with the distance, while it grows from a consistent state.
         """
-        step = self._first_steps.evaluate(x, p)[2]
-        length = norm(step / self.scale)
-        if not (isfinite(length) and length > 0.0):
-            return False
-        here, there = (
-            self.residual_function(state, p)[0] for state in (x, x + PROBE / length * step)
+        away = self.scale * np.random.default_rng(0).normal(size=x.size)
+        left, near, far = (
+            norm(self.residual_function.evaluate(state, p)[0] / np.maximum(self._usual, 1.0))
+            for state in (x, x + NEAR_POLE[0] * away, x + NEAR_POLE[1] * away)
         )
-        lengths = positive(np.linalg.norm(self.gradients(x, p) * self.scale, axis=1))
-        return bool(norm(there / lengths) < norm(here / lengths))
+        return not left <= POLE or bool(near > 1.0 and near > far)
 
     def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
         """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
@@ -303,7 +304,8 @@ class Manifold:
         if not residual.any():
             return start
         outcome, first = self._first_steps.evaluate(start, p)[0][:2]
-        if self._first_steps.is_finite and outcome != NOT_FOUND and 0.0 < first <= FLOOR:
+        is_there = self._first_steps.is_finite and outcome != NOT_FOUND and 0.0 < first <= FLOOR
+        if is_there and not self._is_at_pole(start, p):
             return self.project(start, p)  # It was there up to round-off, which no level moves.
         chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
         error = InconsistentStateError(

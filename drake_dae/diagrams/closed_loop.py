@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.common import RandomGenerator
 from pydrake.geometry import SceneGraph
 from pydrake.systems.framework import Context, Diagram
 from pydrake.systems.primitives import RandomSource, VectorLogSink
@@ -14,14 +15,14 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
 from drake_dae.dae import Signal
+from drake_dae.diagrams.parts import encoder_seed as seed_of_encoders
 from drake_dae.diagrams.record import Record, computed_record, recorded_values
-from drake_dae.diagrams.sources import seed_noise
-from drake_dae.diagrams.state_feedback import MeasuredState
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller, PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.observing.estimator import StateEstimator
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.sensing.encoders import StateSensor
 from drake_dae.systems.sensing.force_sensor import ForceSensor
 
 
@@ -45,6 +46,7 @@ class ClosedLoop:
         exogenous: The generator of the exogenous signals for the law, or None.
         plant_exogenous: The generator of the exogenous signals for the plant, or None.
         encoders: The sensor of the state for the law, or None.
+        encoder_noise: The source of its noise, or None.
         observer: The observer of the disturbance or the state, or None.
         memory: A cache for rollouts and starts.
     """
@@ -60,7 +62,8 @@ class ClosedLoop:
     noise: RandomSource | None = None
     exogenous: ReferenceGenerator | None = None
     plant_exogenous: ReferenceGenerator | None = None
-    encoders: MeasuredState | None = None
+    encoders: StateSensor | None = None
+    encoder_noise: RandomSource | None = None
     observer: StateEstimator | None = None
     memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
@@ -69,11 +72,7 @@ class ClosedLoop:
 
     @property
     def reference(self) -> ReferenceGenerator:
-        """The generator of references.
-
-        Raises:
-            ModelError: There is none.
-        """
+        """The generator of references, or a ModelError."""
         if self.generator is None:
             raise ModelError(
                 f"{self.controller.get_name()} plans its references itself and has no generator, "
@@ -81,27 +80,24 @@ class ClosedLoop:
             )
         return self.generator
 
-    def set_seed(self, context: Context, seed: int) -> None:
-        """Sets the seed of the noise of the force sensor.
+    def set_seed(self, context: Context, seed: int, encoder_seed: int | None = None) -> None:
+        """Sets the seeds of the noise of the force sensor, and of the encoders if not None.
 
-        Without it they are the same in every run of a loop.
-
-        Args:
-            context: The diagram's context.
-            seed: The seed of the random numbers.
+        Without it they are the same in every run of a loop. `context` is that of the diagram.
         """
-        seed_noise(self.noise, context, seed)
+        if self.noise is not None:
+            self.noise.SetRandomContext(context_in(self.noise, context), RandomGenerator(seed))
+        if self.encoder_noise is not None and encoder_seed is not None:
+            # Another one than that of the force sensor, so that their noise is independent.
+            generator = RandomGenerator(seed_of_encoders(encoder_seed))
+            at_noise = context_in(self.encoder_noise, context)
+            self.encoder_noise.SetRandomContext(at_noise, generator)
 
     @checked(WiringError)
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets the state x of the plant, without a projection onto the constraints.
+        """Sets the state x of the plant, shape (n,), without a projection onto the constraints.
 
-        Args:
-            context: The diagram's context.
-            state: x, shape (n,).
-
-        Raises:
-            ModelError: The shape is wrong.
+        `context` is that of the diagram.
         """
         self.plant.set_state(context_in(self.plant, context), state)
 
@@ -124,23 +120,13 @@ class ClosedLoop:
         """
         context_in(self.plant, context)  # The log has no name.
         logged = Record.from_log(self.log, self.signals, context, after)
-        return self.with_errors(logged, context).while_finite()
+        return self.with_errors(logged).while_finite()
 
     @checked(WiringError)
-    def with_errors(self, record: Record, context: Context | None = None) -> Record:
-        """Adds the derived signals of the controller, such as `tracking_error`, to a record.
-
-        Args:
-            record: The record.
-            context: The diagram's context after the run, for controllers that need it.
-        """
-        plant, controller, at_controller = self.plant, self.controller, None
+    def with_errors(self, record: Record) -> Record:
+        """Adds the derived signals of the controller, such as `tracking_error`, to a record."""
         values = {name: recorded.values for name, recorded in record.signals.items()}
-        if context is not None:
-            at_controller = context_in(controller, context)
-            along = self.plant_parameters(record, context)
-            values["parameters"] = controller.law.system.parameters_of(plant.dae, along)
-        derived = controller.derived(at_controller, record.time, values)
+        derived = self.controller.derived(values)
         added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
         return computed_record(record.time, {**record.signals, **added})
 
@@ -148,11 +134,7 @@ class ClosedLoop:
     def plant_parameters(self, record: Record, context: Context) -> FloatArray:
         """The parameters of the plant at the times of a record, one row each.
 
-        They are those of the context, and exogenous ones those of the record.
-
-        Args:
-            record: The record.
-            context: The diagram's context after the run.
+        They are those of the context after the run, and exogenous ones those of the record.
         """
         plant = self.plant
         own = plant.parameters(context_in(plant, context))

@@ -3,37 +3,38 @@
 from collections.abc import Mapping, Sequence
 
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.framework import DiagramBuilder, OutputPort, System, TriggerType
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
 
 from drake_dae.arguments import checked
-from drake_dae.dae import TrackingLaw
+from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.drives import add_drives, hold_before
-from drake_dae.diagrams.force_feedback import add_force_feedback
-from drake_dae.diagrams.observing import add_observer
 from drake_dae.diagrams.parts import (
+    ENCODER_NOISE,
+    LoopSettings,
     add_block,
+    add_exogenous,
     add_hold,
+    add_noise,
     add_signals,
+    check_force_loop,
     check_parts,
-    contact_reference,
+    hold_before,
+    make_observer,
+    make_sensor,
 )
-from drake_dae.diagrams.recorded import (
-    further_signals,
-    log_signals,
-    signals_of_parts,
-    signals_of_plant,
-)
-from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.diagrams.sources import add_exogenous, make_generator
-from drake_dae.diagrams.state_feedback import add_encoders
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.references import Reference, references_by_name
 from drake_dae.scene.view import add_live_view
+from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import Controller, check_law
 from drake_dae.systems.control.controller import TrackingController
+from drake_dae.systems.control.drives import ControlHold, ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
+
+Named = dict[str, tuple[OutputPort, Sequence[Signal]]]
+"""Name -> output port, names and units of a recorded signal."""
 
 
 @checked(WiringError)
@@ -75,15 +76,18 @@ def make_closed_loop(
     """
     settings = settings or LoopSettings()
     check_law(plant.dae, law)
+    signals, degrees = law.system.output_signals, law.layout.reference_degrees
     if isinstance(references, Mapping):
-        names = [signal.name for signal in law.system.output_signals]
-        references = references_by_name(references, names, law.layout.reference_degrees)
-    period = settings.period(plant.time_step)
-    reference = make_generator(references, law, settings)
+        references = references_by_name(references, [s.name for s in signals], degrees)
+    if settings.commanded:
+        reference: ReferenceGenerator = CommandedReferences(references, degrees, signals)
+    else:
+        reference = ReferenceGenerator(references, degrees)
     try:
         outputs = law.layout.values(reference.reference(settings.start_time))
     except DrakeDaeError:
         outputs = None  # A trajectory that starts later.
+    period = settings.period(plant.time_step)
     controller = TrackingController(law, outputs, sample_period=period)
     return wire_loop(
         plant, controller, reference, settings, scene_graph=scene_graph, meshcat=meshcat
@@ -102,11 +106,8 @@ def wire_loop(
 ) -> ClosedLoop:
     """Builds the closed loop of a plant and any controller, such as that of a task.
 
-    Args:
-        plant: The plant.
-        controller: The controller.
-        reference: The source of its references; None if the controller plans them itself.
-        settings, scene_graph, meshcat: As for `make_closed_loop`.
+    Without a `reference` the controller plans its references itself. Otherwise as
+    `make_closed_loop`.
 
     Raises:
         WiringError: The controller does not fit this plant or one of these parts; or as for
@@ -115,64 +116,125 @@ def wire_loop(
     parts = settings or LoopSettings()
     controller.check_plant(plant)
     check_parts(plant, controller, reference, parts)
-    builder, law = DiagramBuilder(), controller.law
+    builder, period, dae = DiagramBuilder(), parts.period(plant.time_step), plant.dae
+    named = Named()
+
+    def connect(source: OutputPort, system: System, port: str) -> None:
+        builder.Connect(source, system.GetInputPort(port))
 
     # The plant, its references and its controller.
     for block in (plant, reference, controller):
         if block is not None:
             add_block(builder, block)
-    goal = contact_reference(controller, reference)
+    goal = None
+    if reference is not None:
+        goal = reference.GetOutputPort("reference")
+        connect(goal, controller, "reference")
+    elif controller.HasOutputPort("contact_reference"):
+        goal = controller.GetOutputPort("contact_reference")
 
     # The state goes to the controller, through encoders.
-    state, measured = plant.GetOutputPort("state"), None
+    state, encoders, encoder_noise = plant.GetOutputPort("state"), None, None
     if parts.encoders is not None:
-        measured = add_encoders(builder, plant, parts.encoders, parts.period(plant.time_step))
-        state = measured.output
-    observing = parts.observer if goal is not None else None
-    if observing is None:
-        builder.Connect(state, controller.GetInputPort("estimated_state"))
+        encoders = builder.AddSystem(make_sensor(plant, parts.encoders, period))
+        connect(state, encoders, "state")
+        encoder_noise = add_noise(builder, encoders, period, ENCODER_NOISE)
+        state = encoders.GetOutputPort("estimated_state")
+        named["estimated_state"] = (state, dae.state_signals)
 
     # Its control goes to the plant, held between samples and limited by drives.
-    sampling = None if parts.sampling is None else hold_before(plant, parts.sampling)
-    control = controller.GetOutputPort("control")
-    control, limits = add_drives(builder, control, sampling, parts.control_limits)
-    builder.Connect(control, plant.GetInputPort("control"))
-    if goal is not None and controller.HasInputPort("reference"):
-        builder.Connect(goal, controller.GetInputPort("reference"))
+    control, sampling, limits = controller.GetOutputPort("control"), None, None
+    if parts.sampling is not None:
+        sampling = hold_before(plant, parts.sampling)
+        hold = builder.AddSystem(ControlHold(control.size(), sampling))
+        connect(control, hold, "control")
+        control = hold.get_output_port()
+    if parts.control_limits is not None:
+        limits = builder.AddSystem(ControlLimits(parts.control_limits))
+        if limits.limits.size != control.size():
+            raise WiringError(
+                f"control_limits has {limits.limits.size} entries, there are {control.size()} "
+                "controls"
+            )
+        connect(control, limits, "control")
+        control = limits.GetOutputPort("control")
+    connect(control, plant, "control")
 
-    # Exogenous signals go to the plant, and to the law as known there.
-    moving, known = add_exogenous(builder, plant, controller, parts)
+    # Exogenous signals go to the plant, and to the law as known there. Commands pass as many lags
+    # to the plant as to the law.
+    moving, known = None, None
+    degrees = *plant.exogenous_layout.degrees, *controller.exogenous_layout.degrees
+    depth = max(degrees, default=0) + 1 if parts.commanded else 0
+    moves = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
+    if moves:
+        moving = add_exogenous(builder, plant, dae, moves, depth)
+    if parts.exogenous:
+        system = controller.law.system
+        known = add_exogenous(builder, controller, system, parts.exogenous, depth)
+        builder.ExportOutput(known.get_output_port(), "known_exogenous")
 
     # An observer estimates model errors for the law, and perhaps its state. Integrals are not
     # updated while a contact is lost, or a drive is at its limit.
-    holds, observer = list[OutputPort](), None
-    if observing is not None and goal is not None:
-        ports = state, sampling, control, goal, limits
-        observer = add_observer(builder, plant, controller, observing, *ports, parts.encoders)
-        if observing.state_rate is not None:
+    observer, is_limited = None, None if limits is None else limits.GetOutputPort("is_limited")
+    if parts.observer is not None:
+        if goal is None:
+            raise WiringError("observer: it needs the references of a generator, and there is none")
+        observer = make_observer(plant, controller, parts.observer, sampling, parts.encoders)
+        builder.AddSystem(observer)
+        connect(state, observer, "measured_state")
+        connect(control, observer, "control")
+        connect(goal, observer, "reference")
+        connect(observer.GetOutputPort("exogenous"), controller, "exogenous")
+        if is_limited is not None:
+            connect(is_limited, observer, "hold")
+        is_limited = observer.GetOutputPort("hold")
+        if parts.observer.state_rate is not None:
+            if encoders is not None:
+                named["measured_state"] = named.pop("estimated_state")
             state = observer.GetOutputPort("estimated_state")
-        holds.append(observer.GetOutputPort("hold"))
-    if limits is not None and observer is None:
-        holds.append(limits.GetOutputPort("is_limited"))
-    add_hold(builder, controller, holds)
+            named["estimated_state"] = (state, dae.state_signals)
+    connect(state, controller, "estimated_state")
+    add_hold(builder, controller, [] if is_limited is None else [is_limited])
     add_signals(builder, controller, parts.signals)
+    if limits is not None:
+        named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
 
     # The constraint force goes through its sensor to the blocks that measure it.
-    noise = None
+    force, sensor, noise = plant.GetOutputPort("constraint_force"), parts.sensor, None
     if controller.HasInputPort("measured_force"):
-        if parts.sensor is not None:
-            add_block(builder, parts.sensor)
-        ways = parts.sensor, parts.sampling, [] if observer is None else [observer]
-        noise = add_force_feedback(builder, plant, controller, *ways)
+        check_force_loop(plant, controller, sensor, parts.sampling)
+        if sensor is not None:
+            add_block(builder, sensor)
+            connect(force, sensor, "force")
+            force = sensor.GetOutputPort("measured_force")
+            named["measured_force"] = (force, dae.constraint_input_signals)
+            lag = sensor.sample_period or sensor.time_constant
+            noise = add_noise(builder, sensor, lag, "force_noise")
+        connect(force, controller, "measured_force")
+        if controller.HasOutputPort("tared_force"):
+            force = controller.GetOutputPort("tared_force")
+    if observer is not None and observer.HasInputPort("measured_force"):
+        connect(force, observer, "measured_force")
 
     # Every signal has its own name: it is exported, and logged at each step.
-    named = {
-        **signals_of_plant(plant, moving, reference, law, control),
-        **signals_of_parts(plant, controller, measured, limits, observer, parts.sensor),
-    }
-    if reference is not None:
-        named |= further_signals(reference)
-    log = log_signals(builder, plant, controller, named)
+    inputs = Named()
+    if moving is not None:
+        signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
+        inputs["exogenous"] = (moving.get_output_port(), signals)
+    inputs |= {name: (plant.GetOutputPort(name), s) for name, s in plant.port_signals.items()}
+    if reference is not None and goal is not None:
+        inputs["reference"] = (goal, controller.law.reference_signals)
+    named = {**inputs, "control": (control, dae.control_signals), **named}
+    for block in (controller, observer, plant):
+        if block is not None:
+            named |= {n: (block.GetOutputPort(n), s) for n, s in block.further_signals.items()}
+    for name, (port, _) in named.items():
+        builder.ExportOutput(port, name)
+    for name in controller.shown:
+        builder.ExportOutput(controller.GetOutputPort(name), name)
+    if plant.model is not None:
+        builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
+    log = log_steps(builder, [port for port, _ in named.values()], plant)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
     if meshcat is not None:
@@ -189,10 +251,30 @@ def wire_loop(
         log,
         {name: tuple(signals) for name, (_, signals) in named.items()},
         scene_graph,
-        parts.sensor,
+        sensor,
         noise,
         known,
         moving,
-        measured,
+        encoders,
+        encoder_noise,
         observer,
     )
+
+
+def log_steps(builder: DiagramBuilder, ports: Sequence[OutputPort], plant: Plant) -> VectorLogSink:
+    """Adds one log of several ports, stacked, with one sample per step.
+
+    For a discrete plant the log is periodic, since after the last step of a run the state of the
+    plant belongs to a time that the run has not reached.
+    """
+    stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
+    stacked.set_name("logged_signals")
+    for index, port in enumerate(ports):
+        builder.Connect(port, stacked.get_input_port(index))
+    port = stacked.get_output_port()
+    if plant.time_step:
+        triggers = {TriggerType.kPeriodic}
+        log = builder.AddSystem(VectorLogSink(port.size(), triggers, plant.time_step))
+        builder.Connect(port, log.get_input_port())
+        return log
+    return LogVectorOutput(port, builder, {TriggerType.kPerStep})

@@ -21,7 +21,7 @@ from drake_dae.errors import (
 )
 from drake_dae.running.divergence import DivergenceWatch
 from drake_dae.systems.control.contract import Controller
-from drake_dae.systems.control.limits import ControlLimits
+from drake_dae.systems.control.drives import ControlLimits
 from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.round_off import equilibration, smallest_singular_value

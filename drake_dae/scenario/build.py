@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
@@ -26,9 +26,7 @@ from drake_dae.dae import (
     with_disturbance,
 )
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.drives import hold_before
-from drake_dae.diagrams.settings import LoopSettings
-from drake_dae.diagrams.state_feedback import make_sensor
+from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
 from drake_dae.references import Reference
@@ -43,7 +41,7 @@ from drake_dae.scenario.model import (
     scenario_structure,
 )
 from drake_dae.scenario.parts import Poles, ScenarioTask
-from drake_dae.scenario.robot_file.reading import add_robot
+from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
 from drake_dae.systems.control.contract import Controller, Derived
@@ -169,7 +167,10 @@ def build_completed(
 
 def make_plant(scenario: Scenario, model: RobotModel, structure: ConstraintStructure) -> Plant:
     """The plant of a scenario, for a robot with payloads if the plant does not add them itself."""
-    add = partial(add_robot, scenario.robot, payloads=scenario.plant.payloads)
+
+    def add(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+        read_robot(scenario.robot, plant, scene_graph, scenario.plant.payloads)
+
     try:
         return scenario.plant.plant(model, structure, add)
     except InconsistentStateError as error:  # Its default state is projected.
@@ -296,9 +297,7 @@ class _NoController(TracedSystem, Controller):
     def check_plant(self, plant: Plant) -> None:
         pass
 
-    def derived(
-        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
-    ) -> Derived:
+    def derived(self, values: Mapping[str, FloatArray]) -> Derived:
         none = np.zeros((*values["state"].shape[:-1], 0))
         return {name: (none, ()) for name in ("desired_output", "tracking_error")}
 

@@ -3,14 +3,13 @@
 import os
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from math import ceil, log10, pi
 from pathlib import Path
 from time import process_time
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -19,7 +18,6 @@ from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
-    JacobianWrtVariable,
     Joint,
     PrismaticJoint,
     QuaternionFloatingJoint,
@@ -32,7 +30,7 @@ from pydrake.multibody.tree import (
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import DrakeDaeError, ModelError, RobotFileWarning, ScenarioError
-from drake_dae.references import CircleReference, SinusoidReference
+from drake_dae.references import CircleReference, Reference, SinusoidReference
 from drake_dae.robots import (
     ConstraintSet,
     Cylinder,
@@ -50,7 +48,7 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
-from drake_dae.scenario.robot_file.changes import actuators_of, closing_joints, joints_of
+from drake_dae.scenario.robot_file.changes import joints_of
 from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
@@ -66,6 +64,9 @@ _TOOLS = [
     re.compile(word, re.IGNORECASE)
     for word in ("tcp", "tool", "end_?effector|eef|(^|_)ee(_|$)", "flange", "tip")
 ]
+
+_ARM, _LONGEST_FINGER = 5, 4
+"""Where a chain of so many joints branches into chains of at most so many, a hand begins."""
 
 # A table, walls around, and a ceiling: axis of the normal, its sign, and the preference.
 _NORMALS = (
@@ -102,9 +103,9 @@ def new_scenario(
 
     The base is the free root body of the file. The working chain is the longest one without mimic
     joints, grippers and wheels, or the one that ends at `tip`; all other joints are locked. If the
-    last joint does not move the tip, the far end of its link is the tip. The surface is where the
-    tip reaches it with its axis along the normal, and the directions of the task are most
-    independent. Circle and force keep a margin to the limits of the joints.
+    last joint of a short chain does not move the tip, the far end of its link is the tip. The
+    surface is where the tip reaches it with its axis along the normal, and the directions of the
+    task are most independent. Circle and force keep a margin to the limits of the joints.
 
     Args:
         file: The robot's file, as a scenario has it.
@@ -128,15 +129,15 @@ def new_scenario(
     end = process_time() + seconds
     is_url = file.startswith("package://")
     with at("robot.file"):
-        robot, tip, point, last, why = _robot(
-            file if is_url or not file else os.path.realpath(file), tip, point
-        )
+        plant, robot = _read(file if is_url or not file else os.path.realpath(file))
+        robot, tip, last, why = _robot(plant, robot, tip)
     read = robot_links(robot, SceneGraph(), drawn=False)
     links, tried = read[0], list[str]()
+    names = [signal.name for signal in links.position_signals]
+    if not any(point) and len(names) <= 3 and (far := _far_end(links, tip, last)):
+        point, why["point"] = far, "m, in that frame: its far end, where no frame of the file is"
     progress("looking for a place")
-    if not any(point) and "point" in why:
-        point = _far_end(links, tip, last) or point
-    places, names = _places(links, tip, point), [s.name for s in links.position_signals]
+    places = _places(links, tip, point)
     for fraction, place in product(_FRACTIONS, places[:_PLACES]):
         scenario = _scenario(robot, tip, point, place, names, surface, fraction)
         name, center = scenario.constraints[0].name, place.center
@@ -151,18 +152,53 @@ def new_scenario(
         if not problem:
             return scenario, _text(scenario, {**why, "surface": place.why}, folder)
         tried.append(f"{name} at {center} m, {fraction:g} of the usual circle: {problem[:160]}")
+    where = "; ".join(tried[:_PLACES]) or "surfaces along all axes of the world"
     text = (
-        f"no place was found where '{tip}' can move along a {surface}. Tried: "
-        + ("; ".join(tried[:_PLACES]) or "surfaces along all axes of the world")
-        + ". Give another tip, or copy a shipped scenario"
+        f"no place was found where the joints of '{tip}' ({', '.join(names)}) move it along a "
+        f"{surface}. Tried: {where}. Give another tip, as --tip LINK:x,y,z, or copy a shipped "
+        "scenario"
     )
-    raise ScenarioError(("robot", text))
+    raise ScenarioError(("robot.file", text))
 
 
-def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str, dict[str, str]]:
+def _read(file: str) -> tuple[MultibodyPlant, Robot]:
+    """The plant of a robot, with what must be left out of its file."""
+    robot = Robot(file, actuators="all")
+    with warnings.catch_warnings():  # The scenario's own robot reports it.
+        warnings.simplefilter("ignore", RobotFileWarning)
+        missing, lost = needs_of(robot)
+        above = [*Path(file).resolve().parents]
+        folders: dict[str, str] = {}  # Of unknown packages: above the file, or beside it.
+        for name in missing:
+            beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
+            found = [*(folder for folder in above if folder.name == name), *beside]
+            folders.update({name: str(found[0])} if found else {})
+        robot = replace(robot, packages=folders, leave_out=lost)
+        for more in ([], ["empty_limits"]):
+            robot = replace(robot, leave_out=[*robot.leave_out, *more])
+            plant, loops = read_robot(robot)
+            if any(map(_has_room, joints_of(plant))):
+                break
+    if loops:
+        names = ", ".join(loop.options["name"] for loop in loops)
+        raise ModelError(
+            f"joints close loops ({names}), and a new scenario has none; write one by hand, as the "
+            "shipped five_bar"
+        )
+    finalize(plant)
+    return plant, robot
+
+
+def _has_room(joint: Joint) -> bool:
+    """Whether a joint turns or slides between limits."""
+    one = isinstance(joint, RevoluteJoint | PrismaticJoint)
+    return one and bool(joint.position_upper_limits()[0] > joint.position_lower_limits()[0])
+
+
+def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, str, dict[str, str]]:
     """The robot; the tip and the last joint that moves it; and key -> why it is so."""
-    plant, robot = _read(file)
     why = {"packages": "where package://<name>/ leads", "leave_out": "what no equation has"}
+    why["actuators"] = "that are not locked"
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
     joints = joints_of(plant)
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
@@ -189,12 +225,6 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
     couplings = couplings_of(plant) if plant.num_constraints() else []
     coupled = {name for c in couplings for name in (c.follower, c.leader)}
     works = [j for j in joints if _has_room(j) and names[j.index()] not in coupled]
-    if not works:
-        mimics = f" (mimicking: {', '.join(sorted(coupled))})" if coupled else ""
-        raise ModelError(
-            f"no joint turns or slides for itself{mimics}; write a scenario by hand, in which "
-            "robot.actuators names what is driven"
-        )
 
     def path(body: RigidBody) -> list[Joint]:
         found = []
@@ -203,6 +233,7 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
             body = found[-1].parent_body()
         return found[::-1]
 
+    paths = {name: path(body) for name, body in body_of.items()}
     if tip:
         try:
             body = GetScopedFrameByName(plant, tip).body()
@@ -211,14 +242,19 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
         chain = [joint for joint in path(body) if joint in works]
         if not chain:
             raise ModelError(f"no joint that turns or slides for itself moves the tip '{tip}'")
+        why["frame"] = f"moved by {len(chain)} joints"
     else:
         arms = [j for j in works if not _NOT_OF_AN_ARM.search(j.name())]
         arms = [j for j in arms if not _FINGER.search(j.child_body().name())]
-        of_arms = [[j for j in path(body) if j in arms] for body in bodies]
-        every = [[j for j in path(body) if j in works] for body in bodies]
-        chain = max(of_arms, key=len) or max(every, key=len)
-        tip = _tip(plant, chain, {name: path(body) for name, body in body_of.items()})
-    why["frame"] = f"the end of the {'' if tip else 'longest '}chain, of {len(chain)} joints"
+        chain = _longest(paths, arms) or _longest(paths, works)
+        if not chain:
+            mimics = f" (mimicking: {', '.join(sorted(coupled))})" if coupled else ""
+            raise ModelError(
+                f"no joint turns or slides for itself{mimics}; write a scenario by hand, in which "
+                "robot.actuators names what is driven"
+            )
+        tip = _tip(plant, chain, paths)
+        why["frame"] = f"the end of the longest chain, of {len(chain)} joints"
     # All else is locked, at zero or the nearest limit; what mimics follows.
     skipped = {names[joint.index()] for joint in chain} | {c.follower for c in couplings}
     locked = {}
@@ -228,134 +264,74 @@ def _robot(file: str, tip: str, point: Vector) -> tuple[Robot, str, Vector, str,
             low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
             locked[name] = float(min(max(0.0, low), high))
     why["locked"] = "m or rad; all that is not of the chain, or mimics"
-    driven = {actuator.joint().index() for actuator in actuators_of(plant)}
-    is_driven = all(joint.index() in driven for joint in chain)
-    # Motors that Drake does not read are no loss where the scenario names the driven joints.
-    is_driven &= not needs_of(replace(robot, actuators=None))[1]
-    actuators = None if is_driven else "all"
-    why["actuators"] = "that are not locked: the file drives not all of them"
-    directions = _directions(plant, chain, tip, point)
-    if not any(point) and directions < min(len(chain), 3):
-        why["point"] = "m, in that frame: its far end, where no frame of the file is"
-    elif directions < 2:
-        moves = "in one direction alone" if directions else "nowhere"
-        raise ModelError(
-            f"the tip '{tip}' moves {moves} by its joints "
-            f"({', '.join(names[joint.index()] for joint in chain)}), and a contact takes two "
-            "directions; give another tip, as --tip LINK:x,y,z"
-        )
-    last = names[chain[-1].index()]
-    return replace(robot, locked=locked, actuators=actuators), tip, point, last, why
+    return replace(robot, locked=locked), tip, names[chain[-1].index()], why
 
 
-def _read(file: str) -> tuple[MultibodyPlant, Robot]:
-    """The plant of a robot, with what must be left out of its file."""
-    robot = Robot(file, _folders_above(file), actuators="all")
-
-    def read() -> MultibodyPlant:
-        plant, _ = read_robot(robot)
-        if closing := closing_joints(plant):
-            raise ModelError(
-                f"joints close loops ({', '.join(joint.name() for joint in closing)}), and a new "
-                "scenario has none; write one by hand, as the shipped five_bar"
-            )
-        finalize(plant)
-        return plant
-
-    with warnings.catch_warnings():  # The scenario's own robot reports it.
-        warnings.simplefilter("ignore", RobotFileWarning)
-        robot = replace(robot, leave_out=needs_of(robot)[1])
-        plant = read()
-        if not any(map(_has_room, joints_of(plant))):
-            robot = replace(robot, leave_out=[*robot.leave_out, "empty_limits"])
-            plant = read()
-    return plant, robot
-
-
-def _folders_above(file: str) -> dict[str, str]:
-    """Unknown packages -> folders of that name above the file or beside it."""
-    folders: dict[str, str] = {}
-    with suppress(ModelError, ScenarioError, OSError, RuntimeError):  # The reader reports it.
-        above = [*Path(file).resolve().parents]
-        for name in needs_of(Robot(file))[0]:
-            beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
-            found = [*(folder for folder in above if folder.name == name), *beside]
-            folders.update({name: str(found[0])} if found else {})
-    return folders
-
-
-def _has_room(joint: Joint) -> bool:
-    """Whether a joint turns or slides between limits."""
-    one = isinstance(joint, RevoluteJoint | PrismaticJoint)
-    return one and bool(joint.position_upper_limits()[0] > joint.position_lower_limits()[0])
+def _longest(paths: Mapping[str, list[Joint]], joints: Sequence[Joint]) -> list[Joint]:
+    """The longest chain of some joints, up to a hand."""
+    chains = [[joint for joint in path if joint in joints] for path in paths.values()]
+    every = [[joint for joint in path if _has_room(joint)] for path in paths.values()]
+    longest = max(chains, key=len, default=[])
+    for count in range(_ARM, len(longest)):
+        beyond = [c for c in every if c[:count] == longest[:count] and len(c) > count]
+        branches = {int(chain[count].index()) for chain in beyond}
+        if len(branches) > 1 and max(map(len, beyond)) <= count + _LONGEST_FINGER:
+            return longest[:count]
+    return longest
 
 
 def _tip(plant: MultibodyPlant, chain: Sequence[Joint], paths: dict[str, list[Joint]]) -> str:
-    """The vendor's frame at the end of a chain, otherwise the outermost one."""
+    """The vendor's frame at the end of a chain, otherwise the outermost one that it alone moves."""
     context = plant.CreateDefaultContext()
     origin = chain[-1].frame_on_child().CalcPoseInWorld(context).translation()
-    distances = {}
+    distances, fixed = {}, set()
     for name, path in paths.items():
         if sum(joint in chain for joint in path) == len(chain):
             pose = GetScopedFrameByName(plant, name).CalcPoseInWorld(context)
             distances[name] = float(np.linalg.norm(pose.translation() - origin))
+            fixed |= {name} if not any(map(_has_room, path[path.index(chain[-1]) + 1 :])) else set()
     for word in _TOOLS:
         named = [n for n in distances if word.search(n) and not _FINGER.search(n)]
         if named:
             return max(named, key=lambda name: distances[name])
-    return max(distances, key=lambda name: distances[name])
-
-
-def _directions(plant: MultibodyPlant, chain: Sequence[Joint], tip: str, point: Vector) -> int:
-    """The number of directions in which a chain of joints moves a point, in most postures."""
-    context, world = plant.CreateDefaultContext(), plant.world_frame()
-    random, frame, most = np.random.default_rng(0), GetScopedFrameByName(plant, tip), 0
-    columns = [joint.velocity_start() for joint in chain]
-    for _ in range(4):
-        q = plant.GetPositions(context)
-        for joint in chain:
-            low = max(joint.position_lower_limits()[0], -1.0)
-            high = max(min(joint.position_upper_limits()[0], 1.0), low)
-            q[joint.position_start()] = random.uniform(low, high)
-        plant.SetPositions(context, q)
-        J = plant.CalcJacobianTranslationalVelocity(
-            context, JacobianWrtVariable.kV, frame, np.array(point), world, world
-        )[:, columns]
-        values = np.linalg.svd(J, compute_uv=False)
-        most = max(most, int(np.count_nonzero(values > 1e-6 * max(values[0], 0.1))))
-    return most
+    return max(fixed, key=lambda name: distances[name])
 
 
 def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
-    """The middle of the face of the box around a link that is farthest from the last joint, m.
+    """The far end of a link whose frame is at the axis of the joint that turns it, in m.
 
-    Without geometry it is beyond the center of mass, at the end of an equivalent rod. None if both
-    are at the joint's axis.
+    It is the middle of the face of the box around the link that is farthest from the joint; without
+    geometry it is beyond the center of mass, at the end of an equivalent rod. None if the frame is
+    elsewhere, or all these are at the axis.
     """
-    plant = links.plant
-    body, joint = GetScopedFrameByName(plant, tip).body(), joint_names(plant)[last]
-    context = plant.CreateDefaultContext()
+    plant, context = links.plant, links.plant.CreateDefaultContext()
+    frame, joint = GetScopedFrameByName(plant, tip), joint_names(plant)[last]
+    if not isinstance(joint, RevoluteJoint):
+        return None
+    body = frame.body()
     origin = joint.frame_on_child().CalcPose(context, body.body_frame())
-    axis = origin.rotation() @ joint.revolute_axis() if isinstance(joint, RevoluteJoint) else None
+    axis = origin.rotation() @ joint.revolute_axis()
+
+    def distance(place: FloatArray) -> float:
+        return float(np.linalg.norm(np.cross(axis, place - origin.translation())))
+
     mass_at = body.default_com() if body.default_mass() > 0.0 else origin.translation()
     choices = [[2.0 * mass_at - origin.translation()]]
     points = [o.points for o in links.outlines if o.name == body.name() and len(o.points) > 1]
     if points:
         low, high = np.vstack(points).min(axis=0), np.vstack(points).max(axis=0)
         sides = product(range(3), (low, high))
-        middle = (low + high) / 2.0
-        choices.insert(0, [np.where(np.arange(3) == k, side, middle) for k, side in sides])
-
-    def distance(place: FloatArray) -> float:
-        lever = place - origin.translation()
-        return float(np.linalg.norm(lever if axis is None else np.cross(axis, lever)))
-
+        choices.insert(
+            0, [np.where(np.arange(3) == k, side, (low + high) / 2) for k, side in sides]
+        )
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     origins = [plant.EvalBodyPoseInWorld(context, one).translation() for one in bodies]
-    size = float(np.linalg.norm(np.ptp(origins, axis=0)))
+    near = 0.01 * float(np.linalg.norm(np.ptp(origins, axis=0)))
+    if distance(frame.GetFixedPoseInBodyFrame().translation()) > near:
+        return None
     for places in choices:
         farthest = max(places, key=distance)
-        if distance(farthest) > 0.01 * size:
+        if distance(farthest) > near:
             x, y, z = (float(value) + 0.0 for value in np.round(farthest, 4))
             return (x, y, z)
     return None
@@ -371,17 +347,10 @@ class _Place(NamedTuple):
     normal: Vector
     ways: tuple[int, ...]
     q: FloatArray
-    quality: float
-    directions: int
+    why: str
     speed: float
     force: float
     size: float
-
-    @property
-    def why(self) -> str:
-        """How good it is."""
-        free = f"{self.directions} directions of motion are free of each other there"
-        return f"where {free} by {self.quality:.2g} (1 is best, 0 singular)"
 
 
 def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place]:
@@ -399,8 +368,8 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
     rows = ca.vertcat(place, *[R[k, across].T for k in range(3)])
     postures = Postures(links, ConstraintSet(()), rows, ca.SX(0, 0), [], {})
     bodies = ca.horzsplit(links.landmarks())
-    still = [body for body in bodies if not ca.depends_on(body, links.q)]
     moving = [place, *(body for body in bodies if ca.depends_on(body, links.q))]
+    still = [body for body in bodies if not ca.depends_on(body, links.q)]
     weight = ca.substitute(links.bias, links.v, ca.SX.zeros(links.v.numel()))
     parameters = [p.symbol for p in links.parameters]
     outputs = [sign_out * R[:, column], ca.horzcat(*moving), ca.horzcat(*still), weight]
@@ -411,28 +380,27 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
     efforts[np.argmax(np.abs(links.actuation_matrix), axis=0)] = links.effort_limits
     efforts = np.where(efforts > 0.0, efforts, np.inf)
     guesses, size = postures.guesses(_TRIES), postures.size
-    slanted = [postures.at(guess) for guess in guesses]
-    seen = {id(p): [v.full() for v in function(p.q, values)] for p in slanted}
+    decimals = 2 if size > 0.3 else 3
+
+    def seen(posture: Posture) -> tuple[Posture, list[FloatArray]]:
+        return posture, [value.full() for value in function(posture.q, values)]
+
+    slanted = [seen(postures.at(guess)) for guess in guesses]
     found = list[tuple[float, _Place]]()
     for axis in range(3):
-        tilts, aligned = [3 + 2 * axis, 4 + 2 * axis], list[Posture]()
+        tilts, aligned = [3 + 2 * axis, 4 + 2 * axis], list[tuple[Posture, list[FloatArray]]]()
+        ways = [k for k in range(3) if k != axis]
         for count, guess in enumerate(guesses):
             if count == _PATIENCE and not aligned:
                 break  # A planar robot cannot rotate its tool about some axes.
             if (q := postures.solve(tilts, np.zeros(2), guess)) is not None:
-                aligned.append(postures.at(q))
-        seen |= {id(p): [v.full() for v in function(p.q, values)] for p in aligned}
-        ways = [k for k in range(3) if k != axis]
+                aligned.append(seen(postures.at(q)))
         for sign, preference in ((s, p) for k, s, p in _NORMALS if k == axis):
-            best: tuple[float, list[int], Posture] | None = None
-            for posture, factor in [
-                *((p, 1.0) for p in aligned),
-                *((p, _SLANTED) for p in slanted),
-            ]:
-                outward, moved, base, gravity = seen[id(posture)]
+            score, best, rows_at = 0.0, aligned[0][0] if aligned else None, list[int]()
+            choices = [*((one, 1.0) for one in aligned), *((one, _SLANTED) for one in slanted)]
+            for (posture, (outward, moved, base, gravity)), factor in choices:
                 at_tip, roots = posture.rows[:3], base.mean(axis=1)
-                beside = at_tip - roots
-                beside[axis] = 0.0
+                beside = np.delete(at_tip - roots, axis)
                 disadvantages = (
                     np.min(sign * (moved[axis] - at_tip[axis])) < -0.02 * size,
                     sign * outward[axis, 0] > -0.5,
@@ -442,36 +410,25 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
                     np.any(np.abs(gravity[:, 0]) > 0.5 * efforts),
                 )
                 factor *= postures.margin(posture.q) * 0.1 ** sum(map(bool, disadvantages))
-                if best is not None and factor * 5 <= best[0]:
+                if factor * 5 <= score:
                     continue  # No independence is above 1.
-                rows_at = posture.independent([], [axis, *ways, *tilts], posture.q.size)
-                if axis in rows_at and {*rows_at} & {*ways}:
-                    score = factor * posture.independence(rows_at) * len(rows_at)
-                    if best is None or score > best[0]:
-                        best = score, rows_at, posture
-            if best is None:
+                chosen = posture.independent([], [axis, *ways, *tilts], posture.q.size)
+                quality = factor * posture.independence(chosen) * len(chosen)
+                if axis in chosen and {*chosen} & {*ways} and quality > score:
+                    score, best, rows_at = quality, posture, chosen
+            if best is None or not rows_at:
                 continue
-            score, rows_at, posture = best
             free = tuple(row for row in rows_at if row in ways)
-            inverse = np.linalg.pinv(posture.gradients[rows_at])[:, 1 : 1 + len(free)]
+            inverse = np.linalg.pinv(best.gradients[rows_at])[:, 1 : 1 + len(free)]
             fastest = np.max(np.abs(inverse) / speeds[:, None], initial=1e-9)
-            torque = np.max(np.abs(posture.gradients[axis]) / efforts, initial=1e-9)
-            decimals = 2 if size > 0.3 else 3
-            x, y, z = (round(float(value), decimals) + 0.0 for value in posture.rows[:3])
+            torque = np.max(np.abs(best.gradients[axis]) / efforts, initial=1e-9)
+            why = f"where {len(rows_at)} directions of motion are free of each other there"
+            x, y, z = (round(float(value), decimals) + 0.0 for value in best.rows[:3])
             i, j, k = (sign * (n == axis) + 0.0 for n in range(3))
-            place_of = _Place(
-                (x, y, z),
-                (i, j, k),
-                free,
-                posture.q,
-                score / len(rows_at),
-                len(rows_at),
-                _SHARE / fastest,
-                _SHARE / 2 / torque,
-                size,
-            )
-            found.append((score * preference, place_of))
-    return [place_of for _, place_of in sorted(found, key=lambda entry: -entry[0])]
+            of_limits = _SHARE / fastest, _SHARE / 2 / torque
+            placed = _Place((x, y, z), (i, j, k), free, best.q, why, *of_limits, size)
+            found.append((score * preference, placed))
+    return [placed for _, placed in sorted(found, key=lambda entry: -entry[0])]
 
 
 def _scenario(
@@ -484,40 +441,38 @@ def _scenario(
     fraction: float,
 ) -> Scenario:
     """A circle at a place, or a line, with a fraction of the usual radius and force."""
-    center, normal, size = np.array(place.center), np.array(place.normal), place.size
+    center, normal, size, ways = place.center, np.array(place.normal), place.size, place.ways
     radius = _round_number(fraction * _RADIUS * size)
-    force = _round_number(fraction * min(_FORCE, place.force))
     period = max(_SHORTEST, float(ceil(2 * pi * radius / place.speed)))
     decimals = 2 if size > 0.3 else 3
-    bend = round(_BEND * size, decimals)
+    bend, axis = round(_BEND * size, decimals), int(np.argmax(np.abs(normal)))
     x, y, z = (float(value) + 0.0 for value in np.round(center - bend * normal, decimals))
-    axis = int(np.argmax(np.abs(normal)))
-    surface: Surface = Plane(place.center, place.normal)
-    name = ("ceiling" if normal[2] < 0.0 else "table") if axis == 2 else "wall"
-    if kind == "sphere":
-        name, surface = "ball", Sphere((x, y, z), bend)
-    elif kind == "cylinder":
-        # A planar robot moves around the cylinder, others also along it.
-        along = place.ways[-1] if len(place.ways) > 1 else 3 - axis - place.ways[0]
-        i, j, k = np.eye(3)[along].tolist()
-        name, surface = "pipe", Cylinder((x, y, z), (i, j, k), bend)
-    middle = [place.center[way] for way in place.ways]
-    path: Any
-    if len(middle) > 1:
+    # A planar robot moves around the cylinder, others also along it.
+    along = np.eye(3)[ways[-1] if len(ways) > 1 else 3 - axis - ways[0]].tolist()
+    flat = ("ceiling" if normal[2] < 0.0 else "table") if axis == 2 else "wall"
+    surfaces: dict[str, tuple[str, Surface]] = {
+        "plane": (flat, Plane(center, place.normal)),
+        "sphere": ("ball", Sphere((x, y, z), bend)),
+        "cylinder": ("pipe", Cylinder((x, y, z), along, bend)),
+    }
+    name, surface = surfaces[kind]
+    middle = [center[way] for way in ways]
+    path: Reference = SinusoidReference(middle[0], [radius], [round(2 * pi / period, 4)])
+    if len(ways) > 1:
         path = CircleReference(middle, radius, period=period)
-    else:
-        path = SinusoidReference(middle[0], [radius], [round(2 * pi / period, 4)])
-    axes = "".join("xyz"[way] for way in place.ways)
-    near = dict(zip(names, (np.round(place.q, 4) + 0.0).tolist(), strict=True))
-    shape = "circle" if len(middle) > 1 else "line"
+    shape = "circle" if len(ways) > 1 else "line"
     stem = Path(robot.file).name.split(".")[0]
+    near = dict(zip(names, (np.round(place.q, 4) + 0.0).tolist(), strict=True))
     return Scenario(
         description=f"{stem} draws a {shape} on a {name} and presses on it",
         robot=robot,
         constraints=[PointOnSurface(tip, surface, point, name)],
         # On a strongly curved surface an axis fixed to the normal hinders motion along it.
         tool_axis="normal" if kind == "plane" else "fixed",
-        references={f"{tip}.{axes}": path, f"{name}.force": force},
+        references={
+            f"{tip}.{''.join('xyz'[way] for way in ways)}": path,
+            f"{name}.force": _round_number(fraction * min(_FORCE, place.force)),
+        },
         start=Start(positions=near),
         duration=2 * period,
     )
@@ -535,21 +490,24 @@ def _text(scenario: Scenario, why: dict[str, str], folder: str | Path | None) ->
     file = Path(data["robot"]["file"])
     if folder is not None and file.is_relative_to(saved := os.path.realpath(folder)):
         data["robot"]["file"] = file.relative_to(saved).as_posix()
-    contact, force = (
-        scenario.constraints[0].name,
-        "N, at most 20, and a sixth of what efforts allow",
-    )
-    why = {**why, "tool_axis": "kept where it starts", "positions": "near there, in rad or m"}
-    why |= {"duration": "s, two rounds", f"{contact}.force": force}
+    force = "N, at most 20, and a sixth of what efforts allow"
+    why = {
+        **why,
+        "tool_axis": "kept where it starts",
+        "positions": "near there, in rad or m",
+        "duration": "s, two rounds",
+        f"{scenario.constraints[0].name}.force": force,
+    }
     lines = [
         "# Written by `drake-dae new`, to be changed. Units: m, rad, s, N, N m.",
         "# Outputs beside the tool's path, gains (poles at -4 1/s) and an exact start are added by",
         "# `drake-dae simulate FILE`; --meshcat shows it. `drake-dae analyze FILE` tells margins.",
     ]
     for line in dump_yaml(data).splitlines():
-        note = why.get(line.removeprefix("  ").removeprefix("- ").partition(":")[0], "")
-        fits = len(line) + len(note) < 97
-        indent = line[: len(line) - len(line.lstrip(" "))]
-        lines += [f"{line}  # {note}"] if note and fits else [f"{indent}# {note}"] * bool(note)
-        lines += [line] * (not (note and fits))
+        note = why.get(line.strip().removeprefix("- ").partition(":")[0], "")
+        if len(line) + len(note) < 97:
+            lines.append(f"{line}  # {note}" if note else line)
+        else:
+            indent = line[: len(line) - len(line.lstrip(" "))]
+            lines += [f"{indent}# {note}", line] if note else [line]
     return "\n".join(lines) + "\n"

@@ -10,11 +10,11 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.record import Record, RecordAfter
-from drake_dae.diagrams.state_feedback import (
+from drake_dae.diagrams.parts import (
     ENCODER_NOISE,
     encoder_seed,
 )
+from drake_dae.diagrams.record import Record, RecordAfter
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.divergence import DivergenceWatch
 from drake_dae.running.rollout import Rollout, diagnosed, run_loop, start_values

@@ -86,10 +86,16 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
                 f"plant_disturbance_{i}.force": d.force for i, d in enumerate(of_plant.disturbances)
             },
         }
+        before = plant.parameters(at_plant)
         for key, values in numbers.items():
             with at(key):
                 for name, value in values.items():
-                    plant.set_parameter(at_plant, name, value)
+                    # A user's own plant may not let these be set, and has been made with them.
+                    is_set = key != "plant.parameters" and np.array_equal(
+                        before[plant.dae.parameter_slice(name)], np.ravel(value)
+                    )
+                    if not is_set:
+                        plant.set_parameter(at_plant, name, value)
     with at("plant"):
         of_plant.begin(plant, at_plant)
     force, encoders = scenario.sensors.force, scenario.sensors.encoders
@@ -105,9 +111,8 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
                 designs[repr(gains)] = controller.law.design(gains.design())
             at_controller = controller.GetMyMutableContextFromRoot(context)
             controller.set_gains(at_controller, designs[repr(gains)])
-    loop.set_seed(context, 0 if force is None else force.seed)
-    if loop.encoders is not None and encoders is not None:
-        loop.encoders.set_seed(context, encoders.seed)
+    seed = 0 if force is None else force.seed
+    loop.set_seed(context, seed, None if encoders is None else encoders.seed)
 
 
 def _at_rest(

@@ -39,10 +39,7 @@ class ForceArrows:
 
     The arrow has the direction of the force on the robot. A moment is an arrow with two heads,
     along its axis. The longest arrow, of this length in m, is that of the largest force until now.
-
-    Attributes:
-        largest_force, largest_moment: The force and moment of the longest arrows, N and N m.
-        has_moment: Whether some moment has not been negligible compared with the forces.
+    `has_moment` says whether some moment has not been negligible compared with the forces.
     """
 
     def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
@@ -96,11 +93,7 @@ class ForceArrows:
 class ConstraintForceVisualizer(LeafSystem):
     """Draws the constraint forces and the paths of their points while a robot runs.
 
-    Input ports:
-        link_state: (q, v).
-        constraint_force: lambda, shape (m,).
-        exogenous: The exogenous signals, as the plant's port of the same name; `places` are their
-            indices among all parameters.
+    Its input ports are those of the plant; `places` are the exogenous signals among the parameters.
     """
 
     __slots__ = SHARED_DICTIONARY

@@ -20,10 +20,8 @@ _MARGIN = 0.06
 def view_angles(angle: float, aspect: float, top: float = 0.0) -> tuple[float, float, float]:
     """The tangents of a camera's angles to each side, up and down, without the picture's margins.
 
-    Args:
-        angle: The vertical angle of view of the picture, in rad.
-        aspect: Its width divided by its height.
-        top: The fraction of its height that is also free at the top.
+    `angle` is its vertical angle of view in rad, `aspect` width by height; `top` is the fraction of
+    its height that is also free at the top.
     """
     half = float(np.tan(angle / 2.0))
     return half * (aspect - 2 * _MARGIN), half * (1 - 2 * (top + _MARGIN)), half * (1 - 2 * _MARGIN)
@@ -32,13 +30,8 @@ def view_angles(angle: float, aspect: float, top: float = 0.0) -> tuple[float, f
 def direction_of(points: FloatArray, contacts: FloatArray, normals: FloatArray) -> FloatArray:
     """The unit vector from a scene to its camera: from behind, the side and slightly above.
 
-    It is turned about the vertical if surfaces or links would hide the contacts.
-
-    Args:
-        points: Points that enclose the scene, m, shape (k, 3).
-        contacts: The contact points, m, shape (j, 3).
-        normals: The normal toward the free side at each contact point, shape (j, 3); zero if
-            there is none.
+    It is turned about the vertical if surfaces or links would hide the contacts. The points enclose
+    the scene; normals point toward the free side at each contact, or are zero.
     """
     extents = np.ptp(points, axis=0)
     size = float(np.linalg.norm(extents))
@@ -67,12 +60,8 @@ def framed(
     Let x point to the right, y up and z to the camera, and let the camera have the distance D from
     the origin and the offset s from the z axis. It shows a point if |x - s_x| <= side (D - z) and
     -down (D - z) <= y - s_y <= up (D - z). Each of the two conditions has a least D for which an s
-    exists; the larger one is used. In the other direction the points are centered.
-
-    Args:
-        points: The points, m, shape (k, 3).
-        direction: The unit vector from the points to the camera, not vertical, shape (3,).
-        view: (side, up, down), as `view_angles` computes them.
+    exists; the larger one is used. In the other direction the points are centered. `direction` is
+    the unit vector to the camera, not vertical, and `view` is (side, up, down).
     """
     side, up, down = view
     right = np.cross([0.0, 0.0, 1.0], direction)

@@ -22,13 +22,7 @@ scene's diagonal."""
 
 @dataclass(frozen=True, eq=False)
 class DrawnSurface:
-    """A surface that one or several constraints touch.
-
-    Attributes:
-        constraint: The first of these constraints.
-        pose: The pose of the surface's frame in the world.
-        picture: The shape, and its pose in the surface's frame.
-    """
+    """A surface in the world that one or several constraints touch, of which it has the first."""
 
     constraint: Constraint
     pose: RigidTransform
@@ -131,14 +125,7 @@ def scene_points(
     states: FloatArray,
     scene_graph: SceneGraph | None = None,
 ) -> FloatArray:
-    """Points that enclose a robot and its contact points, m, shape (k, 3).
-
-    Args:
-        model: The robot.
-        wrenches: Its constraint wrenches.
-        states: x, or only its first part, the link state (q, v), one row for each time.
-        scene_graph: The geometry of its links; None if only the links' origins count.
-    """
+    """Points that enclose a robot and its contact points at some states, m, shape (k, 3)."""
     links, dae = model.links, model.dae
     origins = links.landmarks()
     if origins.shape[1] > 1:  # The world's origin is not a part of the robot.
@@ -149,14 +136,10 @@ def scene_points(
     for state in states:
         values = landmarks(state[: links.q.numel()], dae.parameter_values)[0]
         points += [values.reshape(3, -1, order="F").T, wrenches(state, no_force).points]
-    return np.vstack([*points, _corners(model, states, scene_graph)])
-
-
-def _corners(model: RobotModel, states: FloatArray, scene_graph: SceneGraph | None) -> FloatArray:
-    """Corners and middles of the bounding boxes of the links' geometry, m, (k, 3)."""
-    plant, corners = model.links.plant, [np.zeros((0, 3))]
+    # Corners and middles of the bounding boxes of the links' geometry.
+    plant = links.plant
     if scene_graph is None or plant is None or plant.get_source_id() is None:
-        return corners[0]
+        return np.vstack(points)
     inspector, context = scene_graph.model_inspector(), plant.CreateDefaultContext()
     signs = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3)).reshape(3, -1)
     boxes = []
@@ -171,5 +154,5 @@ def _corners(model: RobotModel, states: FloatArray, scene_graph: SceneGraph | No
                 boxes.append((body, pose.multiply(signs * box.half_width()[:, None])))
     for state in states:
         plant.SetPositions(context, state[: plant.num_positions()])
-        corners += [plant.EvalBodyPoseInWorld(context, body).multiply(box).T for body, box in boxes]
-    return np.vstack(corners)
+        points += [plant.EvalBodyPoseInWorld(context, body).multiply(box).T for body, box in boxes]
+    return np.vstack(points)

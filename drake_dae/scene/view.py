@@ -119,11 +119,7 @@ def add_live_view(
 def draw_scene(
     plant: Plant, meshcat: Meshcat, scene_graph: SceneGraph | None = None
 ) -> ForceArrows:
-    """Draws the static parts of a robot's scene at its nominal state; returns the force arrows.
-
-    Raises:
-        ModelError: The plant is not a robot.
-    """
+    """Draws the static parts of a robot's scene at its nominal state; returns the force arrows."""
     model, dae = plant.robot("a view"), plant.dae
     state = plant.structure.manifold.project(dae.nominal_state)
     wrenches = ConstraintWrenches(model)
@@ -159,10 +155,8 @@ def view_of_links(
     """A diagram that draws a robot's links in Meshcat for its input, the link state (q, v).
 
     The links' MultibodyPlant computes the poses of the links, and is not simulated. What is drawn
-    on request, by a forced publish, goes into a page, with coarser meshes if these are large.
-
-    Returns:
-        The diagram, with a copy of the geometry; None if the links have none.
+    on request, by a forced publish, goes into a page, with coarser meshes if these are large. None
+    if the links have no geometry.
     """
     links = plant.robot("a view").links.plant
     if scene_graph is None or links is None or links.get_source_id() is None:

@@ -226,12 +226,7 @@ def _check(base: Mapping[str, Any], variations: Sequence[Variation]) -> None:
 
 
 def _try(runner: Runner, variations: Sequence[Variation]) -> None:
-    """Checks that a run can be built, for example that the names of parameters exist.
-
-    Raises:
-        ScenarioError: The first, the middle and the last run all have an error in keys or values;
-            it is that of the first.
-    """
+    """Checks that the first, the middle or the last run can be built."""
     errors = []
     for index in dict.fromkeys((0, len(variations) // 2, len(variations) - 1)):
         try:

@@ -3,11 +3,11 @@
 from .control.commanded import CommandedReferences as CommandedReferences
 from .control.contract import Controller as Controller
 from .control.controller import TrackingController as TrackingController
-from .control.drake_references import TrajectoryReference as TrajectoryReference
-from .control.limits import ControlLimits as ControlLimits
+from .control.drives import ControlHold as ControlHold
+from .control.drives import ControlLimits as ControlLimits
+from .control.drives import Sampling as Sampling
 from .control.references import ReferenceGenerator as ReferenceGenerator
-from .control.sampling import ControlHold as ControlHold
-from .control.sampling import Sampling as Sampling
+from .control.references import TrajectoryReference as TrajectoryReference
 from .observing.estimator import StateEstimator as StateEstimator
 from .observing.observing import Observing as Observing
 from .plants.contact.compliant_plant import CompliantPlant as CompliantPlant

@@ -1,6 +1,6 @@
 """Blocks with the parameters of a DaeSystem, and its exogenous signals on a port."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import casadi as ca
@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import FloatArray, numbers
-from drake_dae.blocks.block import Block, Requirement
+from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.blocks.block import Block
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import DaeSystem, DerivativeLayout
 from drake_dae.errors import ModelError
+from drake_dae.robots import RobotModel
 
 
 class ParameterizedSystem(TracedSystem):
@@ -21,19 +22,10 @@ class ParameterizedSystem(TracedSystem):
     So a study changes numbers in a context without tracing again, and a controller can have other
     numbers than its plant. Varying parameters, the exogenous signals w, come through an input port
     `exogenous` with the derivatives that the block needs, stacked like references: w_1, w_1', ...,
-    w_2, ...; see `exogenous_layout`. Without a wire they keep the values of the parameters.
-
-    Attributes:
-        dae: The system.
-        exogenous_layout: The layout of the port's entries.
-        exogenous_places: Their indices among the parameters.
-
-    Args:
-        dae: The system.
-        block: The block; its parameters begin with those of the system.
-        degrees: The number of derivatives of each entry of w that the block needs; by default
-            those on which its expressions depend.
-        sees_steps: As of `TracedSystem`.
+    w_2, .... Without a wire they keep the values of the parameters.
+    `exogenous_layout` and `exogenous_places` are the layout of that port's entries, and their
+    indices among the parameters. `degrees` are the numbers of derivatives of the entries of w that
+    the block needs; by default those on which its expressions depend.
     """
 
     __slots__ = TracedSystem.__slots__
@@ -46,7 +38,8 @@ class ParameterizedSystem(TracedSystem):
         sees_steps: bool | None = None,
     ) -> None:
         if degrees is None:
-            values = *block.outputs.values(), block.derivative, *_next(block)
+            after = (held.next for held in block.held.values())
+            values = *block.outputs.values(), block.derivative, *after
             degrees = dae.exogenous.degrees(*values)
         self.dae = dae
         self.exogenous_layout = DerivativeLayout(tuple(degrees))
@@ -74,35 +67,14 @@ class ParameterizedSystem(TracedSystem):
         return np.array(self._values(context)[: self.dae.parameter_values.size])
 
     def get_parameter(self, context: Context, name: str) -> FloatArray:
-        """A parameter by name, shape (k,).
-
-        Raises:
-            ModelError: No parameter has that name.
-        """
+        """A parameter by name, shape (k,)."""
         return self.parameters(context)[self.dae.parameter_slice(name)]
 
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
-        """Changes a parameter in a context.
-
-        Args:
-            context: The context of this system.
-            name: The name of the parameter in `dae.parameters`.
-            value: The new value, shape (k,), or a number for all entries.
-
-        Raises:
-            ModelError: No parameter has that name, or the value does not fit.
-        """
+        """Changes a parameter in a context: its value, shape (k,), or a number for all entries."""
         self.check_context(context)
         values = context.get_numeric_parameter(0).CopyToVector()
-        place = self.dae.parameter_slice(name)
-        given = numbers(f"parameter '{name}'", value)
-        size = place.stop - place.start
-        if given.shape not in ((), (size,)):
-            raise ModelError(f"parameter '{name}' has {size} entries, got {value!r}")
-        values[place] = given
-        for parameter in self.dae.parameters:
-            if parameter.name == name:
-                parameter.check(values[place])
+        put(self.dae, values, name, value)
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
 
@@ -136,11 +108,35 @@ def with_exogenous(block: Block, places: Sequence[int]) -> Block:
             **{name: moved(value) for name, value in block.defaults.items()},
             "exogenous": block.parameters[list(places)],
         },
-        requirements=tuple(
-            Requirement(moved(r.margin), r.reason, r.fault) for r in block.requirements
-        ),
+        requirements=tuple(replace(r, margin=moved(r.margin)) for r in block.requirements),
     )
 
 
-def _next(block: Block) -> list[ca.SX]:
-    return [held.next for held in block.held.values()]
+def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:
+    """All parameters of a robot, some of surfaces, masses and stages changed for its plant."""
+    values = model.dae.parameter_values
+    known = [p.name for p in model.links.parameters]
+    known += [p.name for constraint in model.constraints for p in constraint.parameters]
+    known += [p.name for stage in model.stages for p in stage.parameters]
+    known += [p.name for load in model.known_forces for p in load.parameters]
+    for name, value in parameters.items():
+        if name not in known:
+            raise ModelError(
+                f"of Drake's contact as the plant {unknown_name('parameter', name, known)}; give "
+                "the law's model others instead"
+            )
+        put(model.dae, values, name, value)
+    return values
+
+
+def put(dae: DaeSystem, values: FloatArray, name: str, value: ArrayLike) -> None:
+    """Changes a parameter of a system among all their values."""
+    place, given = dae.parameter_slice(name), numbers(f"parameter '{name}'", value)
+    if given.shape not in ((), (place.stop - place.start,)):
+        raise ModelError(
+            f"parameter '{name}' has {place.stop - place.start} entries, got {value!r}"
+        )
+    values[place] = given
+    for parameter in dae.parameters:
+        if parameter.name == name:
+            parameter.check(values[place])

@@ -15,7 +15,6 @@ from runs import run_scenario, scenario
 
 from drake_dae import build_scenario
 from drake_dae.errors import ScenarioError
-from drake_dae.scenario.model import scenario_model
 
 HOURS = 120.0 * np.pi / 180.0 * np.arange(3)
 CORNERS = 0.035 * np.column_stack([np.cos(HOURS), np.sin(HOURS), np.zeros(3)])
@@ -111,20 +110,6 @@ def grasp_map(pose):
 
 
 @pytest.mark.slow
-def test_squeezes_lie_in_the_null_space_of_the_grasp_map():
-    """G S^T = 0, and they are all of it; round-off."""
-    model = scenario_model(scenario("three_fingers"))
-    evaluate = model.dae.trace("S", {"S": model.dae.m[6:, :]})
-    _, _, record = run("three_fingers", *FINE)
-    for step in np.random.default_rng(0).integers(len(record.time), size=5):
-        _, pose, _, _ = fingers(record, step)
-        S = evaluate(record["state"][step], model.dae.parameter_values)[0].reshape(3, 9)
-        G, _ = grasp_map(pose)
-        assert_allclose(G @ S.T, 0.0, atol=1e-12)
-        assert np.linalg.matrix_rank(S) == 9 - np.linalg.matrix_rank(G) == 3
-
-
-@pytest.mark.slow
 def test_forces_and_squeezes_of_the_fingers_are_those_of_drake():
     """Round-off of systems of 24 equations, with forces of some N and 1e3 rad/s^2 for each N."""
     _, _, record = run("three_fingers", *FINE)
@@ -144,24 +129,6 @@ def test_forces_and_squeezes_of_the_fingers_are_those_of_drake():
 
 
 # A biped with flexible joints: 4 joints, 3 positions of the trunk, 4 forces, 1 of them internal.
-
-
-@pytest.mark.slow
-def test_forces_of_the_biped_are_those_of_drake():
-    """Of some 100 N, with shaft angles of the spring's torque: round-off of 1e-12 relative."""
-    loop, _, record = run("biped", "duration=2")
-    plant = loop.plant.model.links.plant
-    front, rear = (plant.GetFrameByName(f"{side}_foot") for side in ("front", "rear"))
-    feet = [((foot, (0, 0, 0)), None, [row]) for row in (2, 0) for foot in (front, rear)]
-    rotors = np.diag([0.0, 0.0, 0.0, *[2e-5 * 50.0**2] * 4])
-    for step in range(0, len(record.time), 50):
-        q, v, shafts = np.split(record["state"][step], [7, 14])
-        mass, force, jacobian, bias, _ = drake(plant, q, v, feet)
-        torque = np.array([0.0, 0.0, 0.0, *2000.0 * (shafts[:4] - q[3:])])
-        _, found = motion(mass - rotors, force, jacobian, bias, torque)
-        assert_allclose(record["constraint_force"][step], found, atol=1e-9)
-        assert_allclose(record["controlled_output"][step, 3], (found[2] - found[3]) / 2, atol=1e-9)
-        assert_allclose(jacobian @ v, 0.0, atol=1e-9)
 
 
 # Two arms with a free box: 14 joints, 6 positions of the box and 2 elbows, 12 forces, 6 internal.
@@ -217,28 +184,10 @@ def test_two_arms_carry_a_free_box_with_the_error_by_hand():
     [
         ("three_fingers", "robot.free=[]", ["robot.file: ", "'object'", "robot.free"]),
         ("three_fingers", "robot.free=[objct]", ["robot.free: ", "'objct'"]),
-        ("three_fingers", "robot.free=[world]", ["robot.free: ", "'world'"]),
         ("biped", "robot.free=[trunk]", ["robot.free: ", "'trunk'", "'pitch'"]),
-        ("three_fingers", "robot.free=object", ["robot.free: ", "'object'"]),
         ("three_fingers", "forces.0.first=grip", ["forces.0: ", "'grip'"]),
         ("three_fingers", "forces.1.frame=obj", ["forces.1: ", "'grip2'", "'obj'"]),
         ("three_fingers", "forces.1.second=grip2", ["forces.1: "]),
-        ("three_fingers", "forces.1.third=grip2", ["forces.1: ", "!Squeeze", "'third'"]),
-        (
-            "three_fingers",
-            "forces.2=!Squeeze {frame: object}",
-            ["forces.2: ", "!Squeeze", "'first'"],
-        ),
-        (
-            "three_fingers",
-            "forces.2=!Squeze {}",
-            ["forces.2: ", "!Squeeze", "!Squeze"],
-        ),
-        (
-            "three_fingers",
-            "forces.2=3",
-            ["forces.2: ", "!Squeeze", "!ForceCombination", "3"],
-        ),
         (
             "three_fingers",  # What moves the puck, too.
             "forces.2=!ForceCombination {name: grip3.grip1.squeeze, "
@@ -250,11 +199,6 @@ def test_two_arms_carry_a_free_box_with_the_error_by_hand():
             "biped",
             "forces.0=!ForceCombination {weights: {front.forc: 1}, name: a}",
             ["forces.0: ", "'front.forc'", "'front.force'"],
-        ),
-        (
-            "biped",
-            "forces.0=!ForceCombination {weights: {front.force: a}, name: a}",
-            ["forces.0.weights.front.force: ", "'a'"],
         ),
     ],
 )

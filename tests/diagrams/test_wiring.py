@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from arms import arm, law, touching
+from arms import arm, touching
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.primitives import VectorLogSink
 from runs import run_scenario, scenario
@@ -70,17 +70,6 @@ def test_a_plant_of_another_diagram_is_refused_with_its_name():
         make_closed_loop(loop.plant, loop.controller.law, loop.generator.references)
 
 
-def test_a_law_for_another_system_is_refused_with_both_sizes():
-    found = arm("two_link")
-    with pytest.raises(
-        WiringError,
-        match=r"'seven_joint'.*14.*7.*'two_link'.*4.*2",
-    ):
-        make_closed_loop(
-            RobotPlant(found.model, structure=found.structure), law("seven_joint"), REFERENCES
-        )
-
-
 def test_behind_motors_the_force_may_be_connected_directly():
     model = touching("two_link", [MOTORS])
     law = TrackingLaw(model.dae, poles(-8.0), measured_force=True)
@@ -134,7 +123,6 @@ def test_a_scenario_with_another_mass_in_the_plant():
         ("two_link_flexible", "actuation.0.stiffness=[-1]", "actuation.0: "),
         ("two_link_wall", "actuation=[!FlexibleJoints {stiffness: [8e3]}]", "joint1_motor"),
         ("two_link_motors", "actuation.0.torque_constant=[0]", "torque_constant"),
-        ("two_link_motors", "actuation=[!Motor {}]", r"actuation.0: .*!Motor"),
         (
             "two_link_wall",
             ["sensors.force={}", "law.force_gain=1"],
@@ -144,11 +132,6 @@ def test_a_scenario_with_another_mass_in_the_plant():
             "two_link_wall",
             ["sensors.force={sample_period: 0.01}", "law.force_gain=2"],
             "sensors.force: ",
-        ),
-        (
-            "two_link_wall",
-            ["sensors.force={time_constant: 0.01}", "law.force_gain=-1"],
-            "force_gain",
         ),
         ("two_link_wall", "plant.parameters={link3.mass: [1]}", "'link3.mass'"),
         ("two_link_wall", "start.errors={wall.force: 1}", "wall.force"),

@@ -2,11 +2,21 @@
 
 import numpy as np
 import pytest
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RpyFloatingJoint, SpatialInertia
 from vendors import joint, link, robot
 
-from drake_dae import CoincidentPoints, RobotModel, RobotPlant
+from drake_dae import (
+    CoincidentPoints,
+    PrismaticLoopJoint,
+    RevoluteLoopJoint,
+    RobotModel,
+    RobotPlant,
+    WeldedFrames,
+)
 from drake_dae.errors import InconsistentStateError, ModelError
 
 
@@ -50,3 +60,34 @@ def test_constraints_that_nothing_meets_name_the_argument(tmp_path):
     plant, pin = four_bar(tmp_path, far=3.0)
     with pytest.raises(ModelError, match="nominal_positions"):
         RobotModel.from_multibody(plant, [pin])
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-12, 1e-9])
+@pytest.mark.parametrize("cls", [WeldedFrames, RevoluteLoopJoint, PrismaticLoopJoint])
+def test_frames_that_are_half_a_turn_off_are_turned_to_each_other(cls: type, off: float):
+    """The rotations of these constraints have poles there, which no step shows."""
+    plant = MultibodyPlant(0.0)
+    for name in "ab":
+        body = plant.AddRigidBody(name, SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3))
+        plant.AddJoint(RpyFloatingJoint(name, plant.world_frame(), body.body_frame()))
+    plant.Finalize()
+    mechanism = RobotPlant(RobotModel.from_multibody(plant, [cls("a", "b")], [], forces=[]))
+    random, context = np.random.default_rng(0), plant.CreateDefaultContext()
+    frames = [plant.GetFrameByName(name) for name in "ab"]
+    for _ in range(15):
+        across = np.append(random.normal(size=2), 0.0)
+        turned = RigidTransform(
+            AngleAxis(np.pi - off, across / np.linalg.norm(across)), np.zeros(3)
+        )
+        start = RigidTransform(RollPitchYaw(*random.uniform(-0.8, 0.8, 3)), random.normal(size=3))
+        poses = [
+            (RollPitchYaw(X.rotation()).vector(), X.translation()) for X in (start, start @ turned)
+        ]
+        guess = np.concatenate([part for pose in poses for part in pose])
+        state = mechanism.set_consistent_state(
+            mechanism.CreateDefaultContext(), [*guess, *[0.0] * 12]
+        )
+        plant.SetPositions(context, state[:12])
+        a, b = (frame.CalcPoseInWorld(context).rotation().matrix() for frame in frames)
+        free = 2 if cls is RevoluteLoopJoint else slice(None)
+        np.testing.assert_allclose(a[:, free], b[:, free], atol=1e-12)

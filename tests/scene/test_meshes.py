@@ -20,7 +20,7 @@ def scene_of(folder: Path, files: list[str]):
     visuals = "".join(VISUAL.format(k, file) for k, file in enumerate(files))
     (folder / "robot.urdf").write_text(URDF.format(visuals))
     scene_graph = SceneGraph()
-    plant, _ = read_robot(Robot(str(folder / "robot.urdf")), scene_graph)
+    plant, _ = read_robot(Robot(str(folder / "robot.urdf")), None, scene_graph)
     return scene_graph, plant.get_source_id()
 
 

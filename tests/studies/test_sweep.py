@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -35,9 +36,14 @@ def chosen():
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
-    """An undisturbed study, on one process."""
-    return dd.sweep(chosen(), VARIATIONS, tmp_path_factory.mktemp("one") / "runs.db", workers=1)
+def whole(tmp_path_factory):
+    """The file of an undisturbed study, on one process."""
+    return tmp_path_factory.mktemp("one") / "runs.db"
+
+
+@pytest.fixture(scope="module")
+def study(whole):
+    return dd.sweep(chosen(), VARIATIONS, whole, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +77,10 @@ def test_the_number_of_processes_changes_nothing(study, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("outcome", some([None, "crashed", "timed out"]))
-def test_it_continues_with_what_is_missing_or_died_and_runs_nothing_again(outcome, study, tmp_path):
-    file = tmp_path / "runs.db"
-    dd.sweep(chosen(), VARIATIONS, file, workers=1)
+def test_it_continues_with_what_is_missing_or_died_and_runs_nothing_again(
+    outcome, study, whole, tmp_path
+):
+    file = shutil.copy(whole, tmp_path)
     with closing(sqlite3.connect(file)) as database:
         if outcome is None:
             database.execute("DELETE FROM runs WHERE run = 3")

@@ -1,8 +1,8 @@
 """What a scenario changes of its robot, and loops of joints, which become constraints."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from math import isfinite
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -26,7 +26,6 @@ from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.errors import ModelError
 from drake_dae.robots import (
     Constraint,
-    JointCoupler,
     PrismaticLoopJoint,
     RevoluteLoopJoint,
     axes_along,
@@ -37,11 +36,11 @@ from drake_dae.robots import (
     unique_names,
 )
 from drake_dae.scenario.form import at
-from drake_dae.scenario.robot_file.mending import Mender
 from drake_dae.scenario.robot_file.mjcf import ARMATURE
 from drake_dae.scenario.robot_file.robot import Payload, Robot, RobotPlacement
 
-T = TypeVar("T")
+_Leader = tuple[str, float, float]
+"""The name of a joint that another one follows, the ratio, and the offset, rad or m."""
 
 
 def joints_of(plant: MultibodyPlant) -> list[Joint]:
@@ -54,22 +53,35 @@ def actuators_of(plant: MultibodyPlant) -> list[JointActuator]:
     return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
 
 
-def change_robot(robot: Robot, plant: MultibodyPlant, mender: Mender) -> None:
-    """Applies the changes that a scenario makes to the robot of its file."""
-    couplings = _couplings(plant, mender)
+def change_robot(
+    robot: Robot, plant: MultibodyPlant, known: Mapping[str, Mapping[tuple[str, str], Any]]
+) -> None:
+    """Applies the changes that a scenario makes to the robot of its file.
+
+    `known` is what the file says of joints, `Mender.joints`.
+    """
+    of_joints = {
+        what: {
+            name: values[model, joint.name()]
+            for name, joint in joint_names(plant).items()
+            for model in ("", plant.GetModelInstanceName(joint.model_instance()))
+            if (model, joint.name()) in values
+        }
+        for what, values in known.items()
+    }
+    leaders = _leaders(plant, of_joints.get("follows", {}))
     if robot.base is not None:
         _weld_base(robot.base, plant)
-    locked = _of_joints(plant, mender.joints["stands"]) | robot.locked
-    if locked:
-        _lock_joints(locked, plant, couplings)
+    if locked := of_joints.get("stands", {}) | robot.locked:
+        _lock_joints(locked, plant, leaders)
     _add_free_joints(robot.free, plant)
+    armatures = of_joints.get("armature", {})
     if robot.actuators is not None:
-        _drive_joints(robot.actuators, plant, couplings, mender)
+        _drive_joints(robot.actuators, plant, leaders, of_joints.get("effort", {}), armatures)
     add_payloads("robot.payloads", robot.payloads, plant)
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
-    is_left_out = ARMATURE in robot.leave_out
-    for name, armature in _of_joints(plant, mender.joints["armature"]).items():
-        if not is_left_out and joint_names(plant)[name].index() not in driven:
+    for name, armature in armatures.items() if ARMATURE not in robot.leave_out else ():
+        if joint_names(plant)[name].index() not in driven:
             raise ModelError(
                 f"joint '{name}' has an armature of {armature:g} and no motor, and Drake gives "
                 "only motors one; name it under robot.actuators, or write leave_out: "
@@ -128,13 +140,19 @@ def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
 
 @at("robot.locked")
 def _lock_joints(
-    locked: Mapping[str, float], plant: MultibodyPlant, couplings: Sequence[JointCoupler]
+    locked: Mapping[str, float], plant: MultibodyPlant, leaders: Mapping[str, _Leader]
 ) -> None:
-    """Replaces joints, and those that are coupled to them, by welds with their constant X_FM(q).
+    """Replaces joints, and those that follow them, by welds with their constant X_FM(q).
 
     Drake supports locked joints only in discrete time. Actuator, damping and rotor go.
     """
-    joints, positions = _movable(plant), _with_coupled(locked, couplings)
+    joints, positions = _movable(plant), dict(locked)
+    for _ in leaders:  # As often as the longest chain needs.
+        for follower, (leader, ratio, offset) in leaders.items():
+            if leader in positions:
+                positions.setdefault(follower, ratio * positions[leader] + offset)
+            if follower in locked:
+                raise ModelError(f"'{follower}' follows '{leader}', which can be locked instead")
     for name, value in positions.items():
         joint = _named(name, joints)
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
@@ -144,7 +162,7 @@ def _lock_joints(
             raise ModelError(
                 f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
             )
-    if plant.num_constraints() > len(couplings):
+    if plant.num_constraints() > len(leaders):
         raise ModelError(
             "the file has constraints other than mimic joints, which Drake loses when a joint is "
             "locked; name them under robot.leave_out, and write them under constraints"
@@ -167,39 +185,18 @@ def _lock_joints(
             raise ModelError(f"'{name}' cannot be locked: {error}") from None
         plant.AddJoint(WeldJoint(own_name, inboard, outboard, pose))
     joints = _movable(plant)
-    for coupling in couplings:
-        if coupling.follower in joints:
-            pair = joints[coupling.follower], joints[coupling.leader]
-            plant.AddCouplerConstraint(*pair, coupling.ratio, coupling.offset)
-
-
-def _with_coupled(
-    locked: Mapping[str, float], couplings: Sequence[JointCoupler]
-) -> dict[str, float]:
-    """The positions of locked joints, and of those that are coupled to them."""
-    positions = dict(locked)
-    for _ in couplings:  # As often as the longest chain needs.
-        for coupling in couplings:
-            leader, follower = coupling.leader, coupling.follower
-            if leader in positions:
-                coupled = coupling.ratio * positions[leader] + coupling.offset
-                value = positions.setdefault(follower, coupled)
-                if abs(value - coupled) > 1e-9:
-                    raise ModelError(
-                        f"{follower} = {value:g}, but it is coupled to {leader} = "
-                        f"{positions[leader]:g}, which makes it {coupled:g}; lock one of them"
-                    )
-            elif follower in positions and coupling.ratio != 0.0:
-                positions[leader] = (positions[follower] - coupling.offset) / coupling.ratio
-    return positions
+    for follower, (leader, ratio, offset) in leaders.items():
+        if follower in joints:
+            plant.AddCouplerConstraint(joints[follower], joints[leader], ratio, offset)
 
 
 @at("robot.actuators")
 def _drive_joints(
     driven: str | Sequence[str] | Mapping[str, float | None],
     plant: MultibodyPlant,
-    couplings: Sequence[JointCoupler],
-    mender: Mender,
+    followers: Container[str],
+    efforts: Mapping[str, float],
+    armatures: Mapping[str, float],
 ) -> None:
     """Adds actuators to the joints that a scenario names, and removes those of all other joints.
 
@@ -207,11 +204,8 @@ def _drive_joints(
     """
     joints = _movable(plant)
     if driven == "all":
-        followers = {coupling.follower for coupling in couplings}
         driven = [name for name in joints if name not in followers]
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
-    efforts = _of_joints(plant, mender.joints["effort"])
-    armatures = _of_joints(plant, mender.joints["armature"])
     names, with_actuator = {_named(name, joints).index(): name for name in limits}, set()
     for actuator in actuators_of(plant):
         name = names.get(actuator.joint().index())
@@ -243,27 +237,14 @@ def _is_simple(joint: Joint) -> bool:
     return isinstance(joint, RevoluteJoint | PrismaticJoint)
 
 
-def _of_joints(plant: MultibodyPlant, values: Mapping[tuple[str, str], T]) -> dict[str, T]:
-    """What is known of joints by (model, joint), by their names in a scenario."""
-    found = {}
-    for name, joint in joint_names(plant).items():
-        for model in ("", plant.GetModelInstanceName(joint.model_instance())):
-            if (model, joint.name()) in values:
-                found[name] = values[model, joint.name()]
-    return found
-
-
-def _couplings(plant: MultibodyPlant, mender: Mender) -> list[JointCoupler]:
-    """The couplings of joints of a plant, by names."""
-    if plant.num_constraints() == 0:
-        return []
-    joints = joint_names(plant)
+def _leaders(plant: MultibodyPlant, follows: Mapping[str, _Leader]) -> dict[str, _Leader]:
+    """Follower -> its leader, ratio and offset, by the names of joints in the plant."""
+    joints, leaders = joint_names(plant), dict[str, _Leader]()
     names = {(int(j.model_instance()), j.name()): name for name, j in joints.items()}
-    couplings = []
-    for name, (leader, ratio, offset) in _of_joints(plant, mender.joints["follows"]).items():
-        leading = names.get((int(joints[name].model_instance()), leader))
-        couplings += [JointCoupler(name, leading, ratio, offset)] if leading else []
-    return couplings
+    for name, (leader, ratio, offset) in follows.items():
+        if leading := names.get((int(joints[name].model_instance()), leader)):
+            leaders[name] = leading, ratio, offset
+    return leaders
 
 
 def _joints_to_parents(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
@@ -281,10 +262,14 @@ class CutJoint(NamedTuple):
     options: dict[str, Any]
 
 
-def closing_joints(plant: MultibodyPlant) -> list[Joint]:
-    """The joints that close loops, so that the others form a tree; if possible without motors."""
-    driven = {actuator.joint().index() for actuator in actuators_of(plant)}
-    groups, closing = list(range(plant.num_bodies())), []
+def cut_loops(plant: MultibodyPlant, parents: Mapping[tuple[str, str], str]) -> list[CutJoint]:
+    """Removes joints until the others form a tree; driven joints only if necessary.
+
+    `parents` are the frames that an SDFormat file names as the parents of joints.
+    """
+    driven = {actuator.joint().index(): actuator for actuator in actuators_of(plant)}
+    names = {joint.index(): name for name, joint in joint_names(plant).items()}
+    groups, cuts = list(range(plant.num_bodies())), []
     for joint in sorted(
         joints_of(plant),
         key=lambda joint: (not _is_simple(joint), joint.index() in driven),
@@ -294,20 +279,10 @@ def closing_joints(plant: MultibodyPlant) -> list[Joint]:
             groups[int(body.index())] for body in (joint.parent_body(), joint.child_body())
         )
         if first == second:
-            closing.append(joint)
+            name = names.get(joint.index(), joint.name())
+            _check_parent(joint, name, plant, parents)
+            cuts.append(_cut(joint, name, driven.get(joint.index()), plant))
         groups = [second if group == first else group for group in groups]
-    return closing
-
-
-def cut_loops(plant: MultibodyPlant, mender: Mender) -> list[CutJoint]:
-    """Removes joints until the others form a tree; driven joints only if necessary."""
-    driven = {actuator.joint().index(): actuator for actuator in actuators_of(plant)}
-    names = {joint.index(): name for name, joint in joint_names(plant).items()}
-    cuts = []
-    for joint in closing_joints(plant):
-        name = names.get(joint.index(), joint.name())
-        _check_parent(joint, name, plant, mender.joints["parent"])
-        cuts.append(_cut(joint, name, driven.get(joint.index()), plant))
     return cuts
 
 

@@ -11,7 +11,6 @@ with its own colors and textures, and any other mesh an .obj, by the optional pa
 import atexit
 import json
 import os
-import re
 import warnings
 from collections.abc import Iterator
 from functools import cache
@@ -23,7 +22,6 @@ from urllib.parse import unquote
 
 import numpy as np
 from pydrake.common import GetDrakePath
-from pydrake.geometry import Mesh
 from pydrake.multibody.parsing import PackageMap
 
 from drake_dae.errors import ModelError
@@ -32,9 +30,6 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.robot_file.xml_tree import read_xml
 from drake_dae.scenario.shipped import FOLDER
-
-DRAWN: tuple[str, ...] = (".obj", ".gltf")
-"""The kinds of mesh that Drake draws everywhere."""
 
 
 class RobotFiles:
@@ -52,10 +47,6 @@ class RobotFiles:
     def __init__(self, robot: Robot, packages: PackageMap) -> None:
         self.missing: set[str] = set()
         self.packages = packages
-        self._places = [
-            *(Path(part) for part in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)),
-            *(Path(p, "share") for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)),
-        ]
         packages.AddPackageXml(str(FOLDER / "models" / "package.xml"))
         for name, folder in robot.packages.items():
             with at(f"robot.packages.{name}"):
@@ -82,12 +73,12 @@ class RobotFiles:
     def find(self, name: str, file: Path) -> Path | None:
         """The path of a URL or a name in a file; None if its package is unknown."""
         scheme, _, rest = name.rpartition("://")
-        rest = rest.lstrip("/") if scheme in ("package", "model") else rest
-        package = rest.split("/")[0]
         if not scheme:
             return file.resolve().parent / name
         if scheme == "file":
             return Path(unquote(rest))
+        rest = rest.lstrip("/")
+        package = rest.split("/")[0]
         if scheme not in ("package", "model") or package in self.missing:
             return None
         if not self.packages.Contains(package):
@@ -110,10 +101,9 @@ class RobotFiles:
         ros = PackageMap.MakeEmpty()
         if os.environ.get("ROS_PACKAGE_PATH"):
             ros.PopulateFromRosPackagePath()
-        if ros.Contains(package):
-            return Path(ros.GetPath(package))
-        inside = (place / package for place in self._places if str(place) != ".")
-        return next((folder for folder in inside if folder.is_dir()), None)
+        if os.environ.get("AMENT_PREFIX_PATH"):
+            ros.PopulateFromEnvironment("AMENT_PREFIX_PATH")
+        return Path(ros.GetPath(package)) if ros.Contains(package) else None
 
     def needed(self, name: str, file: Path) -> Path:
         """The path of a URL or a name in a file."""
@@ -136,19 +126,19 @@ class RobotFiles:
             current = waiting.pop()
             try:
                 real = current.resolve()
+                is_file = current.is_file()
             except (OSError, RuntimeError, ValueError):  # A cycle of links, or an invalid path.
                 return False
             if not any(real.is_relative_to(folder) for folder in folders):
                 return False
-            if current in checked or not current.is_file():
-                continue
-            checked.add(current)
-            for name in _references(current):
-                # Percent encoding is decoded by some parsers, and not by Drake's.
-                spelled = {name, unquote(name)} if not name.lower().startswith("data:") else set()
-                if any(re.match(r"[A-Za-z][\w+.-]+:/", one) for one in spelled):
-                    return False
-                waiting += [current.parent / one for one in spelled]
+            if is_file and current not in checked:
+                checked.add(current)
+                for name in _references(current):
+                    # Percent encoding is decoded by some parsers, and not by Drake's.
+                    spelled = {name, unquote(name)}
+                    if any(":/" in one for one in spelled):
+                        return False
+                    waiting += [current.parent / one for one in spelled]
         return True
 
 
@@ -160,58 +150,43 @@ def _package_name(folder: Path) -> str:
         return ""
 
 
-# Matches more than the formats permit, since their parsers do: options and line ends before a name.
-_MATERIAL_LIBRARY = re.compile(r"mtllib\s+([^\r\n]+)")
-_TEXTURE = re.compile(r"(?:map_|bump|disp|decal|norm|refl)[^\r\n]*[\r\n]*[^\r\n]*", re.IGNORECASE)
-
-
 def _references(file: Path) -> Iterator[str]:
-    """The names of files in a mesh or a material."""
+    """All that may name a file in a mesh or a material: parsers permit more than the formats."""
     kind = file.suffix.lower()
     if kind == ".dae":
         try:
-            nodes = read_xml(file).iter()
+            nodes = list(read_xml(file).iter())
         except ModelError:
-            return
-        yield from (
-            (node.text or "").strip()
-            for node in nodes
-            if node.tag.split(":")[-1] in ("init_from", "ref")
-        )
+            nodes = []
+        tags = ("init_from", "ref")
+        yield from ((n.text or "").strip() for n in nodes if n.tag.split(":")[-1] in tags)
     elif kind in (".gltf", ".obj", ".mtl"):
         check_file(file, ModelError)
-        text = file.read_bytes().decode("utf-8", errors="replace")
+        text = file.read_bytes().decode("utf-8", errors="replace").replace("\r", "\n")
         if kind == ".gltf":
             try:  # As lists of (key, value), since a key may occur twice.
                 yield from _uris(json.loads(text, object_pairs_hook=list))
             except (ValueError, RecursionError):
                 yield "/"  # Nobody knows what it names.
         elif kind == ".obj":
-            for names in _MATERIAL_LIBRARY.findall(text):
+            for part in text.split("mtllib")[1:]:
+                names = part.lstrip().split("\n")[0]
                 yield from {names.strip(), *names.split()}
         else:
-            yield from (name for line in _TEXTURE.findall(text) for name in line.split())
+            lines = text.replace("\\\n", " ").split("\n")
+            yield from (word for line in lines if line[:1] != "#" for word in line.split())
 
 
 def _uris(data: Any) -> Iterator[str]:
-    """The entries "uri" of buffers, images and extensions."""
+    """The entries "uri" of buffers, images and extensions that are no data themselves."""
     if isinstance(data, tuple) and data[0] == "uri" and isinstance(data[1], str):
-        yield data[1]
+        yield from [data[1]] if not data[1].lower().startswith("data:") else []
     elif isinstance(data, (list, tuple)):
         for part in data:
             yield from _uris(part)
 
 
-def has_hull(mesh: Path) -> bool:
-    """Whether Drake can compute the convex hull that a collision needs."""
-    try:
-        Mesh(str(mesh)).GetConvexHull()
-    except RuntimeError:
-        return False
-    return True
-
-
-def drawable(mesh: Path, kinds: tuple[str, ...] = DRAWN) -> Path | None:
+def drawable(mesh: Path, kinds: tuple[str, ...]) -> Path | None:
     """A mesh, or a copy until Python exits, of a kind that is drawn; None if there is none."""
     if mesh.suffix.lower() in kinds:
         return mesh

@@ -6,71 +6,62 @@ read. What changed on the way is collected, and so is what is lost.
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
-from itertools import count
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+from pydrake.geometry import Mesh
 from pydrake.multibody.tree import RotationalInertia
 
 from drake_dae.arrays import FloatArray, number_in
-from drake_dae.errors import ModelError
+from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning
 from drake_dae.scenario.robot_file import mjcf
-from drake_dae.scenario.robot_file.files import DRAWN, RobotFiles, drawable, has_hull
+from drake_dae.scenario.robot_file.files import RobotFiles, drawable
 from drake_dae.scenario.robot_file.read_by_drake import DRIVES, READ_BY_DRAKE, take_lost
-from drake_dae.scenario.robot_file.xml_tree import read_xml, write_xml
-
-_TYPES = {
-    ".urdf": ("revolute", "continuous", "prismatic", "planar", "floating", "fixed"),
-    ".sdf": ("revolute", "continuous", "prismatic", "universal", "ball", "screw", "fixed"),
-    ".xml": ("hinge", "slide", "ball", "free"),
-}
-"""Suffix of a file -> the types of joints that Drake reads."""
-
-_EMPTY = "shapes of size 0 are left out"
-
-_MOST_INCLUDED = 1000
-"""The largest number of files that an MJCF file includes: each may include another one twice."""
+from drake_dae.scenario.robot_file.robot import Robot
+from drake_dae.scenario.robot_file.xml_tree import write_xml
 
 
-def _lists() -> dict[str, list[str]]:
-    return defaultdict(list)
+class Floating(NamedTuple):
+    """A floating joint that a copy lacks; its origin on the parent is a frame of the copy."""
+
+    model: str
+    name: str
+    child: str
+    origin: str
 
 
-@dataclass
 class Mender:
     """Makes mended copies of files. A "model" is the name of a model instance, "" for a lone robot.
 
     Attributes:
-        files: The files that they name.
-        leave_out: The key `robot.leave_out`.
-        drives: Whether the file's motors count, since the scenario names no driven joints.
-        has_geometry, drawn: Whether geometry is read, and converted to such that can be drawn.
-        folder: An empty folder for the copies; None makes none.
-        omitted, changed, lost: What of the geometry is left out, what else changed, and what is
-            lost -> where.
+        told: Category of a warning and its text -> what it concerns.
+        lost: Part of the files that is lost -> where.
         originals: Copy -> its file.
         joints: "effort" limit, "armature", "follows" (leader, ratio, offset), position at which it
             "stands", "parent" of SDFormat -> (model, joint) -> value.
-        floating: Model, name, parent, child, and x, y, z, roll, pitch, yaw of floating joints.
+        floating: The floating joints.
         crossed: (model, link) of which visual geometry is left out.
     """
 
-    files: RobotFiles
-    leave_out: Collection[str] = ()
-    drives: bool = True
-    has_geometry: bool = True
-    drawn: bool = True
-    folder: Path | None = None
-    omitted: dict[str, list[str]] = field(default_factory=_lists)
-    changed: dict[str, list[str]] = field(default_factory=_lists)
-    lost: dict[str, list[str]] = field(default_factory=_lists)
-    originals: dict[Path, Path] = field(default_factory=dict)
-    joints: dict[str, dict[tuple[str, str], Any]] = field(default_factory=lambda: defaultdict(dict))
-    floating: list[tuple[str, str, str, str, FloatArray]] = field(default_factory=list)
-    crossed: set[tuple[str, str]] = field(default_factory=set)
+    def __init__(
+        self, files: RobotFiles, robot: Robot, folder: Path | None, shapes: Collection[str] = ()
+    ) -> None:
+        """`folder` is an empty one for the copies, None to make none.
+
+        `shapes` has "read" if geometry is read, and "drawn" if it is converted to be drawn.
+        """
+        self.files, self.leave_out, self.folder = files, robot.leave_out, folder
+        self.drives = robot.actuators is None  # Else the file's motors do not count.
+        self.has_geometry, self.drawn = "read" in shapes, "drawn" in shapes
+        self.told: dict[tuple[type[Warning], str], list[str]] = defaultdict(list)
+        self.lost: dict[str, list[str]] = defaultdict(list)
+        self.originals: dict[Path, Path] = {}
+        self.joints: dict[str, dict[tuple[str, str], Any]] = defaultdict(dict)
+        self.floating: list[Floating] = []
+        self.crossed: set[tuple[str, str]] = set()
 
     def copy(
         self,
@@ -84,13 +75,12 @@ class Mender:
         `placed` are links that the scenario places, so that no joint fixes them to the world, and
         `within` the files that include this one.
         """
-        kind, own = file.suffix, (*within, file.resolve())
+        kind = file.suffix
         if kind not in READ_BY_DRAKE:
             return file
-        root = _read(file, within)
+        root = mjcf.read_included(file, within)
         if kind == ".xml":
-            _include(root, file, own, count(1))
-            mjcf.prepare(root, file)
+            mjcf.expand(root, file)
         parents = {child: parent for parent in root.iter() for child in parent}
 
         def place(node: Element) -> str:
@@ -103,11 +93,9 @@ class Mender:
         for node in root.iter():
             for value in (*node.attrib.values(), node.text or ""):
                 if "$(" in value or "${" in value:
-                    text = (
-                        f"{place(node)}: '{value.strip()}' is a template: xacro FILE -o robot.urdf"
-                    )
-                    raise ModelError(f"{text} writes the URDF")
-                if number_in(value.replace(",", ".", 1)) is not None and "," in value:
+                    way = "is a template: xacro FILE -o robot.urdf writes the URDF"
+                    raise ModelError(f"{place(node)}: '{value.strip()}' {way}")
+                if "," in value and number_in(value.replace(",", ".", 1)) is not None:
                     raise ModelError(f"{place(node)}: '{value}': numbers have a point, no comma")
         # Only the armature of joints without motor is lost.
         for part, node in take_lost(root, kind, {*self.leave_out} - {mjcf.ARMATURE}):
@@ -117,13 +105,13 @@ class Mender:
             if text := mend_inertia(inertial, kind, place(inertial)):
                 if "inertia" not in self.leave_out:
                     self.lost["inertia"].append(text)
-                self.changed["moments of inertia of no body become possible ones"].append(text)
+                self.tell("moments of inertia of no body become possible ones", text)
         for joint in root.iter("joint"):
-            self._check_joint(joint, kind, place(joint))
+            self._mend_limits(joint, kind, place(joint))
         if kind == ".urdf":
             self._mend_urdf(root, file, model, placed)
         elif kind == ".sdf":
-            self._mend_sdf(root, file, model, placed, own)
+            self._mend_sdf(root, file, model, placed, (*within, file.resolve()))
         else:
             self._mend_mjcf(root, file, model, placed)
         if self.folder is None:
@@ -134,19 +122,18 @@ class Mender:
         self.originals[copy] = file
         return copy
 
-    def _check_joint(self, joint: Element, kind: str, place: str) -> None:
-        """Checks the type of a joint, and removes limits that Drake refuses."""
-        name = joint.get("type", "hinge" if kind == ".xml" else "")
-        if name and name not in _TYPES[kind]:
-            raise ModelError(
-                f"{place}: no joint of type '{name}' is read, but {', '.join(_TYPES[kind])}; two "
-                "joints that move together are a !JointCoupler under constraints"
-            )
+    def tell(self, kind: str, item: str, category: type[Warning] = RobotFileWarning) -> None:
+        self.told[category, kind].append(item)
+
+    def _mend_limits(self, joint: Element, kind: str, place: str) -> None:
+        """Removes limits that Drake refuses, and those of joints that have none."""
         # Drake damps no free body, and limits no ball joint.
-        part = {"free": "damping", "ball": "range"}.get(name, "") if kind == ".xml" else ""
+        own = {"free": "damping", "ball": "range"} if kind == ".xml" else {}
+        part = own.get(joint.get("type", ""), "")
         values = [number_in(word) for word in joint.attrib.pop(part, "").split()]
         if any(values) and (part == "damping" or joint.get("limited") != "false"):
             self.lost[f"joint/{part}"].append(place)
+        is_continuous = joint.get("type") == "continuous"
         for owner in (joint, *(joint.find(way) for way in ("limit", "axis/limit", "axis2/limit"))):
             if owner is None:
                 continue
@@ -154,14 +141,14 @@ class Mender:
             bounds = [number_in(word) for word in owner.get("range", "").split() or sides]
             low, high = bounds if len(bounds) == 2 else (None, None)
             is_reversed = low is not None and high is not None and low > high
-            if is_reversed and name != "continuous" and "empty_limits" not in self.leave_out:
+            if is_reversed and not is_continuous and "empty_limits" not in self.leave_out:
                 self.lost["empty_limits"].append(f"{place}: limits from {low:g} to {high:g}")
-            for key in ("range", "lower", "upper") if is_reversed or name == "continuous" else ():
+            for key in ("range", "lower", "upper") if is_reversed or is_continuous else ():
                 owner.attrib.pop(key, None)
                 _remove(owner, key)
 
-    def _mesh(self, name: str, path: Path | None, collides: bool, drawn_as: tuple[str, ...]) -> str:
-        """The file of a mesh as Drake reads it; "" if it is left out."""
+    def _mesh(self, name: str, path: Path | None, collides: bool, kinds: tuple[str, ...]) -> str:
+        """The file of a mesh as Drake reads it, of some kinds if any; "" if it is left out."""
         if self.folder is None:
             return str(path or "")
         drawn, why = path, ""
@@ -174,47 +161,53 @@ class Mender:
             why = "is not there"
         elif not self.files.holds(path):
             why = "is outside of the model's folder or package (robot.packages can name its folder)"
-        elif drawn_as and (drawn := drawable(path, drawn_as)) is None:
+        elif kinds and (drawn := drawable(path, kinds)) is None:
             why = "cannot be converted (pip install 'drake_dae[meshes]' converts more)"
-        elif collides and drawn is not None and not has_hull(drawn):
+        elif collides and drawn and not _has_hull(str(drawn), drawn.stat().st_mtime_ns):
             why = "cannot be read by Drake"
         if why:
-            items = self.omitted[f"geometry that {why} is left out; no equation needs it"]
-            items.append(f"'{name if path is None else Path(name).name}'")
+            self._leave_out(why, f"'{name if path is None else Path(name).name}'")
         return "" if why else str(drawn)
+
+    def _leave_out(self, why: str, item: str) -> None:
+        text = f"geometry that {why} is left out; no equation needs it"
+        self.tell(text, item, GeometryWarning)
 
     def _mend_shapes(self, link: Element, file: Path, model: str) -> None:
         """Leaves out what of a link's geometry Drake cannot take, in URDF and SDFormat."""
         name = link.get("name", "")
         for shape in [*link.iterfind("visual"), *link.iterfind("collision")]:
-            is_visual, meshes = shape.tag == "visual", [*_files(shape)]
+            is_visual = shape.tag == "visual"
+            if not self.has_geometry:
+                link.remove(shape)
+                continue
             sizes = [
                 size
-                for form in (() if meshes else shape.iterfind("geometry/*"))
+                for form in shape.iterfind("geometry/*")
                 for key in ("size", "radius", "length", "radii")
                 for size in (form.get(key) or form.findtext(key) or "1").split()
             ]
-            is_empty = any((number_in(size) or 0.0) <= 0.0 for size in sizes)
-            if is_empty or not self.has_geometry:
-                if self.has_geometry:
-                    self.omitted[_EMPTY].append(f"of '{name}'")
+            if any((number_in(size) or 0.0) <= 0.0 for size in sizes):
+                self._leave_out("has size 0", f"of '{name}'")
                 link.remove(shape)
                 continue
-            for owner, key in meshes:
-                text = (owner.get(key, "") if key else owner.text or "").strip()
-                drawn_as = DRAWN if is_visual and self.drawn else ()
-                path = self._mesh(text, self.files.find(text, file), not is_visual, drawn_as)
-                if key:
-                    owner.set(key, path)
-                else:
+            for mesh in shape.iterfind("geometry/mesh"):
+                uri = mesh.find("uri")
+                owner, is_text = (mesh, False) if uri is None else (uri, True)
+                text = (owner.text or "").strip() if is_text else mesh.get("filename", "")
+                kinds = (".obj", ".gltf") if is_visual and self.drawn else ()
+                path = self._mesh(text, self.files.find(text, file), not is_visual, kinds)
+                if is_text:
                     owner.text = path
+                else:
+                    owner.set("filename", path)
                 if not path:
                     link.remove(shape)
                     self.crossed |= {(model, name)} if is_visual else set()
             for material in shape.iterfind("material"):
-                for texture in [t for t in material if t.tag in ("texture", "drake:diffuse_map")]:
-                    self.omitted["textures are left out"].append(f"of '{name}'")
-                    material.remove(texture)
+                for tag in ("texture", "drake:diffuse_map"):
+                    if _remove(material, tag):
+                        self.tell("textures are left out", f"of '{name}'", GeometryWarning)
 
     def _follow(self, model: str, joint: Element, tag: str) -> None:
         """Notes whether a joint follows another one, unless Drake reports what is wrong."""
@@ -225,7 +218,7 @@ class Mender:
             if joint.get("type") in ("planar", "floating", "universal", "ball"):
                 self.lost[f"joint/{tag}"].append(f"joint '{name}'")
             elif ratio == 0.0 and offset is not None:
-                self.changed["joints that follow others with multiplier 0 stand"] += [f"'{name}'"]
+                self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
                 self.joints["stands"][model, name] = offset
                 joint.remove(mimic)
             elif ratio is not None and offset is not None:
@@ -235,25 +228,29 @@ class Mender:
         root.attrib.setdefault("name", file.stem)
         for link in root.iterfind("link"):
             self._mend_shapes(link, file, model)
-        _take_first_colours(root)
+        colours = set()  # Drake refuses several of a name, which other parsers take.
+        for material in root.findall("material"):
+            if material.get("name") in colours:
+                root.remove(material)
+            colours.add(material.get("name"))
+        moving: set[str | None] = set()
         still: set[str | None] = set()  # Joints that Drake drives not: their effort limit is 0.
         for joint in root.findall("joint"):
             name, kind = joint.get("name", ""), joint.get("type")
             ends = joint.find("parent"), joint.find("child")
-            parent, child = ("" if end is None else str(end.get("link", "")) for end in ends)
+            parent, child = ("" if end is None else end.get("link", "") for end in ends)
+            if kind == "fixed":
+                _remove(joint, "mimic")
+            else:
+                moving.add(name)
             if parent == "world" and child in placed and kind in ("fixed", "floating"):
                 root.remove(joint)
             elif kind == "floating":
                 root.remove(joint)
                 origin = joint.find("origin")
-                pose = {} if origin is None else origin.attrib
-                text = f"{pose.get('xyz', '0 0 0')} {pose.get('rpy', '0 0 0')}"
-                numbers = [number_in(word) for word in text.split()]
-                if len(numbers) != 6 or None in numbers:
-                    raise ModelError(f"joint '{name}': its origin is six numbers, got '{text}'")
-                self.floating.append((model, name, parent, child, np.array(numbers, float)))
-            if kind == "fixed":
-                _remove(joint, "mimic")
+                own = {"name": f"{name}_origin", "link": parent, "xyz": "0 0 0", "rpy": "0 0 0"}
+                SubElement(root, "frame", own | ({} if origin is None else origin.attrib))
+                self.floating.append(Floating(model, name, child, own["name"]))
             self._follow(model, joint, "mimic")
             for limit in joint.iterfind("limit"):
                 effort = number_in(limit.get("effort", "")) or 0.0
@@ -261,7 +258,6 @@ class Mender:
                     self.joints["effort"][model, name] = effort
                 elif "effort" in limit.attrib:  # Many authors write 0 for an unknown limit.
                     still.add(name)
-        moving = {j.get("name") for j in root.iterfind("joint") if j.get("type") != "fixed"}
         count = Counter[str]()
         for transmission in root.findall("transmission"):
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
@@ -302,81 +298,78 @@ class Mender:
                 self._follow(model, joint, "drake:mimic")
 
     def _mend_mjcf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
-        if not (self.has_geometry and self.drawn):
-            mjcf.remove_geometry(root, collides=not self.has_geometry)
-        refused: dict[str, str] = {}
-        used = mjcf.colliding_meshes(root) if self.has_geometry else set[str]()
-        for mesh, path in mjcf.mesh_files(root, file):
-            name = mesh.get("file", "")
-            mesh.set("file", self._mesh(name, path, mesh.get("name") in used, (".obj",)))
-            if not mesh.get("file"):
-                refused[mesh.get("name", "")] = name
-        crossed, empty = mjcf.remove_shapes(root, refused)
-        self.crossed |= {(model, body) for body in crossed if self.has_geometry}
-        if empty:
-            self.omitted[_EMPTY] += [f"of '{body}'" for body in empty]
-        for name, armature in mjcf.armatures(root):
-            if name:
-                self.joints["armature"][model, name] = armature
+        options = mjcf.compiler(root)
+        folder = file.resolve().parent / options.get("meshdir", options.get("assetdir", ""))
+        meshes, used, shells = dict[str, Element](), dict[str, str](), set[str]()
+        for asset in root.iterfind("asset/mesh"):
+            if "file" in asset.attrib:
+                asset.attrib.setdefault("name", Path(asset.get("file", "")).stem)
+                meshes[asset.get("name", "")] = asset
+            is_shell = asset.attrib.pop("inertia", "") == "shell"
+            shells |= {asset.get("name", "")} if is_shell else set()
+        shapes = [
+            (geom, body, moves)
+            for world in root.iterfind("worldbody")
+            for body, moves in mjcf.bodies(world)
+            for geom in body.findall("geom")
+        ]
+        colliding = {geom.get("mesh") for geom, _, _ in shapes if mjcf.collides(geom)}
+        for geom, body, moves in shapes:
+            name, mesh = body.get("name", ""), geom.get("mesh", "")
+            weighs = moves and number_in(geom.get("mass", "1")) != 0.0
+            weighs &= mjcf.weighs_by_geometry(root) or body.find("inertial") is None
+            is_seen = self.has_geometry and (self.drawn or mjcf.collides(geom))
+            is_shape = "mesh" not in geom.attrib and geom.get("type", "sphere") != "plane"
+            size = number_in((geom.get("size", "").split() or ["1"])[0])
+            if mesh in meshes and mesh not in used and (weighs or is_seen):
+                own = meshes[mesh].get("file", "")
+                is_hull = self.has_geometry and mesh in colliding
+                used[mesh] = self._mesh(own, folder / own, is_hull, (".obj",))
+                meshes[mesh].set("file", used[mesh])
+            is_refused = mesh in used and not used[mesh]
+            if weighs and (is_refused or mesh in shells):
+                raise ModelError(
+                    f"body '{name}' has its mass from the mesh '{mesh}', which Drake cannot read, "
+                    "or not as a shell; give the body an <inertial>, or the mesh as .obj, or let "
+                    "trimesh read it, by pip install 'drake_dae[meshes]'"
+                )
+            if is_seen and is_refused:
+                self.crossed.add((model, name))
+            elif is_seen and is_shape and size == 0.0:
+                self._leave_out("has size 0", f"of '{name}'")
+            if is_refused or (is_shape and size == 0.0) or not (weighs or is_seen):
+                body.remove(geom)
+        for owner in root.iterfind("asset"):
+            for asset in owner.findall("mesh"):
+                if "file" in asset.attrib and not used.get(asset.get("name", "")):
+                    owner.remove(asset)
+        if not self.has_geometry:
+            _remove(root, "contact")
+        for joint, armature in mjcf.armatures(root):
+            if joint:
+                self.joints["armature"][model, joint] = armature
             elif mjcf.ARMATURE not in self.leave_out:
                 self.lost[mjcf.ARMATURE].append(f"{file.name}: of a joint that no motor can drive")
         for name, joint in mjcf.floating_bodies(root, placed):
-            self.floating.append((model, joint, "world", name, np.zeros(6)))
+            self.floating.append(Floating(model, joint, name, "world"))
 
 
-def _read(file: Path, within: tuple[Path, ...]) -> Element:
-    if file.resolve() in within:
-        names = " -> ".join(path.name for path in (*within, file))
-        raise ModelError(f"'{file.name}' includes itself: {names}")
-    return read_xml(file)
+@cache
+def _has_hull(mesh: str, changed: int) -> bool:
+    """Whether Drake can compute the convex hull that a collision needs, of a file of a time."""
+    try:
+        Mesh(mesh).GetConvexHull()
+    except RuntimeError:
+        return False
+    return True
 
 
-def _include(owner: Element, main: Path, within: tuple[Path, ...], number: Iterator[int]) -> None:
-    """Puts the content of files that an MJCF file includes into the places of their names."""
-    for index, node in reversed(list(enumerate(owner))):
-        if node.tag != "include":
-            _include(node, main, within, number)
-            continue
-        if next(number) > _MOST_INCLUDED:
-            raise ModelError(f"'{main.name}' includes more than {_MOST_INCLUDED} files")
-        file = main.parent / node.get("file", "")
-        included = _read(file, within)
-        _include(included, main, (*within, file.resolve()), number)
-        for part in included.iter():
-            part.line = 0  # type: ignore[attr-defined]
-        owner[index : index + 1] = list(included)
-
-
-def _remove(owner: Element, tag: str) -> None:
-    for child in [child for child in owner if child.tag == tag]:
+def _remove(owner: Element, tag: str) -> int:
+    """Removes the children of a tag; returns how many there were."""
+    children = [child for child in owner if child.tag == tag]
+    for child in children:
         owner.remove(child)
-
-
-def _files(shape: Element) -> Iterator[tuple[Element, str]]:
-    """The elements that name meshes, and the attribute that does; "" is the text, in SDFormat."""
-    for owner in shape.iterfind("geometry/mesh"):
-        if "filename" in owner.attrib:
-            yield owner, "filename"
-        else:
-            yield from ((uri, "") for uri in [*owner.findall("uri")] or [owner])
-
-
-def _take_first_colours(root: Element) -> None:
-    """Writes the first colour of each name of a material into all materials of that name.
-
-    Some vendors define several colours for a name, of which other parsers use one and Drake none,
-    or use a name before they define its colour, or never define it.
-    """
-    colours: dict[str, list[Element]] = {}
-    for material in root.iter("material"):
-        if len(material):
-            colours.setdefault(material.get("name", ""), list(material))
-    for owner in list(root.iter()):
-        for material in owner.findall("material"):
-            if colour := colours.get(material.get("name", "")):
-                material[:] = colour if material.get("name") else material[:]
-            elif not len(material):
-                owner.remove(material)
+    return len(children)
 
 
 _ENTRIES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
@@ -399,7 +392,7 @@ def nearest_inertia(inertia: FloatArray) -> FloatArray:
 
 def mend_inertia(inertial: Element, kind: str, place: str) -> str:
     """Replaces an impossible inertia by the nearest possible one; says what it replaced, or ""."""
-    words = _mass_and_entries(inertial, kind)
+    words = list(_mass_and_entries(inertial, kind))
     numbers = [number_in(word) for word in words]
     if None in numbers:
         raise ModelError(f"{place}: mass and inertia are numbers, got {', '.join(words)}")
@@ -423,11 +416,8 @@ def mend_inertia(inertial: Element, kind: str, place: str) -> str:
             f"{place}: the moments of inertia are {before} kg m^2, and near these is none that a "
             f"body of {mass:g} kg can have; mend them"
         )
-    written, matrix = (
-        [repr(float(entry)) for entry in nearest[_ROWS, _COLUMNS]],
-        inertial.find("inertia"),
-    )
-    if matrix is None:
+    written = [repr(float(entry)) for entry in nearest[_ROWS, _COLUMNS]]
+    if (matrix := inertial.find("inertia")) is None:
         # A fullinertia cannot be combined with a quat, so a diagonal one remains diagonal.
         key = "fullinertia" if "fullinertia" in inertial.attrib else "diaginertia"
         inertial.set(key, " ".join(written[: 6 if key == "fullinertia" else 3]))
@@ -443,17 +433,17 @@ def mend_inertia(inertial: Element, kind: str, place: str) -> str:
     return f"{place}: ({was}) kg m^2, nearest possible ({now}), changed by {change:.2g} %"
 
 
-def _mass_and_entries(inertial: Element, kind: str) -> list[str]:
+def _mass_and_entries(inertial: Element, kind: str) -> Iterator[str]:
     """Mass in kg, and xx, yy, zz, xy, xz and yz in kg m^2; fewer if some are missing."""
+    matrix = inertial.find("inertia")
     if kind == ".xml":
         entries = inertial.get("fullinertia", inertial.get("diaginertia", "")).split()
-        return [inertial.get("mass", "0"), *entries, *["0"] * 3][:7] if len(entries) > 2 else []
-    mass, matrix = inertial.find("mass"), inertial.find("inertia")
-    if matrix is None:
-        return []
-    if kind == ".urdf":
-        weight = "0" if mass is None else mass.get("value", "0")
-        return [weight, *(matrix.get(key, "0") for key in _ENTRIES)]
-    # The defaults of SDFormat are those of the unit matrix.
-    pairs = zip(_ENTRIES, "111000", strict=True)
-    return [inertial.findtext("mass", "1"), *(matrix.findtext(key, one) for key, one in pairs)]
+        yield from [inertial.get("mass", "0"), *entries, *["0"] * 3][: 7 if entries[2:] else 0]
+    elif kind == ".urdf" and matrix is not None:
+        mass = inertial.find("mass")
+        yield "0" if mass is None else mass.get("value", "0")
+        yield from (matrix.get(key, "0") for key in _ENTRIES)
+    elif matrix is not None:  # The defaults of SDFormat are those of the unit matrix.
+        yield inertial.findtext("mass", "1")
+        for key, default in zip(_ENTRIES, "111000", strict=True):
+            yield matrix.findtext(key, default)

@@ -1,14 +1,19 @@
-"""The parts of an MJCF file that Drake reads otherwise than MuJoCo does."""
+"""MJCF as Drake reads it: each element says all that it means, where it means it."""
 
 from collections.abc import Collection, Iterator, Mapping
+from itertools import count
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from drake_dae.arrays import number_in
 from drake_dae.errors import ModelError
+from drake_dae.scenario.robot_file.xml_tree import Node, read_xml
 
 ARMATURE = "joint/armature"
 """Rotor inertia. Drake gives it to motors only."""
+
+_MOST_INCLUDED = 1000
+"""The largest number of files that an MJCF file includes: each may include another one twice."""
 
 _TURNS = {"quat", "axisangle", "euler", "xyaxes", "zaxis"}
 
@@ -22,31 +27,32 @@ _OF_GENERAL = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"
 """What motors and servos set themselves, whatever is the default."""
 
 
-def prepare(root: Element, file: Path) -> None:
+def read_included(file: Path, within: tuple[Path, ...]) -> Node:
+    """The root of a file that others include, none of which it is."""
+    if file.resolve() in within:
+        names = " -> ".join(path.name for path in (*within, file))
+        raise ModelError(f"'{file.name}' includes itself: {names}")
+    return read_xml(file)
+
+
+def expand(root: Element, file: Path) -> None:
     """Writes an MJCF file so that each element says all that it means, where it means it.
 
-    Defaults of classes go into the elements. Inactive equalities go. Limits of motors become those
-    of the efforts at joints, the gear times those of motors; servos become motors, since controls
-    are efforts here. Bodies of mass 0, which MuJoCo takes if they do not move or move with others,
-    lose their inertia, and their geometry its mass.
+    Included files and defaults of classes go into their places. Inactive equalities go. Limits of
+    motors become those of the efforts at joints, the gear times those of motors; servos become
+    motors, since controls are efforts here. Bodies of mass 0, which MuJoCo takes if they do not
+    move or move with others, lose their inertia, and their geometry its mass.
     """
+    _include(root, file, (file.resolve(),), count(1))
     root.attrib.setdefault("model", file.stem)
     _apply_defaults(root)
-    compiler = _compiler(root)
-    if compiler.get("coordinate") == "global":
-        raise ModelError(
-            f"'{file.name}' has global coordinates; MuJoCo up to 2.3.2 reads it, and saves it with "
-            "local ones"
-        )
     for equality in root.iterfind("equality"):
-        for constraint in equality.findall("*[@active='false']"):
-            equality.remove(constraint)
-        for constraint in equality:
-            constraint.attrib.pop("active", None)
+        for constraint in list(equality):
+            if constraint.attrib.pop("active", "true") == "false":
+                equality.remove(constraint)
     for joint in root.iter("joint"):  # MuJoCo takes an empty range for none.
-        if "limited" not in joint.attrib and not any(
-            map(number_in, joint.get("range", "").split())
-        ):
+        words = joint.get("range", "").split()
+        if "limited" not in joint.attrib and not any(map(number_in, words)):
             joint.attrib.pop("range", None)
     for motor in [*root.iterfind("actuator/motor"), *root.iterfind("actuator/position")]:
         if motor.tag == "position":  # Its control is a position, and has no limit of efforts.
@@ -60,26 +66,33 @@ def prepare(root: Element, file: Path) -> None:
                 motor.set(key, " ".join(repr(gear * (bound or 0.0)) for bound in bounds))
     for body in root.iter("body"):
         inertial = body.find("inertial")
-        if inertial is None or compiler.get("inertiafromgeom") == "true":
+        if inertial is None or weighs_by_geometry(root):
             continue
         if number_in(inertial.get("mass", "")) == 0.0:
             body.remove(inertial)
             for geom in body.iterfind("geom"):
                 geom.set("mass", "0")
     for geom in root.iter("geom"):
-        if _collides(geom):
+        if collides(geom):
             geom.attrib.pop("contype", None)
             geom.attrib.pop("conaffinity", None)
         if "friction" in geom.attrib:  # Drake has none that resists turning.
             geom.set("friction", "".join(geom.get("friction", "").split()[:1]))
 
 
-def _compiler(root: Element) -> dict[str, str]:
-    return {key: value for one in root.iterfind("compiler") for key, value in one.items()}
-
-
-def _collides(geom: Element) -> bool:
-    return {geom.get("contype", "1"), geom.get("conaffinity", "1")} != {"0"}
+def _include(owner: Element, main: Path, within: tuple[Path, ...], number: Iterator[int]) -> None:
+    for index, node in reversed(list(enumerate(owner))):
+        if node.tag != "include":
+            _include(node, main, within, number)
+            continue
+        if next(number) > _MOST_INCLUDED:
+            raise ModelError(f"'{main.name}' includes more than {_MOST_INCLUDED} files")
+        file = main.parent / node.get("file", "")
+        included = read_included(file, within)
+        _include(included, main, (*within, file.resolve()), number)
+        for part in included.iter():
+            part.line = 0  # type: ignore[attr-defined]
+        owner[index : index + 1] = list(included)
 
 
 def _apply_defaults(root: Element) -> None:
@@ -113,75 +126,27 @@ def _apply_defaults(root: Element) -> None:
     apply(root, "main")
 
 
-def remove_geometry(root: Element, collides: bool) -> None:
-    """Removes geometry from which no mass is computed: what is only drawn, or also collisions."""
-    always = _compiler(root).get("inertiafromgeom") == "true"
-    for body in [*root.iter("body"), *root.iter("worldbody")]:
-        if body.tag == "worldbody" or (body.find("inertial") is not None and not always):
-            for geom in body.findall("geom"):
-                if collides or not _collides(geom):
-                    body.remove(geom)
-    for contact in root.findall("contact") if collides else ():
-        root.remove(contact)
-    named = {geom.get("mesh", "") for geom in root.iter("geom")}
-    for asset in root.iterfind("asset"):
-        for mesh in asset.findall("mesh"):
-            if mesh.get("name", Path(mesh.get("file", "")).stem) not in named:
-                asset.remove(mesh)
+def compiler(root: Element) -> dict[str, str]:
+    """The options of the compiler."""
+    return {key: value for one in root.iterfind("compiler") for key, value in one.items()}
 
 
-def mesh_files(root: Element, file: Path) -> Iterator[tuple[Element, Path]]:
-    """The meshes of a file with their names, and their files."""
-    compiler = _compiler(root)
-    folder = file.resolve().parent / compiler.get("meshdir", compiler.get("assetdir", ""))
-    for mesh in root.iterfind("asset/mesh"):
-        if name := mesh.get("file", ""):
-            mesh.set("name", mesh.get("name", Path(name).stem))
-            yield mesh, folder / name
+def weighs_by_geometry(root: Element) -> bool:
+    """Whether masses are those of the geometry, also where a body has an <inertial>."""
+    return compiler(root).get("inertiafromgeom") == "true"
 
 
-def colliding_meshes(root: Element) -> set[str]:
-    """The names of the meshes that are collisions."""
-    return {geom.get("mesh", "") for geom in root.iter("geom") if _collides(geom)}
+def collides(geom: Element) -> bool:
+    """Whether a geometry collides, and is not only drawn."""
+    return {geom.get("contype", "1"), geom.get("conaffinity", "1")} != {"0"}
 
 
-def remove_shapes(root: Element, refused: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """Removes meshes that cannot be read, and shapes that have one or are of size 0."""
-    shells = set()
-    for asset in root.iterfind("asset"):
-        for mesh in asset.findall("mesh"):
-            shells |= {mesh.get("name", "")} if mesh.attrib.pop("inertia", "") == "shell" else set()
-            if mesh.get("name", "") in refused:
-                asset.remove(mesh)
-    always = _compiler(root).get("inertiafromgeom") == "true"
-    movable = {body for world in root.iter("worldbody") for body in _movable(world)}
-    bodies, empty = list[str](), list[str]()
-    for body in [*root.iter("body"), *root.iter("worldbody")]:
-        has_mass = body in movable and (always or body.find("inertial") is None)
-        for geom in body.findall("geom"):
-            name, form = body.get("name", ""), geom.get("mesh", "")
-            weighs = has_mass and number_in(geom.get("mass", "1")) != 0.0
-            if weighs and (form in refused or form in shells):
-                raise ModelError(
-                    f"body '{name}' has its mass from the mesh '{refused.get(form, form)}', which "
-                    "Drake cannot read, or not as a shell; give the body an <inertial>, or the "
-                    "mesh as .obj, or let trimesh read it, by pip install 'drake_dae[meshes]'"
-                )
-            is_empty = "mesh" not in geom.attrib and geom.get("type", "sphere") != "plane"
-            size = number_in((geom.get("size", "").split() or ["1"])[0])
-            if form in refused or (is_empty and size == 0.0):
-                (bodies if form in refused else empty).append(name)
-                body.remove(geom)
-    return bodies, empty
-
-
-def _movable(body: Element, moves: bool = False) -> Iterator[Element]:
-    """The bodies in an element that joints can move."""
-    for child in body.iterfind("body"):
-        has_joint = child.find("joint") is not None or child.find("freejoint") is not None
-        if moves or has_joint:
-            yield child
-        yield from _movable(child, moves or has_joint)
+def bodies(owner: Element, moves: bool = False) -> Iterator[tuple[Element, bool]]:
+    """The bodies of a world, itself the first, and whether joints can move them."""
+    yield owner, moves
+    for body in owner.iterfind("body"):
+        has_joint = body.find("joint") is not None or body.find("freejoint") is not None
+        yield from bodies(body, moves or has_joint)
 
 
 def armatures(root: Element) -> Iterator[tuple[str, float]]:

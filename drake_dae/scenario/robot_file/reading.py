@@ -1,7 +1,7 @@
 """Reads a robot's files into a MultibodyPlant, and into links of the library."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 from pydrake.geometry import Box, SceneGraph
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import (
     FlattenModelDirectives,
     LoadModelDirectives,
@@ -18,17 +18,13 @@ from pydrake.multibody.parsing import (
     ProcessModelDirectives,
 )
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    ModelInstanceIndex,
-    QuaternionFloatingJoint,
-    RpyFloatingJoint,
-)
+from pydrake.multibody.tree import ModelInstanceIndex, QuaternionFloatingJoint, RpyFloatingJoint
 
-from drake_dae.errors import DrakeDaeError, GeometryWarning, ModelError, RobotFileWarning
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import Constraint, MultibodyExpressions, joint_names, plant_constraints
 from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.changes import (
+    CutJoint,
     add_payloads,
     change_robot,
     cut_loops,
@@ -59,30 +55,11 @@ _MASSLESS = 1e-12
 
 
 @at("robot.file")
-def add_robot(
-    robot: Robot,
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    payloads: Sequence[Payload] = (),
-) -> None:
-    """Adds the robot of a scenario to a plant that is not finalized."""
-    _, mender = read_robot(robot, scene_graph, plant=plant)
-    with drake_errors():
-        change_robot(robot, plant, mender)
-    add_payloads("plant.payloads", payloads, plant)
-    cut_loops(plant, mender)
-
-
-@at("robot.file")
 def robot_links(
     robot: Robot, scene_graph: SceneGraph, payloads: Sequence[Payload] = (), drawn: bool = True
 ) -> RobotLinks:
     """The links of a scenario's robot, and its loop-closing joints as constraints."""
-    plant, mender = read_robot(robot, scene_graph, drawn)
-    with drake_errors():
-        change_robot(robot, plant, mender)
-        add_payloads("plant.payloads", payloads, plant)
-        cuts = cut_loops(plant, mender)
+    plant, cuts = read_robot(robot, None, scene_graph, payloads, drawn)
     finalize(plant)
     for joint in joints_of(plant):
         if isinstance(joint, QuaternionFloatingJoint):
@@ -113,55 +90,55 @@ def finalize(plant: MultibodyPlant) -> None:
 def _check_mass(plant: MultibodyPlant) -> None:
     """Checks that each joint moves a mass; otherwise its acceleration is not determined."""
     context = plant.CreateDefaultContext()
-    default, random = plant.GetPositions(context), np.random.default_rng(0)
-    # A point mass at the end of a straight arm makes M(q) singular in that configuration only.
-    for step in (np.zeros_like(default), *random.uniform(-1.0, 1.0, (3, default.size))):
-        plant.SetPositions(context, default + step)
-        values, modes = np.linalg.eigh(plant.CalcMassMatrix(context))
-        null = modes[:, values <= _MASSLESS * values[-1]]
-        if not null.size:
-            return
+    # Some masses do not move in some configurations, as one at the end of a straight arm.
+    step = np.random.default_rng(0).uniform(-1.0, 1.0, plant.num_positions())
+    plant.SetPositions(context, plant.GetPositions(context) + step)
+    values, modes = np.linalg.eigh(plant.CalcMassMatrix(context))
+    null = modes[:, values <= _MASSLESS * np.max(values, initial=0.0)]
     massless = {}
     for name, joint in joint_names(plant).items():
         velocities = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
         if np.any(np.abs(null[velocities]) > 0.1):
             massless[name] = joint.child_body().name()
-    raise ModelError(
-        f"joints that move no mass: {', '.join(massless)}. Links without it, which no force can "
-        f"move: {', '.join(massless.values())}; give them <inertial> with mass and inertia, or "
-        "lock the joints by robot.locked"
-    )
+    if massless:
+        raise ModelError(
+            f"joints that move no mass: {', '.join(massless)}. Links without it, which no force "
+            f"can move: {', '.join(massless.values())}; give them <inertial> with mass and "
+            "inertia, or lock the joints by robot.locked"
+        )
 
 
 def read_robot(
     robot: Robot,
-    scene_graph: SceneGraph | None = None,
-    drawn: bool = True,
     plant: MultibodyPlant | None = None,
-) -> tuple[MultibodyPlant, Mender]:
-    """Reads the models of the robot's file into a plant that is not finalized."""
+    scene_graph: SceneGraph | None = None,
+    payloads: Sequence[Payload] = (),
+    drawn: bool = True,
+) -> tuple[MultibodyPlant, list[CutJoint]]:
+    """Reads a robot into a plant that is not finalized, with the changes of the scenario.
+
+    Joints that close loops are cut.
+    """
     if plant is None:
         plant = MultibodyPlant(0.0)  # In continuous time, as (37).
         if scene_graph is not None:
             plant.RegisterAsSourceForSceneGraph(scene_graph)
+    shapes = ["read", *["drawn"] * drawn] if scene_graph is not None else []
     parser = Parser(plant)
     files = RobotFiles(robot, parser.package_map())
     with TemporaryDirectory() as folder:
-        mender = Mender(files, robot.leave_out, robot.actuators is None)
-        mender.has_geometry, mender.drawn = scene_graph is not None, drawn
-        mender.folder = Path(folder).resolve()
+        mender = Mender(files, robot, Path(folder).resolve(), shapes)
         with drake_errors(mender.originals):
             models = _mended(robot, files, mender)
             if mender.lost:
-                raise ModelError(_told(mender))
+                raise ModelError(_told(mender.lost))
             if isinstance(models, Path):
                 parser.AddModels(str(models))
             else:
                 ProcessModelDirectives(models, parser)
             _add_floating_joints(plant, mender)
-    for category, found in ((GeometryWarning, mender.omitted), (RobotFileWarning, mender.changed)):
-        for kind, items in found.items():
-            warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
+    for (category, kind), items in mender.told.items():
+        warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
     for model, name in sorted(mender.crossed):
         body = plant.GetBodyByName(name, *_instance(plant, model)) if name else plant.world_body()
         for axis in range(3):
@@ -175,13 +152,16 @@ def read_robot(
                 joint.set_position_limits(-unlimited, unlimited)
             if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
                 joint.set_velocity_limits(-unlimited, unlimited)
-    return plant, mender
+    with drake_errors():
+        change_robot(robot, plant, mender.joints)
+        add_payloads("plant.payloads", payloads, plant)
+        return plant, cut_loops(plant, mender.joints["parent"])
 
 
 def needs_of(robot: Robot) -> tuple[list[str], list[str]]:
     """The packages that a robot's file names and that are not found, and what is lost of it."""
     files = RobotFiles(robot, Parser(MultibodyPlant(0.0)).package_map())
-    mender = Mender(files, robot.leave_out, robot.actuators is None)
+    mender = Mender(files, robot, None, ["read"])
     with drake_errors():
         _mended(robot, files, mender)
     return list(files.missing), list(mender.lost)
@@ -229,13 +209,13 @@ def drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Itera
         raise ModelError(text) from None
 
 
-def _told(mender: Mender) -> str:
+def _told(lost: Mapping[str, list[str]]) -> str:
     """The message for what Drake does not read of the files."""
-    text = "; ".join(f"{part} ({_listed(places)})" for part, places in mender.lost.items())
-    ways = [f"leave_out: [{', '.join(mender.lost)}] under robot"]
-    ways += ["it takes the nearest possible moments of inertia"] if "inertia" in mender.lost else []
-    ways += [hint for word, hint in _REMEDIES.items() if any(word in part for part in mender.lost)]
-    if any(part.startswith(DRIVES) for part in mender.lost):
+    text = "; ".join(f"{part} ({_listed(places)})" for part, places in lost.items())
+    ways = [f"leave_out: [{', '.join(lost)}] under robot"]
+    ways += ["it takes the nearest possible moments of inertia"] if "inertia" in lost else []
+    ways += [hint for word, hint in _REMEDIES.items() if any(word in part for part in lost)]
+    if any(part.startswith(DRIVES) for part in lost):
         ways.append("or name the driven joints under robot.actuators")
     return (
         f"the equations would lack what Drake does not read of the file: {text}. Mend it, or write "
@@ -243,7 +223,7 @@ def _told(mender: Mender) -> str:
     )
 
 
-def _listed(items: list[str], most: int = 8) -> str:
+def _listed(items: Iterable[str], most: int = 8) -> str:
     every = list(dict.fromkeys(items))
     more = f" and {len(every) - most} more" if len(every) > most else ""
     return ", ".join(every[:most]) + more
@@ -258,19 +238,17 @@ def _add_floating_joints(plant: MultibodyPlant, mender: Mender) -> None:
 
     No constraint force keeps the length of a quaternion at 1.
     """
-    for model, name, parent, child, pose in mender.floating:
-        models, is_world = _instance(plant, model), parent == "world"
-        above = plant.world_body() if is_world else plant.GetBodyByName(parent, *models)
+    for model, name, child, origin in mender.floating:
+        models = _instance(plant, model)
         body = plant.GetBodyByName(child, *models)
         start = plant.GetDefaultFloatingBaseBodyPose(body)
-        origin = RigidTransform(RollPitchYaw(pose[3:]), pose[:3])
-        frame = plant.AddFrame(
-            FixedOffsetFrame(f"{name}_origin", above.body_frame(), origin, body.model_instance())
-        )
+        is_world = origin == "world"
+        frame = plant.world_frame() if is_world else plant.GetFrameByName(origin, *models)
         joint = plant.AddJoint(RpyFloatingJoint(name, frame, body.body_frame()))
         if is_world:
             joint.SetDefaultPose(start)
-        mender.changed[
+        kind = (
             "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place "
             "of a quaternion, and must not pitch by 90 degrees"
-        ].append(f"'{name}'")
+        )
+        mender.tell(kind, f"'{name}'")

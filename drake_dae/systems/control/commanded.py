@@ -38,23 +38,9 @@ class CommandedReferences(ReferenceGenerator):
 
     and y_mu is added to the reference. Its derivatives up to mu are sums of y_0, ..., y_mu. A lag
     is a mean with positive weights, so that y_mu does not overshoot, |y_mu'| <= V, and
-    |y_mu^(k)| <= (2 w)^(k-1) V. The state are the lags.
-
-    Output port:
-        reference: R of (28) for references + changes, shape (sum (mu_i + 1),).
-
-    Args:
-        references: The references, in the order of the outputs.
-        degrees: The degrees mu_1, ..., mu_p.
-        signals: Names and units of the outputs.
-        depth: The least number of lags, for another block with the same commands and more
-            derivatives.
-
-    Attributes:
-        commands: Names and units of the commands.
-
-    Raises:
-        ReferenceSignalError: As of `ReferenceGenerator`; or a reference has parameters.
+    |y_mu^(k)| <= (2 w)^(k-1) V. The state are the lags. `depth` is their least number, for another
+    block with the same commands and more derivatives; `signals` are names and units of the outputs,
+    and so of the commands.
     """
 
     __slots__ = TracedSystem.__slots__

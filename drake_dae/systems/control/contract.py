@@ -38,19 +38,11 @@ Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
 @checked(ModelError)
 @dataclass(frozen=True)
 class PhaseChange:
-    """The start of a phase of a task.
+    """The start of a phase of a task, with time, force, distance and its rate in SI units.
 
-    Attributes:
-        time: The time, in s.
-        phase: The name of the phase that begins, "Approach" for example; "done" if the task is
-            done, "held" if the robot rests for another reason.
-        place: Its index in the task, from 0; the number of phases when done or held.
-        in_contact: Whether the law for contact is active from then on.
-        reason: Why the previous phase ended.
-        force: The measured force of the contact then, in N.
-        distance: The distance by the law's model then, in m.
-        distance_rate: Its derivative, in m/s.
-        failed: Whether the phase before failed; of "held", whether the task was given up.
+    `phase` is its name, or "done" or "held" where the robot rests, and `place` its index in the
+    task. `in_contact` says whether the law for contact is active from then on, `reason` why the
+    phase before ended, and `failed` whether it failed; of "held", whether the task was given up.
     """
 
     time: float
@@ -131,62 +123,34 @@ class Controller(System):
         return self.law.system.parameter_values
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
-        """Changes the gains of the law in a context.
-
-        Raises:
-            GainError: The gains do not fit.
-            ModelError: The gains of this controller are fixed.
-        """
+        """Changes the gains of the law in a context, or refuses to."""
         raise ModelError(f"the gains of a {type(self).__name__} are fixed when it is made")
 
     def check_plant(self, plant: Plant) -> None:
-        """Refuses a plant that does not fit the controller.
-
-        Raises:
-            WiringError: The plant does not fit; the message has the reason.
-        """
+        """Refuses a plant that does not fit, by a WiringError."""
         check_law(plant.dae, self.law)
 
-    def derived(
-        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
-    ) -> Derived:
-        """Derived signals of a record: desired outputs, errors and others.
-
-        Args:
-            context: The context of this system after the run, or None.
-            times: The times of the record, in s, shape (k,).
-            values: The other signals of the record, and "parameters": those of the law's system as
-                the plant has them; one row for each time. Without a context they may be those of
-                several runs, shape (runs, k, size), and so are the derived ones.
-        """
+    def derived(self, values: Mapping[str, FloatArray]) -> Derived:
+        """Desired outputs, errors and others from the other signals of a record."""
         return {}
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:
         """The current outputs and their desired values, with their names; None if unknown.
 
-        Args:
-            context: The context of this system.
-            shown: Name of a signal of the plant, such as "controlled_output" -> its value.
+        `shown` has the value of a signal of the plant, such as "controlled_output".
         """
-        if (reference := self.reference_now(context)) is None:
-            return None
-        law = self.law
-        return shown("controlled_output"), reference[law.layout.lowest], law.system.output_signals
-
-    def reference_now(self, context: Context) -> FloatArray | None:
-        """R from the wire or fixed value, or from references by time; None without any."""
         port = self.GetInputPort("reference") if self.HasInputPort("reference") else None
-        return port.Eval(context) if port is not None and port.HasValue(context) else None
+        if port is None or not port.HasValue(context):
+            return None
+        desired, law = port.Eval(context)[self.law.layout.lowest], self.law
+        return shown("controlled_output"), desired, law.system.output_signals
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        """The predicted tracking error, one row for each time.
+        """The predicted tracking error, one row for each time of a record with these values.
 
-        Args:
-            times: The times of the record, in s, shape (k,).
-            values: The signals of the record.
-            parameters: Those of the law's model at its start.
+        `parameters` are those of the law's model at its start.
         """
         raise NotImplementedError
 
@@ -196,31 +160,13 @@ class Controller(System):
 
 
 def check_law(dae: DaeSystem, law: TrackingLaw) -> None:
-    """Refuses a law for a system of another size than the plant's.
-
-    Args:
-        dae: The plant's system.
-        law: The law.
-
-    Raises:
-        WiringError: The sizes differ.
-    """
+    """Refuses a law for a system of another size than the plant's, by a WiringError."""
     remedy = "the law for the plant's system, TrackingLaw(plant.dae, ...), or for"
     check_same_sizes(dae, law.system, "law", f"{remedy} a model of the same structure")
 
 
 def check_same_sizes(dae: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:
-    """Refuses a law or model for a system of another size than the plant's.
-
-    Args:
-        dae: The plant's system.
-        other: The system that it is for.
-        what: The name of the wired part.
-        remedy: The remedy.
-
-    Raises:
-        WiringError: The sizes differ.
-    """
+    """Refuses a part for `other`, a system of another size than the plant's."""
     sizes = [(s.num_states, s.num_controls, s.num_constraints) for s in (dae, other)]
     if sizes[0] != sizes[1]:
         has, takes = ("{} states, {} controls and {} constraints".format(*size) for size in sizes)

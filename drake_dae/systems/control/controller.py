@@ -1,5 +1,6 @@
 """The tracking law as a LeafSystem."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -12,10 +13,9 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, vector
 from drake_dae.blocks.block import Block, Held, Requirement, where_finite
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
-from drake_dae.dae import FeedbackGains, GainDesign, Signal, TrackingLaw
-from drake_dae.errors import ModelError
+from drake_dae.dae import FeedbackGains, GainDesign, Signal, TrackingLaw, Verdict, ZeroDynamics
+from drake_dae.errors import ModelError, NonMinimumPhaseWarning
 from drake_dae.systems.control.contract import Controller, Derived
-from drake_dae.systems.control.non_minimum_phase import warn_of_zero_dynamics
 from drake_dae.systems.parameterized import ParameterizedSystem
 
 
@@ -82,7 +82,16 @@ class TrackingController(ParameterizedSystem, Controller):
             )
         if count and not sample_period >= 0.0:
             raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
-        warn_of_zero_dynamics(law, outputs)
+        if law.structure.zero_dynamics_dimension:
+            dynamics = ZeroDynamics(law.system, structure=law.structure)  # (35)
+            stability = dynamics.stability(law.structure.states[0], outputs=outputs)
+            if stability.verdict is Verdict.UNSTABLE:
+                warnings.warn(
+                    f"{law.system.name}: {stability.reason}. The outputs follow the reference "
+                    "while other states, or the control, grow without bound; choose other outputs",
+                    NonMinimumPhaseWarning,
+                    stacklevel=2,
+                )
         self.law, self.sample_period = law, sample_period if count else 0.0
         block = law_block(law, np.broadcast_to(largest, (count,)), self.sample_period)
         self.equations = law.system
@@ -105,21 +114,15 @@ class TrackingController(ParameterizedSystem, Controller):
             context.SetContinuousState(values)
 
     def set_gains(self, context: Context, gains: GainDesign | FeedbackGains) -> None:
-        """Changes the gains in a context.
-
-        Args:
-            context: The context of this system.
-            gains: A design such as `poles(-8.0)`, or finished gains.
+        """Changes the gains in a context: a design such as `poles(-8.0)`, or finished gains.
 
         Raises:
-            GainError: The gains do not fit, are not Hurwitz, or couple outputs that the law does
-                not.
+            GainError: They do not fit, are not Hurwitz, or couple outputs that the law does not.
         """
         values = self.law.all_parameters(self.parameters(context), gains)
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
     def all_parameters(self, context: Context) -> FloatArray:
-        """The parameters of the law's function: the model's at the context's time, and K."""
         self.check_context(context)
         return np.array(self._values(context))
 
@@ -128,9 +131,7 @@ class TrackingController(ParameterizedSystem, Controller):
         integral = self.law.integral
         return {"integral": integral.signals} if integral.outputs else {}
 
-    def derived(
-        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
-    ) -> Derived:
+    def derived(self, values: Mapping[str, FloatArray]) -> Derived:
         """`desired_output` r and `tracking_error` z - r (29), from "reference" and z."""
         law = self.law
         desired, signals = values["reference"][..., law.layout.lowest], law.system.output_signals
@@ -153,13 +154,7 @@ class TrackingController(ParameterizedSystem, Controller):
 
 
 def law_block(law: TrackingLaw, limits: FloatArray, sample_period: float) -> Block:
-    """The law (28) with the integrals of its errors, as a block; see `TrackingController`.
-
-    Args:
-        law: The law.
-        limits: The largest |integral| of each error, shape (k,).
-        sample_period: The sample period of integrals, in s; 0 for continuous integrals.
-    """
+    """The law (28) with the integrals of its errors, as a block; see `TrackingController`."""
     system, signals = law.system, law.integral.signals
     named = {"state": "estimated_state"}
     inputs = {named.get(name, name): symbol for name, symbol in law.inputs.items()}

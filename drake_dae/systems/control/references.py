@@ -2,12 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
+from math import factorial
 
 import casadi as ca
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
+from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, all_finite, numbers, unknown_name, vector
@@ -15,11 +20,10 @@ from drake_dae.blocks.block import TIME, Block, BlockFunction, Requirement, stac
 from drake_dae.blocks.failures import simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.dae import Signal
 from drake_dae.errors import DrakeDaeError, ReferenceSignalError
 from drake_dae.references import Reference, ReferenceRows
+from drake_dae.references.polynomials import PiecewisePolynomials
 from drake_dae.references.reference import with_degrees
-from drake_dae.systems.control.drake_references import TrajectoryReference
 from drake_dae.trace.functions import FailureKind
 
 
@@ -57,11 +61,6 @@ class ReferenceGenerator(TracedSystem):
         self._base = block  # Without commands.
         super().__init__(block, sees_steps=False)
 
-    @property
-    def further_signals(self) -> dict[str, tuple[Signal, ...]]:
-        """Name of an output port beside `reference` -> names and units, for a record."""
-        return {}
-
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s by the defaults of its parameters, shape (sum (mu_i + 1),)."""
         return self._at(time, self._base.default("parameters")).copy()
@@ -69,9 +68,7 @@ class ReferenceGenerator(TracedSystem):
     def along(self, times: ArrayLike, context: Context | None = None) -> FloatArray:
         """R(t) at many times in s, one row for each; nan without a value.
 
-        Args:
-            times: The times.
-            context: The block's context with the values of parameters; the defaults if None.
+        Its parameters are those of a context of the block; the defaults if None.
         """
         moments = vector("times", times, None, ReferenceSignalError)
         values = self._base.default("parameters")
@@ -98,38 +95,24 @@ class ReferenceGenerator(TracedSystem):
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
         """Changes a parameter of its references in a context.
 
-        Args:
-            context: The context of this system.
-            name: Its name.
-            value: The new value, shape (k,), or a number for all entries.
+        `value` has shape (k,), or is a number for all entries.
 
         Raises:
             ReferenceSignalError: There is no such parameter, or the value does not fit.
         """
         self.check_context(context)
-        if name not in self.reference_parameters:
-            error = unknown_name("parameter of references", name, self.reference_parameters)
-            raise ReferenceSignalError(error)
-        size = self.reference_parameters[name].size
+        sizes = {known: default.size for known, default in self.reference_parameters.items()}
+        if name not in sizes:
+            raise ReferenceSignalError(unknown_name("parameter of references", name, sizes))
         given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
-        if given.shape not in ((), (size,)) or not all_finite(given):
+        if given.shape not in ((), (sizes[name],)) or not all_finite(given):
             raise ReferenceSignalError(
-                f"parameter '{name}' takes {size} finite numbers, got {value!r}"
+                f"parameter '{name}' takes {sizes[name]} finite numbers, got {value!r}"
             )
         values = context.get_numeric_parameter(0).CopyToVector()
-        values[self.places(name)] = given
+        first = sum([*sizes.values()][: [*sizes].index(name)])
+        values[first : first + sizes[name]] = given
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
-
-    def places(self, name: str) -> slice:
-        """Returns the entries of numeric parameter 0 that belong to a named parameter."""
-        first = 0
-        for known, value in self.reference_parameters.items():
-            if known == name:
-                return slice(first, first + value.size)
-            first += value.size
-        raise ReferenceSignalError(
-            unknown_name("parameter of references", name, self.reference_parameters)
-        )
 
 
 def reference_block(
@@ -137,11 +120,7 @@ def reference_block(
     degrees: Sequence[int],
     parameters: Mapping[str, FloatArray],
 ) -> Block:
-    """R(t) with its derivatives, as a block; see `ReferenceGenerator`.
-
-    Raises:
-        ReferenceSignalError: The references do not cover the outputs, or are not smooth enough.
-    """
+    """R(t) with its derivatives, as a block; see `ReferenceGenerator`."""
     covered = sum(reference.size for reference in references)
     if covered != len(degrees):
         raise ReferenceSignalError(
@@ -149,7 +128,15 @@ def reference_block(
         )
     symbols = {name: ca.SX.sym(name, value.size) for name, value in parameters.items()}
     moved = [reference.with_parameters(symbols) for reference in references]
-    ranges = [r for each in references if (r := time_range(each)) is not None]
+    ranges = []
+    for each in map(_whole, references):
+        if isinstance(each, TrajectoryReference):
+            first, last = each.trajectory.start_time(), each.trajectory.end_time()
+            reason = (
+                f"the reference Trajectory covers {first:g} to {last:g} s; extend it over the "
+                "whole simulation"
+            )
+            ranges.append(Requirement(each.margin(TIME), reason, FailureKind.OUTSIDE))
     return Block(
         "reference",
         outputs={"reference": traced_references(moved, degrees, TIME)},
@@ -160,11 +147,7 @@ def reference_block(
 
 
 def common_parameters(references: Sequence[Reference]) -> dict[str, FloatArray]:
-    """The parameters of all references.
-
-    Raises:
-        ReferenceSignalError: Two have different values for one name.
-    """
+    """The parameters of all references; two with one name must have one value."""
     common: dict[str, FloatArray] = {}
     for reference in references:
         for name, value in reference.parameters.items():
@@ -179,33 +162,114 @@ def common_parameters(references: Sequence[Reference]) -> dict[str, FloatArray]:
 def traced_references(
     references: Sequence[Reference], degrees: Sequence[int], time: ca.SX
 ) -> ca.SX:
-    """R(t) of references at a symbolic time, shape (sum (mu_i + 1), 1).
-
-    Raises:
-        ReferenceSignalError: One is no expression of time, or not smooth enough.
-    """
+    """R(t) of references at a symbolic time, shape (sum (mu_i + 1), 1)."""
     rows = [ca.SX(0, 1)]
     for reference, its_degrees in with_degrees(references, degrees):
         row = reference.expression(its_degrees, time)
         if row is None:
-            whole = reference.reference if isinstance(reference, ReferenceRows) else reference
             raise ReferenceSignalError(
-                f"a {type(whole).__name__} is no expression of time: define its `expression`, or "
-                "take an ExpressionReference, or wire a system of your own to the controller's "
-                "port 'reference'"
+                f"a {type(_whole(reference)).__name__} is no expression of time: define its "
+                "`expression`, or take an ExpressionReference, or wire a system of your own to the "
+                "controller's port 'reference'"
             )
         rows.append(row)
     return ca.vertcat(*rows)
 
 
-def time_range(reference: Reference) -> Requirement | None:
-    """Within which times a Drake Trajectory has values; None for other references."""
-    whole = reference.reference if isinstance(reference, ReferenceRows) else reference
-    if not isinstance(whole, TrajectoryReference):
-        return None
-    first, last = whole.trajectory.start_time(), whole.trajectory.end_time()
-    reason = (
-        f"the reference Trajectory covers {first:g} to {last:g} s; extend it over the whole "
-        "simulation"
-    )
-    return Requirement(whole.margin(TIME), reason, FailureKind.OUTSIDE)
+def _whole(reference: Reference) -> Reference:
+    """The reference of which this one may be some rows."""
+    return reference.reference if isinstance(reference, ReferenceRows) else reference
+
+
+@checked(ReferenceSignalError)
+@dataclass(frozen=True, eq=False)
+class TrajectoryReference(Reference):
+    """A reference that is a Drake PiecewisePolynomial or BsplineTrajectory, with its derivatives.
+
+    During a run a time outside its range is a SimulationError; Drake would clip it in silence.
+
+    Attributes:
+        trajectory: The trajectory, a column of shape (k, 1).
+
+    Raises:
+        ReferenceSignalError: The Trajectory is another one, or no column; or, where the reference
+            is used, a derivative below the highest one jumps at a break.
+    """
+
+    trajectory: Trajectory
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.trajectory, PiecewisePolynomial | BsplineTrajectory):
+            raise ReferenceSignalError(
+                "a reference Trajectory must be a PiecewisePolynomial or a BsplineTrajectory, got "
+                f"a {type(self.trajectory).__name__}; sample it into one of these"
+            )
+        if self.trajectory.cols() != 1:
+            raise ReferenceSignalError(
+                "a reference Trajectory must be a column, this one is "
+                f"{self.trajectory.rows()} x {self.trajectory.cols()}"
+            )
+
+    @property
+    def size(self) -> int:
+        return int(self.trajectory.rows())
+
+    def expression(self, degrees: Sequence[int], time: ca.SX) -> ca.SX:
+        pieces = self._pieces
+        table = [pieces.expression(time)]
+        for order in range(max(degrees)):
+            self._check_breaks(pieces, order, degrees)
+            pieces = _derivative(pieces)
+            table.append(pieces.expression(time))
+        rows = [table[k][i] for i, degree in enumerate(degrees) for k in range(degree + 1)]
+        return ca.vertcat(*rows) + ca.if_else(self.margin(time) >= 0.0, 0.0, np.nan)
+
+    def margin(self, time: ca.SX) -> ca.SX:
+        """The distance of a time from the ends of the trajectory, in s; negative outside."""
+        first, last = self.trajectory.start_time(), self.trajectory.end_time()
+        return ca.fmin(time - first, last - time) + 1e-9 * max(1.0, abs(last))
+
+    @property
+    def _pieces(self) -> PiecewisePolynomials:
+        """The polynomials of its segments, from their derivatives in the middle of each."""
+        path, rows = self.trajectory, range(self.size)
+        if isinstance(path, PiecewisePolynomial):
+            breaks = np.array(path.get_segment_times())
+            segments = range(path.get_number_of_segments())
+            degree = max(path.getSegmentPolynomialDegree(i, row) for i in segments for row in rows)
+        else:
+            breaks, degree = np.unique(path.basis().knots()), path.basis().order() - 1
+            breaks = breaks[(breaks >= path.start_time()) & (breaks <= path.end_time())]
+        factors = np.zeros((breaks.size - 1, self.size, degree + 1))
+        for i, (begin, end) in enumerate(pairwise(breaks)):
+            middle, width = 0.5 * (begin + end), end - begin
+            taylor = [path.value(middle)[:, 0]]
+            taylor += [path.EvalDerivative(middle, k)[:, 0] for k in range(1, degree + 1)]
+            shares = Polynomial([-0.5 * width, width])  # The time from the middle.
+            for k, values in enumerate(taylor):
+                power = np.asarray((shares**k).coef, float) / factorial(k)
+                factors[i, :, : power.size] += np.outer(values, power)
+        return PiecewisePolynomials(breaks, factors)
+
+    def _check_breaks(
+        self, pieces: PiecewisePolynomials, order: int, degrees: Sequence[int]
+    ) -> None:
+        before = pieces.factors[:-1].sum(axis=2)
+        jumps = pieces.factors[1:, :, 0] - before
+        for row, degree in enumerate(degrees):
+            bad = np.abs(jumps[:, row]) > 1e-6 * (1.0 + np.abs(before[:, row]))
+            if order < degree and bad.any():
+                i = int(np.argmax(bad))
+                raise ReferenceSignalError(
+                    f"derivative {order} of row {row} of the reference Trajectory jumps by "
+                    f"{jumps[i, row]:.3g} at t = {pieces.breaks[i + 1]:g} s, but the law needs a "
+                    f"reference with {degree} derivatives; use a smoother trajectory"
+                )
+
+
+def _derivative(pieces: PiecewisePolynomials) -> PiecewisePolynomials:
+    powers = np.arange(pieces.factors.shape[2])
+    factors = (pieces.factors * powers)[:, :, 1:] / np.diff(pieces.breaks)[:, None, None]
+    if not factors.shape[2]:
+        factors = np.zeros((*factors.shape[:2], 1))
+    return PiecewisePolynomials(pieces.breaks, factors)

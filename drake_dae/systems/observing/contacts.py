@@ -41,15 +41,10 @@ LITTLE = 1e-9
 class ContactTerms:
     """The directions of friction and constraints at a state.
 
-    Attributes:
-        friction: C, the friction force per unit of each coefficient, shape (k, c).
-        metric: W of `Observation`, as a function of columns.
-        free: Q of `Observation`.
-        planes: T of `Observation`, of each contact.
-        held: T of the contacts that stick, side by side; zero for others.
-        velocity: The velocities, shape (k, 1).
-        slides, sticks: 1 for each contact that certainly slides, or may stick, shape (c,).
-        valid: Finite if all of these are valid.
+    C is the friction force per unit of each coefficient, shape (k, c); W, Q and T are those of
+    `Observation`. `held` are the planes of contacts that stick, side by side, zero for others;
+    `slides` and `sticks` are 1 for each contact that certainly slides, or may stick, shape (c,);
+    `valid` is finite if all of these are valid.
     """
 
     friction: ca.SX
@@ -66,12 +61,8 @@ class ContactTerms:
 class Contacts:
     """The contacts of a robot at a sample, as expressions.
 
-    Args:
-        observation, observing: The observed functions, the rates and thresholds.
-        period, delay: T and `control_delay`, in s.
-        is_ideal: Whether friction is that of the model at small speeds, too.
-        deviations: The standard deviations of measured positions, shape (k,).
-        reference, hold: The symbols of these ports.
+    `period` and `delay` are T and the `control_delay`; an ideal contact has the friction of the
+    model at small speeds, too; `deviations` are those of measured positions, shape (k,).
     """
 
     def __init__(
@@ -199,9 +190,8 @@ class Contacts:
         the coefficient less by k t than it has risen to. From there on the gains along the friction
         are those of the least squares of all positions since it broke away, a parabola.
 
-        Returns:
-            The change of mu, the samples of sliding, the change of the state, and the samples in
-            which friction explains all of r along it.
+        Returns the change of mu, the samples of sliding, the change of the state, and the samples
+        in which friction explains all of r along it.
         """
         T = self._period
         least = self._least_speed * T / CLEAR

@@ -1,6 +1,6 @@
 """The rates and thresholds of an observer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
@@ -10,23 +10,20 @@ from drake_dae.errors import ModelError
 @checked(ModelError)
 @dataclass(frozen=True)
 class Observing:
-    """The rates of a `StateEstimator`, and its thresholds for friction.
+    """The rates of a `StateEstimator` in 1/s, and its thresholds for friction.
 
     Attributes:
-        rate: k_o in 1/s, the rate of disturbances along the free directions.
-        force_rate: k_n in 1/s, the rate of disturbances along the constrained directions, which
-            change only constraint forces; None for k_o.
-        state_rate: w in 1/s, the rate at which a `StateEstimator` corrects the state by measured
-            positions; None for the state as it is measured.
-        friction_rate: k_f in 1/s, the rate at which coefficients of friction are identified.
+        rate: k_o, the rate of disturbances along the free directions.
+        force_rate: k_n, the rate of disturbances along the constrained directions, which change
+            only constraint forces; None for k_o.
+        state_rate: w, the rate at which the state is corrected by measured positions; None for the
+            state as it is measured.
+        friction_rate: k_f, the rate at which coefficients of friction are identified.
         largest_friction: The upper bound of coefficients of friction.
         least_speed: The speed in m/s below which a contact may stick, so that its friction is not
             identified.
         least_force: The force in N below which a contact counts as lost: its coefficient and
             integrals are not updated.
-
-    Raises:
-        ModelError: A number is not positive.
     """
 
     rate: float
@@ -38,8 +35,6 @@ class Observing:
     state_rate: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("rate", "friction_rate", "largest_friction", "least_speed", "least_force"):
-            positive(name, getattr(self, name))
-        for name in ("force_rate", "state_rate"):
-            if getattr(self, name) is not None:
-                positive(name, getattr(self, name))
+        for each in fields(Observing):  # A form may have more.
+            if (value := getattr(self, each.name)) is not None:
+                positive(each.name, value)

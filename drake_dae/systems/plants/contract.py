@@ -40,9 +40,8 @@ class Plant(System):
     2. System. `dae` is the system, and `structure` its structure. `model` is its robot, if it is
        one; then the output port `link_state` is (q, v) of its links.
     3. State. `time_step` is the time between its steps in s, 0 for a continuous plant. `state`
-       returns x, shape (n,). A discrete plant uses at each step the control of that instant.
-       `projects` says whether the state is projected onto N* after each step; a record then has the
-       state before the projection.
+       returns x, shape (n,). A discrete plant uses at each step the control of that instant. A
+       record of a plant that projects its state has the state before the projection.
     4. Records. `further_signals` are the output ports in a record besides those of rule 1, with
        names and units of their entries.
     5. Exogenous signals. Exogenous parameters come through an input port `exogenous`, stacked by
@@ -67,7 +66,6 @@ class Plant(System):
     time_step: float = 0.0
     exogenous_layout: DerivativeLayout = DerivativeLayout(())
     exogenous_places: list[int] = NOWHERE
-    projects: bool = False
     is_ideal: bool = True
 
     @property
@@ -97,12 +95,7 @@ class Plant(System):
         return coefficients
 
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
-        """Changes a parameter in a context.
-
-        Raises:
-            ModelError: No parameter has that name, the value does not fit, or this plant has fixed
-                numbers.
-        """
+        """Changes a parameter in a context, or refuses to."""
         self.dae.parameter_slice(name)
         raise ModelError(
             f"{self.dae.name}: the numbers of a {type(self).__name__} are fixed when it is made; "
@@ -115,13 +108,7 @@ class Plant(System):
         return context.get_continuous_state_vector().CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets the state x in a context as it is given, shape (n,).
-
-        A run is refused from a state that is not on N*.
-
-        Raises:
-            ModelError: The shape is wrong, or the context is that of another system.
-        """
+        """Sets the state x in a context as it is given, shape (n,), also off N*."""
         check_context(self, context)
         context.SetContinuousState(self.dae.state_vector(state))
 
@@ -140,57 +127,47 @@ class Plant(System):
         Raises:
             InconsistentStateError: None is found near the guess, or none with these states fixed.
         """
-        state = self._consistent(guess, fixed, self.current_parameters(context))
-        self.set_state(context, state)
-        return state
-
-    def _consistent(
-        self,
-        guess: ArrayLike | Mapping[str, float],
-        fixed: Sequence[str],
-        parameters: FloatArray,
-    ) -> FloatArray:
-        """The state on N* next to a guess, as for `set_consistent_state`."""
+        parameters = self.current_parameters(context)
         if isinstance(guess, Mapping):
             names = [signal.name for signal in self.dae.state_signals]
             start, fixed = self.dae.nominal_state.copy(), [*fixed, *guess]
             for name in set(guess) & set(names):  # The manifold refuses others.
                 start[names.index(name)] = guess[name]
             guess = start
-        return self.structure.manifold.settle(guess, parameters, fixed)
+        state = self.structure.manifold.settle(guess, parameters, fixed)
+        self.check_start(state, parameters)
+        self.set_state(context, state)
+        return state
+
+    def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
+        """Refuses a start of a run that is not valid, for these values of all parameters."""
 
     @property
     def port_signals(self) -> dict[str, tuple[Signal, ...]]:
         """Name of an output port of rule 1 -> names and units of its entries."""
-        return {
-            "state": tuple(self.dae.state_signals),
-            "constraint_force": tuple(self.dae.force_signals),
-            "constraint_residual": tuple(self.structure.manifold.residual_signals),
-            "controlled_output": tuple(self.dae.output_signals),
-        }
+        return port_signals(self.structure)
 
     def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
-        """Adds the plant's own part of the Meshcat view, with its wires.
-
-        Args:
-            builder: The builder of the diagram, with the plant in it.
-            meshcat: The Meshcat to draw in.
-        """
+        """Adds the plant's own part of the Meshcat view, with its wires, to its diagram."""
 
     def robot(self, needed_by: str) -> RobotModel:
-        """The robot.
-
-        Args:
-            needed_by: The feature that needs one, in words: "an animation".
-
-        Raises:
-            ModelError: The plant is not a robot.
-        """
+        """The robot, or a refusal by what needs one, in words: "an animation"."""
         if self.model is None:
             raise ModelError(
                 f"{needed_by} needs a robot, such as a RobotPlant, and '{self.dae.name}' is none"
             )
         return self.model
+
+
+def port_signals(structure: ConstraintStructure) -> dict[str, tuple[Signal, ...]]:
+    """Names and units of the output ports that every plant has."""
+    dae = structure.system
+    return {
+        "state": tuple(dae.state_signals),
+        "constraint_force": tuple(dae.force_signals),
+        "constraint_residual": tuple(structure.manifold.residual_signals),
+        "controlled_output": tuple(dae.output_signals),
+    }
 
 
 def plants_in(diagram: Diagram) -> list[Plant]:

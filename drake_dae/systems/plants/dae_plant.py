@@ -1,10 +1,9 @@
 """Any DaeSystem as a LeafSystem."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, EventStatus
 
 from drake_dae.arguments import checked
@@ -17,11 +16,11 @@ from drake_dae.blocks.failures import (
     singular_configuration,
 )
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, weakly
-from drake_dae.dae import ConstraintStructure, DaeSystem, Manifold, constraint_structure_of
+from drake_dae.dae import ConstraintStructure, DaeSystem, constraint_structure_of
 from drake_dae.dae.redundancy import manifold_of_left_out
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.contract import Plant, port_signals
 
 
 @checked(ModelError)
@@ -57,7 +56,6 @@ class DaePlant(ParameterizedSystem, Plant):
 
     Attributes:
         structure: The structure.
-        projects: Whether the state is projected onto N* after each step.
 
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
@@ -81,22 +79,10 @@ class DaePlant(ParameterizedSystem, Plant):
 
     def _start(self, structure: ConstraintStructure, block: Block) -> None:
         """Makes the system of its block."""
-        system, values = structure.system, (*block.outputs.values(), block.derivative)
-        self.equations = system
-        self.structure, self._left_out = structure, manifold_of_left_out(structure.system)
-        self.projects = block.projection is not None
-        super().__init__(system, block, system.exogenous.degrees(*values))
+        self.structure, self.equations = structure, structure.system
+        self._left_out = manifold_of_left_out(structure.system)
+        super().__init__(structure.system, block)
         self.DeclareInitializationPublishEvent(weakly(self._check_start))
-
-    def set_consistent_state(
-        self, context: Context, guess: ArrayLike | Mapping[str, float], fixed: Sequence[str] = ()
-    ) -> FloatArray:
-        self.check_context(context)
-        values = self._values(context)
-        state = self._consistent(guess, fixed, values)
-        self._check_left_out(state, values)
-        self.set_state(context, state)
-        return state
 
     def explained(
         self, error: SimulationError, values: Mapping[str, FloatArray]
@@ -112,43 +98,24 @@ class DaePlant(ParameterizedSystem, Plant):
             names = self.structure.dependent_constraints(error.state, parameters)
             return singular_configuration(self.dae.name, error.time, error.state, names)
         control = values.get("input control", np.zeros(self.dae.num_controls))
-        force = self.structure.trace("force", self.dae.forces(self._constraint_input), True)
+        derivatives = self.structure.derivatives
+        v = derivatives.expand(derivatives.constraint_input)  # (25)
+        force = self.structure.trace("force", self.dae.forces(v), True)
         (lambdas,) = force(error.state, control, parameters)
         return jammed_contact(self.structure, error, control, parameters, lambdas) or error
-
-    @property
-    def _constraint_input(self) -> ca.SX:
-        derivatives = self.structure.derivatives
-        return derivatives.expand(derivatives.constraint_input)  # (25)
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))
         return EventStatus.DidNothing()
 
     def check_start(self, state: FloatArray, parameters: FloatArray) -> None:
-        """Refuses a start that is off N*.
-
-        Args:
-            state: x, shape (n,).
-            parameters: Values of all parameters.
-
-        Raises:
-            InconsistentStateError: The start is off N*.
-        """
-        manifold = self.structure.manifold
-        if manifold.is_consistent(state, parameters):
-            self._check_left_out(state, parameters)
-            return
-        raise off_start(self.dae.name, manifold, manifold.residual(state, parameters))
-
-    def _check_left_out(self, state: FloatArray, parameters: FloatArray) -> None:
-        """Refuses a state that violates redundant constraints that were left out."""
-        left_out = self._left_out
-        if left_out is None or left_out.is_consistent(state, parameters):
-            return
-        raise assembled_otherwise(
-            self.dae.name, left_out, state, left_out.residual(state, parameters)
-        )
+        """Refuses a start off N*, or that violates redundant constraints that were left out."""
+        name, manifold, left_out = self.dae.name, self.structure.manifold, self._left_out
+        if not manifold.is_consistent(state, parameters):
+            raise off_start(name, manifold, manifold.residual(state, parameters))
+        if left_out is not None and not left_out.is_consistent(state, parameters):
+            residual = left_out.residual(state, parameters)
+            raise assembled_otherwise(name, left_out, state, residual)
 
 
 def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
@@ -165,7 +132,10 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
     projection = None
     if project and system.num_constraints:
         parameters = system.parameter_symbol
-        projection = Projection(newton_of(manifold), manifold.projected, parameters)
+        step = manifold.newton_step
+        symbols = [ca.SX.sym(*item) for item in zip(step.input_names, step.sizes, strict=True)]
+        newton = ca.Function("newton", symbols, step.function.call(symbols)[:1])
+        projection = Projection(newton, manifold.projected, parameters)
     return Block(
         system.name,
         inputs={"control": control},
@@ -186,18 +156,8 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
         scale=system.scale,
         requirements=(regular,),
         signals={
-            "state": system.state_signals,
+            **port_signals(structure),
             "control": system.control_signals,
-            "constraint_force": system.force_signals,
-            "constraint_residual": manifold.residual_signals,
-            "controlled_output": system.output_signals,
             "parameters": system.parameter_signals,
         },
     )
-
-
-def newton_of(manifold: Manifold) -> ca.Function:
-    """A Newton step to a manifold, as a `Projection` has it."""
-    step = manifold.newton_step
-    inputs = [ca.SX.sym(*item) for item in zip(step.input_names, step.sizes, strict=True)]
-    return ca.Function("newton", inputs, step.function.call(inputs)[:1])

@@ -60,19 +60,13 @@ class Encoders:
     position_bias: ArrayLike = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("resolution", "position_noise", "velocity_noise"):
-            given = numbers(name, getattr(self, name))
-            if given.ndim > 1 or not (np.isfinite(given).all() and np.all(given >= 0.0)):
+        for name in ("resolution", "position_noise", "velocity_noise", "position_bias"):
+            given, is_bias = numbers(name, getattr(self, name)), name == "position_bias"
+            if given.ndim > 1 or not (np.isfinite(given).all() and (is_bias or np.all(given >= 0))):
                 raise ModelError(
-                    f"the {name} of encoders must be 0 or more, one number or one for each "
-                    f"position, got {brief(getattr(self, name))}"
+                    f"the {name} of encoders must be {'finite' if is_bias else '0 or more'}, one "
+                    f"number or one for each position, got {brief(getattr(self, name))}"
                 )
-        bias = numbers("position_bias", self.position_bias)
-        if bias.ndim > 1 or not np.isfinite(bias).all():
-            raise ModelError(
-                "the position_bias of encoders must be finite, one number or one for each "
-                f"position, got {brief(self.position_bias)}"
-            )
         if self.velocity_bandwidth is not None:
             positive("the velocity_bandwidth of encoders", self.velocity_bandwidth)
             if np.any(self.velocity_noise):
@@ -107,13 +101,8 @@ class Encoders:
         """
         if self.velocity_bandwidth is None:
             return np.array(self.velocity_noise, dtype=float)
-        a = self._forgetting(period)
+        a = np.exp(-self.velocity_bandwidth * positive("period", period))
         return self.position_deviation * (1.0 - a) / period * np.sqrt(2.0 / (1.0 + a))
-
-    def _forgetting(self, period: float) -> float:
-        """a, the factor of the last velocity in the next one."""
-        assert self.velocity_bandwidth is not None
-        return float(np.exp(-self.velocity_bandwidth * positive("period", period)))
 
 
 @checked(ModelError)
@@ -124,27 +113,8 @@ class StateSensor(TracedSystem):
     not changed. At t_k itself the output is a function of the state at that instant, so that a law
     sampled at t_k uses the measurement of t_k. Its updates are unrestricted, so that it sees that
     instant even if a discrete MultibodyPlant steps then. Drake's DiscreteDerivative is not
-    suitable: its difference is one sample old, and it is updated after such a plant.
-
-    Input ports:
-        state: x, shape (n,).
-        noise: Noise of deviation 1 for q and v, shape (2 k,), as of Drake's RandomSource; only if
-            the encoders have noise.
-
-    Output port:
-        estimated_state: x as it is measured, shape (n,); direct feedthrough.
-
-    Args:
-        size: n.
-        num_positions: k, the number of positions and of velocities at the start of x.
-        encoders: The encoders.
-        period: The time between samples in s.
-
-    Attributes:
-        encoders, period: The arguments.
-
-    Raises:
-        ModelError: The encoders have another number of entries, or a size is not valid.
+    suitable: its difference is one sample old, and it is updated after such a plant. The input
+    `noise` has deviation 1 for each of q and v, if the encoders have noise.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -160,49 +130,38 @@ class StateSensor(TracedSystem):
     ) -> None:
         check_whole_number("num_positions", num_positions, 1)
         check_whole_number("size", size, 2 * num_positions)
-        self.encoders, self.period = encoders, positive("period", period)
-        self.sample_period = self.period
-        super().__init__(encoder_block(size, num_positions, encoders, period))
-
-
-def encoder_block(size: int, count: int, encoders: Encoders, period: float) -> Block:
-    """The measured state, and the last sample with its index; see `StateSensor`."""
-    resolution, bias, position_noise, velocity_noise = (
-        _each(name, getattr(encoders, name), count)
-        for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
-    )
-    state, held = ca.SX.sym("state", size), ca.SX.sym("held", 1 + 2 * count)
-    q, v = state[:count] + bias, state[count : 2 * count]
-    inputs = {"state": state}
-    if encoders.has_noise:
-        inputs["noise"] = noise = ca.SX.sym("noise", 2 * count)
-        q, v = q + position_noise * noise[:count], v + velocity_noise * noise[count:]
-    for i in np.flatnonzero(resolution).tolist():
-        q[i] = resolution[i] * _rounded(q[i] / resolution[i])
-    sample, first = ca.floor(TIME / period + _SAME), ca.vertcat(q, v)
-    later = first
-    if encoders.velocity_bandwidth is not None:
-        a = np.exp(-encoders.velocity_bandwidth * period)
-        before, q_before = held[1 + count :], held[1 : 1 + count]
-        later = ca.vertcat(q, a * before + (1.0 - a) * (q - q_before) / period)
-    fresh = ca.if_else(
-        ca.fabs(held[0]) < np.inf, later, first
-    )  # Before the first sample it is nan.
-    current = ca.if_else(ca.eq(held[0], sample), held, ca.vertcat(sample, fresh))
-    return Block(
-        "state_sensor",
-        inputs,
-        {"estimated_state": ca.vertcat(current[1:], state[2 * count :])},
-        held={
-            "sample": Held(
-                held,
-                current,
-                np.full(1 + 2 * count, np.nan),
-                period,
-                begin=ca.vertcat(sample, first),
-            )
-        },
-    )
+        self.encoders, self.sample_period = encoders, positive("period", period)
+        count = num_positions
+        resolution, bias, position_noise, velocity_noise = (
+            _each(name, getattr(encoders, name), count)
+            for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
+        )
+        state, held = ca.SX.sym("state", size), ca.SX.sym("held", 1 + 2 * count)
+        q, v = state[:count] + bias, state[count : 2 * count]
+        inputs = {"state": state}
+        if encoders.has_noise:
+            inputs["noise"] = noise = ca.SX.sym("noise", 2 * count)
+            q, v = q + position_noise * noise[:count], v + velocity_noise * noise[count:]
+        for i in np.flatnonzero(resolution).tolist():
+            q[i] = resolution[i] * _rounded(q[i] / resolution[i])
+        sample, first = ca.floor(TIME / period + _SAME), ca.vertcat(q, v)
+        later = first
+        if encoders.velocity_bandwidth is not None:
+            a = np.exp(-encoders.velocity_bandwidth * period)
+            before, q_before = held[1 + count :], held[1 : 1 + count]
+            later = ca.vertcat(q, a * before + (1.0 - a) * (q - q_before) / period)
+        # Before the first sample it is nan.
+        fresh = ca.if_else(ca.fabs(held[0]) < np.inf, later, first)
+        current = ca.if_else(ca.eq(held[0], sample), held, ca.vertcat(sample, fresh))
+        # The last sample with its index.
+        unknown, begin = np.full(1 + 2 * count, np.nan), ca.vertcat(sample, first)
+        block = Block(
+            "state_sensor",
+            inputs,
+            {"estimated_state": ca.vertcat(current[1:], state[2 * count :])},
+            held={"sample": Held(held, current, unknown, period, begin=begin)},
+        )
+        super().__init__(block)
 
 
 def _rounded(number: ca.SX) -> ca.SX:

@@ -49,10 +49,9 @@ EARLY = 2e-12
 
 @cache
 def fading(order: int) -> FloatArray:
-    """Polynomials whose k-th derivative is 1 at 0, and all others up to n are 0 at 0 and at 1.
+    """Row k has the factors of 1, x, ..., x^(2 n + 1) of a polynomial, for the order n.
 
-    Returns:
-        Row k has the factors of 1, x, ..., x^(2 n + 1), shape (n + 1, 2 n + 2), for the order n.
+    Its k-th derivative is 1 at 0, and all others up to n are 0 at 0 and at 1.
     """
     powers = np.arange(2 * order + 2)
     # Row j: the j-th derivatives of the powers at 1.
@@ -108,15 +107,8 @@ class Automaton:
         R(t) = goal(t) + base + rate t + faded(offset, t),
 
     where base and rate are 0 for outputs with goals. Before the first sample the task has not
-    begun: the references are the present outputs. All values change at samples alone.
-
-    Args:
-        task, contact: The task, and the contact of its laws.
-        laws: The law of the free robot, and the law in contact.
-        period: The sample period, in s.
-
-    Raises:
-        ModelError: A phase has a reference that does not fit its law.
+    begun: the references are the present outputs. All values change at samples alone. `laws` are
+    that of the free robot, and that in contact.
     """
 
     def __init__(

@@ -17,12 +17,10 @@ FREE, CONTACT = 0, 1
 
 @dataclass(frozen=True)
 class OpeningContact:
-    """The contact of a task, which opens and closes: one point, or several that do so together.
+    """The contact of a task: one point, or several that open and close together.
 
-    Attributes:
-        places: The indices of the outputs that are its forces, and its distances where it is open.
-        forces: The indices of its constraint forces.
-        main: The one of `places` that is the sum of its forces.
+    `places` are the outputs that are its forces, and its distances where it is open; `main` is the
+    one of them that is the sum of its forces; `forces` are its constraint forces.
     """
 
     places: tuple[int, ...]
@@ -31,12 +29,11 @@ class OpeningContact:
 
     @property
     def size(self) -> int:
-        """The number of its points."""
         return len(self.forces)
 
     @property
     def others(self) -> list[int]:
-        """The places besides `main`: differences of forces, or further distances."""
+        """Differences of forces, or further distances."""
         return [place for place in self.places if place != self.main]
 
 
@@ -50,14 +47,6 @@ def open_contact(system: DaeSystem, force: str | Sequence[str]) -> DaeSystem:
     points. These constraints do not hold, and the outputs that were their forces are
     their distances k_i(x). State, controls, parameters and the order of the outputs do not change,
     so that the laws of both systems can replace each other at any moment.
-
-    Args:
-        system: The system with the contact closed, `RobotModel.dae` for example.
-        force: The name of the contact's force, "wall.force" for example, or those of its points.
-
-    Raises:
-        ModelError: There is no such force; the outputs that depend on them are not as many, do not
-            contain their sum, or depend on other forces; or constraints share their forces.
     """
     forces = [force] if isinstance(force, str) else list(force)
     names = [signal.name for signal in system.constraint_input_signals]
@@ -111,11 +100,7 @@ def _contact(system: DaeSystem, forces: Sequence[int]) -> OpeningContact:
 
 
 def opening_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
-    """The contact that is closed in one law and open in the other.
-
-    Raises:
-        ModelError: The laws are not for one robot with and without the contact.
-    """
+    """The contact that is closed in one law and open in the other."""
     closed, free = law.system, free_law.system
     names, others = (
         [signal.name for signal in system.constraint_input_signals] for system in (closed, free)

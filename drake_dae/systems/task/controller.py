@@ -21,8 +21,17 @@ from drake_dae.systems.control.contract import (
 )
 from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plants.contract import Plant
-from drake_dae.systems.task.automaton import CHANGE, Automaton
-from drake_dae.systems.task.changes import changes_of
+from drake_dae.systems.task.automaton import (
+    ALL_DONE,
+    BEGUN,
+    CHANGE,
+    GIVEN_UP,
+    GUARD,
+    LATE,
+    LOST,
+    SUCCESS,
+    Automaton,
+)
 from drake_dae.systems.task.contacts import opening_contact
 from drake_dae.systems.task.task import Task
 
@@ -94,13 +103,9 @@ class TaskController(ParameterizedSystem, Controller):
     def rest_state(
         self, outputs: ArrayLike, guess: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """The state of the free robot at rest with given outputs.
+        """The state of the free robot at rest near a guess.
 
-        Args:
-            outputs: The outputs of the free law, shape (p,), with the distance in place of the
-                force.
-            guess: x near it, shape (n,).
-            parameters: Values of all parameters of the law's system; the defaults if None.
+        `outputs` are those of the free law, shape (p,), with the distance in place of the force.
 
         Raises:
             InconsistentStateError: None is found near the guess.
@@ -130,9 +135,6 @@ class TaskController(ParameterizedSystem, Controller):
         self.check_context(context)
         return np.array(self._values(context)[: self.law.all_parameters().size])
 
-    def parameters_along(self, context: Context, times: ArrayLike) -> FloatArray:
-        return super().parameters_along(context, times)[:, : self.law.all_parameters().size]
-
     def check_plant(self, plant: Plant) -> None:
         check_same_sizes(plant.dae, self.law.system, "task", "the laws for the plant's robot")
         if plant.is_ideal:
@@ -141,15 +143,8 @@ class TaskController(ParameterizedSystem, Controller):
                 "take a CompliantPlant or a ContactPlant (in a scenario: plant: !CompliantContact)"
             )
 
-    def derived(
-        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
-    ) -> Derived:
-        """The signals of a task in a record.
-
-        The outputs are the positions, the forces and the distances of the contact. "distance" has
-        the distances, then their derivatives, and "phase" is 1 for the current phase and 0 for all
-        others.
-        """
+    def derived(self, values: Mapping[str, FloatArray]) -> Derived:
+        """Outputs are positions, forces and distances; "phase" is 1 for the current one, else 0."""
         signals, residual = self.output_signals, values["constraint_residual"]
         outputs = np.concatenate([values["controlled_output"], residual[..., self._distances]], -1)
         own = signals[len(self.law.degrees) :]
@@ -176,3 +171,41 @@ class TaskController(ParameterizedSystem, Controller):
     ) -> FloatArray:
         """Zero: the references of each phase begin as those before it end."""
         return np.zeros((times.size, len(self.output_signals)))
+
+
+def changes_of(task: Task, rows: FloatArray) -> tuple[PhaseChange, ...]:
+    """The changes by `change` of each sample; those between two samples are left out."""
+    first = np.unique(rows[:, 0], return_index=True)[1]
+    changes, end = list[PhaseChange](), len(task.all_phases)
+    for row in rows[first].tolist():
+        number, place, is_closed, start, cause, force, distance, rate, ending, before = row
+        if not number:
+            continue  # The task has not begun.
+        at = int(place)
+        name = task.all_phases[at].name if at < end else "done" if ending == ALL_DONE else "held"
+        failed = ending == GIVEN_UP if at == end else cause > SUCCESS
+        lasted = f" {start - changes[-1].time:.4g} s" if changes else ""
+        reason = _reason(task, int(before), int(cause), lasted)
+        again = sum(change.place == at for change in changes)
+        if again and at < end:
+            reason += f", retry {again} of {task.retries_of(at)}"
+        motion = force, distance, rate
+        changes.append(PhaseChange(start, name, at, bool(is_closed), reason, *motion, failed))
+    return tuple(changes)
+
+
+def _reason(task: Task, place: int, cause: int, lasted: str) -> str:
+    """Why a phase ended, after it lasted so long."""
+    if cause == BEGUN:
+        return "the task begins"
+    if place == len(task.all_phases):
+        return "the contact is lost at rest"
+    phase = task.all_phases[place]
+    awaits = phase.awaits(task.contact_force)
+    if cause == SUCCESS:
+        return f"after {awaits}"
+    if cause == LATE:
+        return f"{phase.name} has waited{lasted} for {awaits}"
+    if cause == LOST:
+        return f"the contact of {phase.name} is lost"
+    return f"{phase.name} is ended by {phase.guards[cause - GUARD]}"

@@ -52,9 +52,6 @@ class Condition:
         above: It holds at or above this value.
         below: It holds at or below this value. Either this or `above` is given.
         name: The name of the signal or of the control; of the largest control if empty.
-
-    Raises:
-        ModelError: Not exactly one limit is given, it is not finite, or a name is missing.
     """
 
     of: Watched
@@ -75,7 +72,6 @@ class Condition:
 
     @property
     def limit(self) -> float:
-        """The limit."""
         return self.above if self.above is not None else self.below or 0.0
 
     def __str__(self) -> str:

@@ -230,11 +230,7 @@ class Task:
 
 
 def _named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
-    """The phases with distinct names: those with the name of their class are numbered.
-
-    Raises:
-        ModelError: Two phases have one name, or a name is a reserved word.
-    """
+    """The phases with distinct names: those with the name of their class are numbered."""
     chosen = [phase.name for phase in phases if phase.name != type(phase).__name__]
     renamed = list[Phase]()
     for index, phase in enumerate(phases):

@@ -7,7 +7,7 @@ import pytest
 from combinations import combined, one_in
 
 from drake_dae import build_scenario, load_scenario, rollout, simulate
-from drake_dae.diagrams.state_feedback import encoder_seed
+from drake_dae.diagrams.parts import encoder_seed
 from drake_dae.errors import ModelError, ScenarioError, WiringError
 from drake_dae.running import start_values
 

@@ -15,7 +15,7 @@ from vendors import joint, link, mobile_arm, panda, robot, write_panda
 from drake_dae import load_scenario
 from drake_dae.errors import RobotFileWarning, ScenarioError
 from drake_dae.scenario.model import scenario_model
-from drake_dae.scenario.robot_file.reading import read_robot, robot_links
+from drake_dae.scenario.robot_file.reading import finalize, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Robot
 
 # The collision meshes of the panda are left out.
@@ -181,7 +181,9 @@ def test_an_effort_limit_of_0_is_unknown(tmp_path):
     file = tmp_path / "robot.urdf"
     text = robot("one", link("a", 1), link("b", 1), joint("j", "a", "b", "0 0 1"))
     file.write_text(text.replace("87.0", "0"))
-    assert not read_robot(Robot(str(file)))[1].joints["effort"]
+    plant, _ = read_robot(Robot(str(file), actuators="all"))
+    finalize(plant)
+    assert plant.GetEffortUpperLimits() == [np.inf]
 
 
 FRICTION = """

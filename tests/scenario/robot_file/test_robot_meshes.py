@@ -21,7 +21,7 @@ def count(scene_graph: SceneGraph, role: Role) -> int:
 
 
 def read(file: Path, scene_graph: SceneGraph, **more: object):
-    return read_robot(Robot(str(file), **more), scene_graph)[0]
+    return read_robot(Robot(str(file), **more), scene_graph=scene_graph)[0]
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,8 @@ def test_a_dae_is_drawn_in_its_unit_and_its_colors_by_films_as_well(unit: float,
         'izz="1" ixy="0" ixz="0" iyz="0"/></inertial><visual><geometry>'
         '<mesh filename="box.dae" scale="2 1 1"/></geometry></visual></link></robot>'
     )
-    read_robot(Robot(str(tmp_path / "robot.urdf")), scene_graph := SceneGraph(), drawn=False)
+    scene_graph = SceneGraph()
+    read_robot(Robot(str(tmp_path / "robot.urdf")), None, scene_graph, drawn=False)
     inspector = scene_graph.model_inspector()
     (one,) = inspector.GetAllGeometryIds(Role.kPerception)
     assert Path(inspector.GetShape(one).source().path()).name == "box.dae"

@@ -45,7 +45,7 @@ def joints(folder: Path, file: str = "panda_description/urdf/panda.urdf", *setti
 def drawn(folder: Path, file: str, **packages: str) -> int:
     """The number of visual geometries."""
     scene_graph = SceneGraph()
-    read_robot(Robot(str(folder / file), packages=packages), scene_graph)
+    read_robot(Robot(str(folder / file), packages=packages), scene_graph=scene_graph)
     return len(scene_graph.model_inspector().GetAllGeometryIds(Role.kIllustration))
 
 

@@ -14,7 +14,6 @@ from scipy.optimize import minimize
 from vendors import joint, link, robot
 
 from drake_dae.errors import ModelError, RobotFileWarning, ScenarioError
-from drake_dae.scenario.robot_file.changes import change_robot
 from drake_dae.scenario.robot_file.mending import nearest_inertia
 from drake_dae.scenario.robot_file.reading import finalize, read_robot, robot_links
 from drake_dae.scenario.robot_file.robot import Pose, Robot, RobotPlacement
@@ -23,8 +22,7 @@ from drake_dae.scenario.robot_file.robot import Pose, Robot, RobotPlacement
 def plant_of(file: Path, scene_graph: SceneGraph | None = None, **more) -> MultibodyPlant:
     """The finalized plant of a robot's file, as a scenario reads it."""
     own = Robot(str(file), **more)
-    plant, efforts = read_robot(own, scene_graph)
-    change_robot(own, plant, efforts)
+    plant, _ = read_robot(own, scene_graph=scene_graph)
     finalize(plant)
     return plant
 

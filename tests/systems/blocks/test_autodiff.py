@@ -4,14 +4,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from actuated import actuated, slope, states
-from arms import arm, consistent_states, law, shipped
+from arms import arm, consistent_states, law
 from problems import PROBLEMS, hanging_pendulum
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.systems.analysis import (
-    ResetIntegratorFromFlags,
-    Simulator,
-    Simulator_,
-)
 from pydrake.systems.framework import (
     InputPortSelection,
     OutputPortSelection,
@@ -27,7 +22,6 @@ from drake_dae import (
     ConstantReference,
     DaePlant,
     DaeSystem,
-    ExpressionReference,
     ForceSensor,
     ReferenceGenerator,
     RobotPlant,
@@ -192,16 +186,13 @@ def test_ports_parameters_and_feedthrough_are_kept(make):
     assert isinstance(context.get_time(), AutoDiffXd)
 
 
-@pytest.mark.parametrize("as_trajectory", [False, True])
-def test_references_move_with_the_time(as_trajectory):
+def test_references_move_with_the_time():
     """dR/dt is the table of the next higher derivatives: of t^4, 24 t follows 12 t^2."""
     t = 0.7
-    quartic = ExpressionReference(lambda t: t**4)
-    if as_trajectory:
-        line = PiecewisePolynomial.LagrangeInterpolatingPolynomial(
-            np.linspace(0, 1, 5), (np.linspace(0, 1, 5) ** 4)[None]
-        )
-        quartic = TrajectoryReference(line)
+    line = PiecewisePolynomial.LagrangeInterpolatingPolynomial(
+        np.linspace(0, 1, 5), (np.linspace(0, 1, 5) ** 4)[None]
+    )
+    quartic = TrajectoryReference(line)
     generator = ReferenceGenerator([quartic, SinusoidReference(0.0, 1.0, 2.0)], [2, 1])
     converted = generator.ToAutoDiffXd()
     context = converted.CreateDefaultContext()
@@ -278,11 +269,8 @@ def resting_loop(model, structure, gains, sensor=None, **force_feedback):
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        ("two_link", None),
         ("seven_joint", None),
-        ("two_link", "flexible"),
         ("two_link", "flexible motor"),
-        ("seven_joint", "motor"),
     ],
 )
 def test_closed_loops_have_the_assigned_poles(name, kind):
@@ -311,41 +299,6 @@ def test_a_closed_loop_keeps_its_zero_dynamics():
     context.SetContinuousState([length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0])
     swing = 1j * np.sqrt(-force / mass)
     assert_poles(loop, context, [swing, -swing], 2, 1e-12)
-
-
-def test_a_loop_from_a_scenario_converts():
-    """And stays converted: the rates are those of the diagram, to round-off."""
-    loop, context = shipped("seven_joint_wall")
-    converted = loop.diagram.ToAutoDiffXd()
-    moving = converted.CreateDefaultContext()
-    moving.SetTimeStateAndParametersFrom(context)
-    np.testing.assert_array_equal(
-        ExtractValue(converted.EvalTimeDerivatives(moving).CopyToVector())[:, 0],
-        loop.diagram.EvalTimeDerivatives(context).CopyToVector(),
-    )
-
-
-def test_sensitivity_of_a_simulation():
-    """How the pendulum's end depends on its start angle and on gravity, through 50 steps."""
-
-    def end(simulator_type, plant, angle, gravity):
-        simulator = simulator_type(plant)
-        step = type(angle)(0.01)
-        ResetIntegratorFromFlags(simulator, "runge_kutta3", step).set_fixed_step_mode(True)
-        context = simulator.get_mutable_context()
-        plant.GetInputPort("control").FixValue(context, [1.0])
-        start = [np.sin(angle), -np.cos(angle), 0.0 * angle, 0.0 * angle]
-        context.SetContinuousState(np.array(start))
-        context.get_mutable_numeric_parameter(0).SetFromVector([gravity])
-        simulator.AdvanceTo(0.5)
-        return context.get_continuous_state_vector().CopyToVector()
-
-    plant, point = DaePlant(hanging_pendulum(), project=False), np.array([0.4, 9.81])
-    moving = InitializeAutoDiff(point).reshape(-1)
-    found = ExtractGradient(end(Simulator_[AutoDiffXd], plant.ToAutoDiffXd(), *moving))
-    for column, direction in zip(found.T, np.eye(2), strict=True):
-        expected = slope(lambda at: end(Simulator, plant, *at), point, direction, 1e-3)
-        np.testing.assert_allclose(column, expected, rtol=0, atol=GRADIENT)
 
 
 def test_failures_name_time_and_state():

@@ -1,7 +1,6 @@
 """Python frees what a closed loop was made of when nobody needs the loop any more."""
 
 import gc
-import sys
 from collections.abc import Callable
 from weakref import ref
 
@@ -9,7 +8,6 @@ import arms
 import numpy as np
 import polishing
 import pytest
-from campaign.memory import resident
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from runs import scenario, some
@@ -106,26 +104,3 @@ def test_a_loop_lives_as_long_as_its_simulator():
     state = simulator.get_context().get_continuous_state_vector().CopyToVector()
     assert state.shape == (size,)
     assert np.all(np.isfinite(state))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize(
-    ("again", "count"), [("loop", 100), pytest.param("scenario", 20, marks=pytest.mark.thorough)]
-)
-def test_memory_does_not_grow_with_the_number_of_loops(again: str, count: int):
-    chosen = scenario("two_link_wall")
-
-    def once() -> None:
-        if again == "scenario":
-            build_scenario(chosen)
-        else:
-            loop().diagram.CreateDefaultContext()
-
-    for _ in range(count // 4):  # What CasADi, Drake and the allocator keep once.
-        once()
-    before = resident()
-    for _ in range(count):
-        once()
-    # A loop takes 700 kB, a scenario 1,000 kB; what is measured is 0 to 20 kB, the noise of pages.
-    assert (resident() - before) / count < 100.0

@@ -4,8 +4,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems import PROBLEMS
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RevoluteJoint, SpatialInertia, UnitInertia
 from pydrake.symbolic import (
     Expression,
     ExpressionKind,
@@ -100,11 +98,6 @@ def test_random_expressions_have_the_numbers_of_drake():
     assert found == smooth - {getattr(ExpressionKind, name) for name in refused}
 
 
-def test_constants():
-    assert float(to_casadi(Expression(2.5), {})) == 2.5
-    assert float(to_casadi(np.float64(2.5), {})) == 2.5
-
-
 def pendulum(**changes):
     """PROBLEMS["pendulum"] once more."""
     x, y, vx, vy = state = [Variable(name) for name in ("x", "y", "vx", "vy")]
@@ -172,39 +165,6 @@ def test_drakes_own_symbolic_system():
         drake.EvalTimeDerivatives(context).CopyToVector(),
         rtol=1e-14,
     )
-
-
-def test_a_multibody_plant_of_expressions():
-    """A rod of 2 kg with its centre 0.4 m from the joint, by Drake's own symbolic dynamics."""
-    plant = MultibodyPlant(0.0)
-    body = plant.AddRigidBody(
-        "rod", SpatialInertia(2.0, np.array([0.0, 0.0, -0.4]), UnitInertia(0.2, 0.2, 0.01))
-    )
-    joint = plant.AddJoint(
-        RevoluteJoint("pivot", plant.world_frame(), body.body_frame(), np.array([0.0, 1.0, 0.0]))
-    )
-    plant.AddJointActuator("motor", joint)
-    plant.Finalize()
-    symbolic = plant.ToSymbolic()
-    q, v, u = (Variable(name) for name in ("q", "v", "u"))
-    context = symbolic.CreateDefaultContext()
-    context.SetContinuousState([Expression(q), Expression(v)])
-    symbolic.get_actuation_input_port().FixValue(context, [Expression(u)])
-    rates = symbolic.EvalTimeDerivatives(context).CopyToVector()
-    made = from_symbolic(
-        [q, v],
-        f=[row.Substitute(u, 0.0) for row in rates],
-        h=[row.Differentiate(u) for row in rates],
-        l=q,
-        name="rod",
-    )
-    # (m c^2 included) I v' = u - m g c sin q, I = 2.0 * 0.2.
-    inertia = 2.0 * 0.2
-    function = ca.Function("rod", [made.state], [ca.densify(made.f), ca.densify(made.h)])
-    drift, drive = function([0.6, 1.1])
-    expected = -2.0 * 9.81 * 0.4 * np.sin(0.6) / inertia
-    np.testing.assert_allclose(drift.full()[:, 0], [1.1, expected], rtol=1e-12)
-    np.testing.assert_allclose(drive.full()[:, 0], [0.0, 1.0 / inertia], rtol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,14 @@
 """Trial and accepted: what leaves its domain in a stage of a step that is then made shorter."""
 
-import itertools
-
 import casadi as ca
 import numpy as np
 import pytest
-from arms import error_controlled, fixed_step
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from runs import some
 
-from drake_dae import DaePlant, DaeSystem, ForceSensor, simulate
+from drake_dae import DaePlant, DaeSystem, simulate
 from drake_dae.errors import NonFiniteError, SimulationError, SingularityError
 
 ERROR_CONTROLLED = (
@@ -33,21 +30,6 @@ def tank(f=lambda x: -500 * (ca.sqrt(x) - 0.1), start=1.0):
         h=lambda s: [1],
         l=lambda s: [s[0]],
         nominal_state=[start],
-        name="tank",
-    )
-
-
-def leaking_tank_with_force():
-    """The tank, and a constraint whose force is the root of its level: y' = sqrt(x) + v, y = 0."""
-    return DaeSystem.from_functions(
-        ["x", "y"],
-        f=lambda s: [-500 * (ca.sqrt(s[0]) - 0.1), ca.sqrt(s[0])],
-        g=lambda s: [0, 1],
-        h=lambda s: [1, 0],
-        k=lambda s: [s[1]],
-        l=lambda s: [s[0]],
-        m=lambda s: [[0]],
-        nominal_state=[1.0, 0.0],
         name="tank",
     )
 
@@ -76,9 +58,6 @@ def by_us(diagram, duration, config, context=None):
     return context
 
 
-RUNS = {"Drake's Simulator": by_drake, "simulate": by_us}
-
-
 def scheme(name, accuracy=1e-6):
     return SimulatorConfig(integration_scheme=name, accuracy=accuracy, use_error_control=True)
 
@@ -95,19 +74,18 @@ def level(time):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(ERROR_CONTROLLED, of=3, first=1))
-@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
-def test_a_trial_that_leaves_the_domain_makes_the_step_shorter(run, name):
+def test_a_trial_that_leaves_the_domain_makes_the_step_shorter(name):
     """The first step of 0.1 s tries x = -44, and the motion never does."""
     diagram, logger = alone(DaePlant(tank()))
-    context = run(diagram, 0.02, scheme(name))
+    context = by_us(diagram, 0.02, scheme(name))
     log = logger.FindLog(context)
     assert log.data().min() >= 0.01 - 1e-5
     # The accuracy that was asked for is one for each step, and there are up to 1300.
     np.testing.assert_allclose(log.data()[0], [level(t) for t in log.sample_times()], atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["bogacki_shampine3", "runge_kutta2", "runge_kutta3"])
-@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
+@pytest.mark.parametrize("name", ["bogacki_shampine3", "runge_kutta3"])
+@pytest.mark.parametrize("run", [by_drake, by_us])
 def test_a_fixed_step_that_fails_names_where_it_began(run, name):
     """No nan gets into the log, and the state is one that was reached."""
     diagram, logger = alone(DaePlant(tank()))
@@ -120,21 +98,9 @@ def test_a_fixed_step_that_fails_names_where_it_began(run, name):
     assert np.isfinite(logger.FindLog(context).data()).all()
 
 
-@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
-def test_an_accepted_state_out_of_the_domain_is_reported(run):
-    """Euler's step of 0.05 s ends at 1 - 0.05 * 450 without a trial."""
-    diagram, _ = alone(DaePlant(tank()))
-    config = SimulatorConfig(
-        integration_scheme="explicit_euler", max_step_size=0.05, use_error_control=False
-    )
-    with pytest.raises(NonFiniteError, match=r"t = 0\.05 s, .*\[-21\.5\]"):
-        run(diagram, 1.0, config)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(ERROR_CONTROLLED, of=3))
-@pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
-def test_a_motion_that_ends_in_the_domain_ends_the_run(run, name):
+def test_a_motion_that_ends_in_the_domain_ends_the_run(name):
     """x' = -1 / (2 sqrt(x)) from 1 is (1 - 3 t / 4)^(2/3), and is over at t = 4/3.
 
     Drake's implicit integrators end it themselves, by the length of their steps.
@@ -142,7 +108,7 @@ def test_a_motion_that_ends_in_the_domain_ends_the_run(run, name):
     diagram, logger = alone(DaePlant(tank(lambda x: -1 / (2 * ca.sqrt(x)))))
     context = diagram.CreateDefaultContext()
     with pytest.raises((SimulationError, RuntimeError)):
-        run(diagram, 2.0, scheme(name, 1e-4), context)
+        by_us(diagram, 2.0, scheme(name, 1e-4), context)
     # Euler's method of first order loses 0.01 s on the way.
     assert context.get_time() == pytest.approx(4 / 3, abs=2e-2)
     assert np.isfinite(logger.FindLog(context).data()).all()
@@ -171,7 +137,8 @@ class Broken(LeafSystem):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "since"), some([*itertools.product(ERROR_CONTROLLED, (0.0, 0.3))], of=3), ids=str
+    ("name", "since"),
+    [("runge_kutta3", 0.0), ("runge_kutta3", 0.3), ("runge_kutta5", 0.3), ("radau3", 0.3)],
 )
 def test_nan_from_a_block_of_someone_else_ends_the_run(name, since):
     """Where Drake's error control alone would make steps shorter for ever."""
@@ -186,20 +153,6 @@ def test_nan_from_a_block_of_someone_else_ends_the_run(name, since):
         simulator.AdvanceTo(1.0)
     assert caught.value.time == pytest.approx(since, abs=1e-6)
     assert np.isfinite(logger.FindLog(simulator.get_context()).data()).all()
-
-
-def test_a_sensor_feels_what_a_trial_does_not_have():
-    """Its state, like that of the plant, is finite at each step; tau f' = -sqrt(x) - f."""
-    builder = DiagramBuilder()
-    plant = builder.AddSystem(DaePlant(leaking_tank_with_force()))
-    sensor = builder.AddSystem(ForceSensor(1, 0.01))
-    source = builder.AddSystem(ConstantVectorSource([0.0]))
-    builder.Connect(source.get_output_port(), plant.get_input_port())
-    builder.Connect(plant.GetOutputPort("constraint_force"), sensor.get_input_port())
-    logger = LogVectorOutput(sensor.get_output_port(), builder)
-    context = by_drake(builder.Build(), 0.5, error_controlled(1e-6))
-    # At rest: the level is 0.01, its root 0.1.
-    assert logger.FindLog(context).data()[0, -1] == pytest.approx(-0.1, abs=1e-4)
 
 
 class Reading(LeafSystem):
@@ -219,7 +172,7 @@ class Reading(LeafSystem):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ERROR_CONTROLLED)
+@pytest.mark.parametrize("name", ["bogacki_shampine3", "runge_kutta3", "runge_kutta5"])
 def test_after_a_rejected_step_no_port_shows_the_state_of_the_trial(name):
     """Drake's own DeclareStateOutputPort does, with two of its integrators.
 
@@ -265,25 +218,6 @@ def test_nothing_is_a_trial_outside_of_a_simulation():
         plant.EvalTimeDerivatives(fresh)
 
 
-def test_contexts_do_not_share_what_is_known_of_their_runs():
-    """A run in one context; a clone of it, and a second run from a new start, know their own."""
-    plant = DaePlant(tank())
-    diagram, _ = alone(plant)
-    simulator = Simulator(diagram)
-    ApplySimulatorConfig(scheme("runge_kutta3"), simulator)
-    simulator.AdvanceTo(0.1)
-    clone = simulator.get_context().Clone()
-    other = Simulator(diagram, clone)
-    ApplySimulatorConfig(scheme("runge_kutta3"), other)
-    clone.SetTime(0.0)
-    plant.set_state(plant.GetMyMutableContextFromRoot(clone), [1.0])
-    other.Initialize()
-    other.AdvanceTo(0.02)
-    assert clone.get_continuous_state_vector()[0] == pytest.approx(level(0.02), abs=1e-4)
-    simulator.AdvanceTo(0.2)
-    assert simulator.get_context().get_continuous_state_vector()[0] == pytest.approx(0.01, abs=1e-4)
-
-
 def test_an_overflow_is_not_called_singular():
     """det [[1 + x^2, x], [x, 1]] = 1 for all x, and at 1e40 cancels to 0."""
     system = DaeSystem.from_functions(
@@ -303,15 +237,3 @@ def test_an_overflow_is_not_called_singular():
     with pytest.raises(NonFiniteError, match=r"\bx\b") as caught:
         plant.EvalTimeDerivatives(context)
     assert not isinstance(caught.value, SingularityError)
-
-
-def test_how_slow_is_endless():
-    """A thousand steps of 2 ns add 2e-9 of the 1000 s that were simulated before."""
-    diagram, _ = alone(DaePlant(tank(lambda x: -x)))
-    simulator = Simulator(diagram)
-    ApplySimulatorConfig(fixed_step(1.0), simulator)
-    simulator.AdvanceTo(1000.0)
-    simulator.get_mutable_integrator().set_maximum_step_size(2e-9)
-    with pytest.raises(SimulationError, match="1000"):
-        simulator.AdvanceTo(1000.1)
-    assert simulator.get_context().get_time() < 1000.0001

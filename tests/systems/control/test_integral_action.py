@@ -1,7 +1,5 @@
 """Integral action of the law, against the prediction and closed forms."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from arms import arm, error_controlled, law, numbers, touching
@@ -9,24 +7,20 @@ from numpy.testing import assert_allclose
 
 from drake_dae import (
     ConstantReference,
-    ForceSensor,
     RobotModel,
     RobotPlant,
     SinusoidReference,
     TrackingController,
     TrackingLaw,
-    build_scenario,
     find_structure,
-    load_scenario,
     make_closed_loop,
     poles,
     simulate,
 )
 from drake_dae.dae import linearize_loop
 from drake_dae.diagrams import LoopSettings
-from drake_dae.errors import GainError, ModelError, WiringError
+from drake_dae.errors import GainError, ModelError
 from drake_dae.robots import KnownForce
-from drake_dae.scenario.shipped import find_scenario
 
 WANTED = [SinusoidReference(0.3, 0.2, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
 
@@ -100,54 +94,6 @@ def test_a_push_that_the_law_does_not_know_is_integrated_away():
     assert abs(ends[True][0]) < 1e-6 < 1e-3 < abs(ends[False][0])
 
 
-def test_a_force_that_friction_falsifies_is_integrated_away():
-    """lambda A / A_0 = r_2 - K_i sigma at each step, with A by MultibodyPlant; 50 times better."""
-    smooth = touching("two_link")
-    wall = replace(smooth.constraints[0], friction=0.0, stiction_tolerance=0.05)
-    model = RobotModel(smooth.links, [wall], smooth.outputs, [1.2, -1.6])
-    structure, errors = find_structure(model.dae), {}
-    wanted = [SinusoidReference(0.3, 0.2, 0.5), ConstantReference(20.0)]
-    for names in ([], ["wall.force"]):
-        tracking = TrackingLaw(
-            model.dae,
-            poles({"tool.z": -5.0, "*": -50.0} if names else -5.0),
-            structure=structure,
-            measured_force=bool(names),
-            integral=names,
-        )
-        _, record = follow(model, tracking, 2.0, change={"wall.friction": 0.4}, wanted=wanted)
-        late = record.time > 0.5
-        errors[bool(names)] = np.sqrt(np.mean(record["tracking_error"][late, 1] ** 2))
-    assert errors[True] < errors[False] / 20.0
-    for i in range(0, len(record.time), 20):
-        q, v = np.split(record["state"][i], 2)
-        n = numbers("two_link", q, v)
-        J, P = n.constraint_jacobian[0], n.output_jacobian[0]
-        slip_row = 0.4 * P * (P @ v) / np.hypot(P @ v, 0.05)
-        A_0, A = (J @ np.linalg.solve(n.mass, column) for column in (J, J - slip_row))
-        pressed = 20.0 - 50.0 * record["integral"][i, 0]
-        assert record["constraint_force"][i, 0] == pytest.approx(pressed * A_0 / A, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_proportional_action_beside_it_needs_a_sensor():
-    """K_p closes an algebraic loop, the integral does not; with a sensor both go together."""
-    model, structure = arm("two_link").model, arm("two_link").structure
-    both = TrackingLaw(
-        model.dae,
-        poles(-5.0),
-        structure=structure,
-        measured_force=True,
-        force_gain=2.0,
-        integral=["wall.force"],
-    )
-    assert both.control_takes_force
-    with pytest.raises(WiringError, match="ForceSensor"):
-        make_closed_loop(RobotPlant(model, structure=structure), both, WANTED)
-    _, record = follow(model, both, 3.0, sensor=ForceSensor(1, 0.01), start=[0.3])
-    assert abs(record["tracking_error"][-1, 1]) < 0.1
-
-
 def controller_of(limits=np.inf):
     found = arm("two_link")
     tracking = TrackingLaw(
@@ -180,25 +126,6 @@ def test_the_integral_stops_at_its_limit_and_where_it_is_held():
     assert rate(controller, context) == pytest.approx([0.1])
 
 
-def test_the_control_is_that_of_the_law_and_converts():
-    controller, context = controller_of()
-    controller.set_integral(context, [0.3])
-    state = controller.GetInputPort("estimated_state").Eval(context)
-    reference = controller.GetInputPort("reference").Eval(context)
-    control = controller.GetOutputPort("control").Eval(context)
-    assert_allclose(control, controller.law.control(state, reference, integral=[0.3]))
-    assert np.any(control != controller.law.control(state, reference))
-    converted = controller.ToAutoDiffXd()
-    other = converted.CreateDefaultContext()
-    other.SetTimeStateAndParametersFrom(context)
-    for name in ("estimated_state", "reference"):
-        values = controller.GetInputPort(name).Eval(context)
-        converted.GetInputPort(name).FixValue(other, values)
-    found = [entry.value() for entry in converted.GetOutputPort("control").Eval(other)]
-    assert_allclose(found, control)
-    assert converted.EvalTimeDerivatives(other).CopyToVector()[0].value() == pytest.approx(0.1)
-
-
 def test_what_makes_no_sense_is_refused():
     found = arm("two_link")
     system, known = found.model.dae, {"structure": found.structure}
@@ -219,13 +146,3 @@ def test_what_makes_no_sense_is_refused():
     state = found.structure.states[0]
     with pytest.raises(ModelError, match="state"):
         linearize_loop(controller.law, state, np.zeros(4))
-
-
-def test_a_scenario_names_what_is_integrated():
-    scenario = load_scenario(
-        find_scenario("two_link_measured_force"), ["law.integral=[tool.z, wall.force]"]
-    )
-    loop, context = build_scenario(scenario)
-    assert loop.controller.law.gains.degrees == (3, 1)
-    simulate(loop.diagram, context, 0.1, scenario.integrator)
-    assert loop.record(context)["integral"].shape[1] == 2

@@ -5,7 +5,6 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
-from pydrake.autodiffutils import AutoDiffXd, ExtractGradient
 from pydrake.math import BsplineBasis
 from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial
 
@@ -24,18 +23,6 @@ def table(signal, degree, time):
     """(outputs, derivatives) of one signal at a time."""
     generator = ReferenceGenerator([signal], [degree] * signal.size)
     return generator.reference(time).reshape(signal.size, degree + 1)
-
-
-def test_layout_is_output_major():
-    generator = ReferenceGenerator(
-        [SinusoidReference(1.0, 2.0, 3.0), ConstantReference([7.0, 8.0])], [2, 1, 0]
-    )
-    expected = [1.0, 6.0, 0.0, 7.0, 0.0, 8.0]
-    np.testing.assert_allclose(generator.reference(0.0), expected, atol=1e-15)
-    context = generator.CreateDefaultContext()
-    context.SetTime(0.4)
-    port = generator.GetOutputPort("reference").Eval(context)
-    np.testing.assert_array_equal(port, generator.reference(0.4))
 
 
 def test_sums_of_sinusoids():
@@ -79,15 +66,6 @@ def test_moves_are_smooth_at_both_ends_and_held_outside(order):
     np.testing.assert_allclose(middle[:, 0], [0.5, 4.5], atol=1e-12)
 
 
-def test_expressions_of_time():
-    signal = ExpressionReference(lambda t: [t**3, ca.exp(-t) * t])
-    np.testing.assert_allclose(
-        table(signal, 2, 2.0),
-        [[8.0, 12.0, 12.0], np.exp(-2.0) * np.array([2.0, -1.0, 0.0])],
-        atol=1e-14,
-    )
-
-
 def test_drake_trajectories():
     spline = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
         [0.0, 1.0, 2.0, 3.0],
@@ -112,12 +90,6 @@ def test_functions_of_casadi(symbol):
     signal = ExpressionReference(function)
     expected = [[np.sin(0.7), np.cos(0.7), -np.sin(0.7)], [0.343, 1.47, 4.2]]
     np.testing.assert_allclose(table(signal, 2, 0.7), expected, rtol=1e-14)
-
-
-def test_trajectories_and_expressions_stack():
-    path = PiecewisePolynomial.CubicHermite([0, 1], [[0, 1]], [[0, 0]])
-    generator = ReferenceGenerator([ConstantReference(3.0), TrajectoryReference(path)], [1, 1])
-    np.testing.assert_allclose(generator.reference(0.5), [3.0, 0.0, 0.5, 1.5], atol=1e-15)
 
 
 def hold(values):
@@ -165,16 +137,6 @@ def test_a_reference_that_is_not_finite_raises():
         generator.GetOutputPort("reference").Eval(generator.CreateDefaultContext())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("order", [8, 16, 30])
-def test_high_orders_do_not_cancel(order):
-    """The move stays between its ends and mirrors itself; all its terms are positive."""
-    signal = PointToPointReference(0.0, 1.0, 0.0, 1.0, order)
-    values = [table(signal, 0, t)[0, 0] for t in np.linspace(0.0, 1.0, 41)]
-    assert np.all(np.diff(values) >= -1e-13)
-    np.testing.assert_allclose(np.array(values) + values[::-1], 1.0, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -206,13 +168,6 @@ def test_kinks_and_steps_are_refused_where_derivatives_are_needed(what):
     # A force that is met at once may jump.
     generator = ReferenceGenerator([signal], [0])
     assert np.isfinite(generator.reference(0.5)).all()
-
-
-def test_a_signal_of_which_one_row_is_not_smooth():
-    signal = ExpressionReference(lambda t: [ca.sin(t), ca.fabs(t)])
-    assert ReferenceGenerator([signal], [2, 0]).reference(-1.0)[3] == 1.0
-    with pytest.raises(ReferenceSignalError, match="row 1 "):
-        ReferenceGenerator([signal], [0, 2])
 
 
 def test_the_function_of_the_real_numbers_is_no_reference():
@@ -257,26 +212,6 @@ def test_parameters_stand_in_the_context():
     np.testing.assert_allclose(port.Eval(context), wanted, rtol=1e-15)
     np.testing.assert_allclose(generator.along([0.0, 0.5], context)[1], wanted, rtol=1e-15)
     np.testing.assert_allclose(generator.along([0.5])[0], generator.reference(0.5), rtol=0)
-
-
-def test_parameters_have_derivatives_by_the_time_in_autodiff():
-    generator = pushing()
-    converted = generator.ToAutoDiffXd()
-    context = converted.CreateDefaultContext()
-    context.SetTime(AutoDiffXd(0.5, [1.0]))
-    found = ExtractGradient(converted.GetOutputPort("reference").Eval(context))[:, 0]
-    wanted = [0.6 * np.cos(1.0), -1.2 * np.sin(1.0), 1.0]
-    np.testing.assert_allclose(found, wanted, rtol=1e-14)
-
-
-def test_references_of_several_degrees_have_derivatives_by_the_time_in_autodiff():
-    turn, push = SinusoidReference(0.0, [0.1], [2.0]), SinusoidReference(1.0, [0.5], [3.0])
-    converted = ReferenceGenerator([turn, push], [2, 0]).ToAutoDiffXd()
-    context = converted.CreateDefaultContext()
-    context.SetTime(AutoDiffXd(0.5, [1.0]))
-    found = ExtractGradient(converted.GetOutputPort("reference").Eval(context))[:, 0]
-    wanted = [0.2 * np.cos(1.0), -0.4 * np.sin(1.0), -0.8 * np.cos(1.0), 1.5 * np.cos(1.5)]
-    np.testing.assert_allclose(found, wanted, rtol=1e-14)
 
 
 def test_wrong_parameters_are_refused():

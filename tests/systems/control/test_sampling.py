@@ -6,12 +6,9 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 import pytest
-from arms import arm, error_controlled, fixed_step, law
+from arms import arm, error_controlled
 from numpy.testing import assert_allclose
-from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, VectorLogSink
 from runs import run, run_scenario, scenario
 
 from drake_dae import (
@@ -30,8 +27,7 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.diagrams import LoopSettings
-from drake_dae.errors import ModelError, ScenarioError, WiringError
-from drake_dae.systems import ControlHold
+from drake_dae.errors import ModelError, WiringError
 
 STEP = error_controlled(1e-10)
 K, T = 3.0, 0.05
@@ -126,21 +122,6 @@ def test_error_falls_with_the_period(periods):
     assert np.all(errors[-1] < [1e-3, 0.2])
 
 
-def test_delay_is_an_error_of_its_own():
-    """At rest nothing is late: after the errors have died the force is that of the reference."""
-    found = arm("two_link")
-    loop = make_closed_loop(
-        RobotPlant(found.model, structure=found.structure),
-        law("two_link", poles(-10.0)),
-        [ConstantReference(0.3), ConstantReference(20.0)],
-        LoopSettings(sampling=Sampling(2e-3, 3e-3)),
-    )
-    context = loop.diagram.CreateDefaultContext()
-    record = run(loop, context, 3.0, fixed_step(1e-3))
-    # exp(-10 t) (1 + 10 t) is 3e-12 there.
-    assert_allclose(record["controlled_output"][-1], [0.3, 20.0], atol=1e-9)
-
-
 def test_limits_cut_and_tell_when():
     """x' = -1 from 1 until K x = 1, then exp(-K t): cut off for 1 - 1/K seconds."""
     _, _, record = pursue(ConstantReference(0.0), None, 2.0, control_limits=[1.0])
@@ -166,58 +147,6 @@ def test_integrals_stand_still_while_a_drive_is_at_its_limit():
     record = run(loop, context, 1.0, STEP)
     assert np.all(record["excess"] > 0.0)
     assert_allclose(record["integral"], 0.0)
-
-
-def test_sampled_law_reads_a_force_as_it_is():
-    """lambda_k = (1 + G) r - G lambda_(k-1) with the exact model: a start off by 1 N alternates.
-
-    At rest, where the exact model holds: the force error is multiplied by -G = -0.5 a sample.
-    """
-    found = arm("two_link")
-    tracking = TrackingLaw(
-        found.model.dae,
-        poles(-4.0),
-        structure=found.structure,
-        measured_force=True,
-        force_gain=0.5,
-    )
-    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
-    loop = make_closed_loop(
-        RobotPlant(found.model, structure=found.structure),
-        tracking,
-        wanted,
-        LoopSettings(sampling=Sampling(0.01)),
-    )
-    context = loop.diagram.CreateDefaultContext()
-    plant = loop.plant
-    state = found.model.rest_state(found.model.configuration([0.3], [1.2, -1.6]), [20.0])
-    own = plant.GetMyMutableContextFromRoot(context)
-    plant.set_consistent_state(own, state)
-    hold = loop.diagram.GetSubsystemByName("control_hold")
-    held = hold.GetMyMutableContextFromRoot(context)
-    torque = _torque(found.model, state, 19.0)
-    held.SetDiscreteState(torque)
-    record = run(loop, context, 0.05, STEP)
-    errors = at(record, "constraint_force", 0.01 * np.arange(1, 5)) - 20.0
-    # The torque at the start is 1 N too little until the first sample, at once.
-    assert_allclose(errors, [0.5, -0.25, 0.125, -0.0625], rtol=0.02)
-
-
-def _torque(model, state, force):
-    """What holds the arm at rest against gravity and a force, by the plant alone."""
-    plant = model.links.plant
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, state[:2])
-    jacobian = plant.CalcJacobianTranslationalVelocity(
-        context,
-        JacobianWrtVariable.kV,
-        plant.GetFrameByName("tool"),
-        np.zeros(3),
-        plant.world_frame(),
-        plant.world_frame(),
-    )
-    normal = np.array([-1.0, 0.0, 0.0])
-    return -plant.CalcGravityGeneralizedForces(context) - jacobian.T @ normal * force
 
 
 @pytest.mark.parametrize(
@@ -268,19 +197,6 @@ def test_a_law_that_reads_the_force_of_its_own_first_control_is_reported():
     assert pressed(ForceSensor(1, sample_period=0.01)) == pytest.approx(20.0, abs=0.5)
 
 
-def test_hold_of_a_source_shows_it_late():
-    """Any block may stand before it, also one of Drake."""
-    builder = DiagramBuilder()
-    source = builder.AddSystem(ConstantVectorSource([1.0, 2.0]))
-    hold = builder.AddSystem(ControlHold(2, Sampling(0.1, 0.05)))
-    log = builder.AddSystem(VectorLogSink(2))
-    builder.Connect(source.get_output_port(), hold.get_input_port())
-    builder.Connect(hold.get_output_port(), log.get_input_port())
-    simulator = Simulator(builder.Build())
-    simulator.AdvanceTo(0.3)
-    assert_allclose(log.FindLog(simulator.get_context()).data()[:, -1], [1.0, 2.0])
-
-
 @pytest.mark.parametrize(
     ("numbers", "name"), [((0.0, 0.0), "period"), ((-1.0, 0.0), "period"), ((0.01, -1e-3), "delay")]
 )
@@ -294,16 +210,6 @@ def test_limits_that_are_none_are_refused():
         ControlLimits([1.0, 0.0])
     with pytest.raises(WiringError, match=r"2.*1"):
         pursue(ConstantReference(0.0), None, 1.0, control_limits=[1.0, 1.0])
-
-
-def test_scenario_samples_and_limits():
-    """The record has what was cut off; a robot without limits has nothing to cut."""
-    found = scenario(
-        "seven_joint_wall", "sampling={period: 2.0e-3, delay: 1.0e-3}", "saturation=true"
-    )
-    assert found.sampling == Sampling(2e-3, 1e-3)
-    with pytest.raises(ScenarioError, match=r"sampling: .*period"):
-        scenario("two_link_wall", "sampling={period: 0.0}")
 
 
 def grown(gain, a, late):

@@ -23,12 +23,10 @@ from drake_dae import (
     rollout,
     simulate,
 )
-from drake_dae.cli import main
 from drake_dae.dae import DerivativeLayout, Observation, Parameter, find_structure, with_disturbance
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.running import start_values
-from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model
 from drake_dae.scenario.shipped import FOLDER
 from drake_dae.systems import Observing
@@ -245,28 +243,6 @@ def test_errors_of_the_model_are_found_and_compensated(settings, position, force
             assert abs(value - true[name]) < 2.0 * deviation
 
 
-def test_the_simulator_steps_as_a_rollout_does():
-    """The estimates after 0.1 s, within what Newton's steps of the contact leave."""
-    loop, context, record = rolled(0.1, *KILOGRAM)
-    simulate(loop.diagram, context, 0.1)
-    slow = loop.record(context)
-    for name in ("identified", "identified_deviation", "state"):
-        assert_allclose(record[name][-1], slow[name][-1], rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_the_summary_says_what_is_known_and_what_the_motion_does_not_excite(tmp_path, capsys):
-    settings = [*KILOGRAM, "duration=0.5", "write={plots: false, animation: false}"]
-    words = [word for setting in settings for word in ("--set", setting)]
-    out = str(tmp_path / "run")
-    assert main(["simulate", "wall_point_contact", "--rollout", *words, "--out", out]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert any(line.startswith("identified           payload.mass = 0.") for line in lines)
-    (line,) = [line for line in lines if line.startswith("not identified")]
-    assert "payload.center[0]" in line
-    assert line.endswith("this motion does not excite them")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "message"),
@@ -283,14 +259,6 @@ def test_estimates_that_are_not_possible_are_refused(settings, message):
 def test_an_estimate_needs_an_observer():
     with pytest.raises(ScenarioError, match=r"estimator\.rate: "):
         build_scenario(load_scenario("two_link_wall", ["estimator.identify=[link2.mass]"]))
-
-
-@pytest.mark.slow
-def test_the_law_s_model_has_nothing_to_estimate():
-    """Formerly `analyze` refused these, since its ideal run has no observer."""
-    estimates = ["estimator.identify=[link2.mass]", "bounds.link2.mass=[1, 20]", "duration=0.2"]
-    chosen = load_scenario("wall_guarded", [*estimates, "task={phases: [!Approach {within: 0.1}]}"])
-    assert "identified" not in str(find_feasibility(chosen).problems)
 
 
 def test_bounds_are_needed_in_python_too():

@@ -6,7 +6,6 @@ import pytest
 import scipy.integrate
 from arms import error_controlled
 from numpy.testing import assert_allclose
-from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -160,35 +159,6 @@ def test_without_a_wire_nothing_moves():
         plant.GetInputPort("control").FixValue(context, [0.5, 0.2])
         rates.append(plant.EvalTimeDerivatives(context).CopyToVector())
     assert_allclose(*rates, rtol=1e-14)
-
-
-def test_gradients_by_the_exogenous_signals():
-    """AutoDiffXd against central differences of steps 1e-6: errors of 1e-10 of numbers of 10."""
-    plant = DaePlant(rod())
-    converted = plant.ToAutoDiffXd()
-    context, other = plant.CreateDefaultContext(), converted.CreateDefaultContext()
-    w = np.array([1.3, -0.4, 0.7])
-    state = np.array([0.5, -1.2, 0.3, 0.4])
-    for port, value in (("control", [0.5, 0.2]), ("exogenous", InitializeAutoDiff(w))):
-        converted.GetInputPort(port).FixValue(other, np.reshape(value, -1))
-    plant.GetInputPort("control").FixValue(context, [0.5, 0.2])
-    plant.set_state(context, state)
-    other.SetContinuousState(state)
-    rate = ExtractGradient(converted.EvalTimeDerivatives(other).CopyToVector())
-    force = ExtractGradient(converted.GetOutputPort("constraint_force").Eval(other))
-
-    def at(values):
-        plant.GetInputPort("exogenous").FixValue(context, values)
-        return np.concatenate(
-            [
-                plant.EvalTimeDerivatives(context).CopyToVector(),
-                plant.GetOutputPort("constraint_force").Eval(context),
-            ]
-        )
-
-    steps = 1e-6 * np.eye(3)
-    differences = np.array([(at(w + d) - at(w - d)) / 2e-6 for d in steps]).T
-    assert_allclose(np.vstack([rate, force]), differences, atol=1e-8)
 
 
 def test_the_linear_model_knows_what_moves():

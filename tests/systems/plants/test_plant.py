@@ -26,23 +26,6 @@ def driven(plant, control):
     return simulator, plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
 
 
-def test_ports():
-    plant = two_link()
-    sizes = {
-        "state": 4,
-        "constraint_force": 1,
-        "constraint_residual": 2,
-        "controlled_output": 2,
-        "link_state": 4,
-        "constraint_wrenches": 12,
-    }
-    assert plant.num_output_ports() == len(sizes)
-    for name, size in sizes.items():
-        assert plant.GetOutputPort(name).size() == size
-    assert plant.num_input_ports() == 1
-    assert plant.GetInputPort("control").size() == 2
-
-
 def test_direct_feedthrough_is_exact():
     """With rigid joints the force feeds through; z = x of the pendulum does not."""
     for plant, through in (
@@ -56,15 +39,6 @@ def test_direct_feedthrough_is_exact():
             if plant.HasDirectFeedthrough(control, i)
         }
         assert found == through
-
-
-def test_outputs_without_feedthrough_need_no_control():
-    plant = two_link()
-    context = plant.CreateDefaultContext()
-    assert np.max(np.abs(plant.GetOutputPort("constraint_residual").Eval(context))) < 1e-14
-    np.testing.assert_array_equal(
-        plant.GetOutputPort("state").Eval(context), plant.GetOutputPort("link_state").Eval(context)
-    )
 
 
 def test_outputs_follow_state_control_and_parameters():
@@ -87,32 +61,6 @@ def test_outputs_follow_state_control_and_parameters():
     np.testing.assert_array_equal(plant.get_parameter(context, "wall.position"), [1.25, 0, 0])
     with pytest.raises(ModelError, match=r"'wal'.*link1\.mass"):
         plant.set_parameter(context, "wal", 0.0)
-
-
-def test_pendulum_swings_as_in_polar_coordinates():
-    """phi'' = -g sin phi by an independent integrator; both to about 1e-9."""
-    from scipy.integrate import solve_ivp
-
-    simulator, context = driven(
-        DaePlant(hanging_pendulum(nominal_state=[0.6, -0.8, 0.0, 0.0])), 0.0
-    )
-    plant = simulator.get_system().GetSubsystemByName("pendulum")
-    ApplySimulatorConfig(error_controlled(1e-11), simulator)
-    simulator.AdvanceTo(2.0)
-    angle = np.arctan2(0.6, 0.8)
-    polar = solve_ivp(
-        lambda t, s: [s[1], -9.81 * np.sin(s[0])], (0, 2), [angle, 0], rtol=1e-12, atol=1e-12
-    ).y[:, -1]
-    theory = [
-        np.sin(polar[0]),
-        -np.cos(polar[0]),
-        polar[1] * np.cos(polar[0]),
-        polar[1] * np.sin(polar[0]),
-    ]
-    np.testing.assert_allclose(plant.state(context), theory, atol=1e-8)
-    # The rod's force: 2 v = -(g cos phi + phi'^2).
-    force = plant.GetOutputPort("constraint_force").Eval(context)[0]
-    assert 2 * force == pytest.approx(-(9.81 * np.cos(polar[0]) + polar[1] ** 2), abs=1e-7)
 
 
 def test_a_start_off_the_constraint_is_refused_with_its_residual():
@@ -146,19 +94,6 @@ def test_projection_is_due_at_the_start_of_the_next_step():
     before = np.max(np.abs(port.Eval(context)))
     simulator.AdvancePendingEvents()
     assert np.max(np.abs(port.Eval(context))) < 1e-13 < before
-
-
-def test_projection_does_not_change_the_reported_force():
-    """The force at a consistent state is that of the dynamics, to round-off."""
-    first, second = two_link(), two_link(project=False)
-    values = []
-    for plant in (first, second):
-        simulator, context = driven(plant, [40.0, 20.0])
-        ApplySimulatorConfig(fixed_step(1e-3), simulator)
-        simulator.AdvanceTo(0.2)
-        simulator.AdvancePendingEvents()
-        values.append(plant.GetOutputPort("constraint_force").Eval(context)[0])
-    assert values[0] == pytest.approx(values[1], rel=1e-10)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -140,40 +140,6 @@ def test_law_reads_what_was_measured_at_its_samples(settings):
     assert 2e-5 < off.max() < 1e-4
 
 
-@pytest.mark.slow
-def test_error_of_the_loop_is_what_the_encoders_drive_into_it():
-    """xi_(k+1) = F xi_k - Gamma K (xi_k + n_k), n_k what the encoders add to (z, z').
-
-    B and a at the measured state are left out: they change as gravity does, 10 1/s^2 beside gains
-    of 625 1/s^2. What is left without rounding is the lag of the velocities. Ten times the
-    resolution makes ten times the rest: of 0.6 s the poles at -25 1/s leave some 15 independent
-    values, so that the ratio is known to a quarter; two of these are allowed.
-    """
-    period, w = 2e-3, 25.0
-    settings = (f"sampling={{period: {period}}}", f"law.gains.all=[-{w}]", "duration=0.6")
-    exact = run_scenario(scenario("two_link_wall", *settings))[2]
-    errors = []
-    for delta in (0.0, 2e-5, 2e-4):
-        rough = f"sensors.encoders={{resolution: {delta}, velocity_bandwidth: 400.0}}"
-        loop, _, record = run_scenario(scenario("two_link_wall", rough, *settings))
-        law = loop.controller.law
-        xi, found = np.zeros(2), []
-        for k in np.searchsorted(record.time, period * np.arange(300) - 1e-9):
-            found.append(xi[0])
-            states = (record[name][k] for name in ("estimated_state", "state"))
-            measured, true = (law.error_coordinates(x, record["reference"][k]) for x in states)
-            push = -(w * w * (xi[0] + (measured - true)[0]))
-            push -= 2.0 * w * (xi[1] + (measured - true)[1])
-            xi = np.array([xi[0] + period * xi[1] + period**2 / 2 * push, xi[1] + period * push])
-        times = period * np.arange(300)
-        added = np.interp(times, record.time, record["tracking_error"][:, 0])
-        added -= np.interp(times, exact.time, exact["tracking_error"][:, 0])
-        errors.append(added)
-        assert_allclose(added, found, atol=0.1 * np.abs(found).max())
-    fine, coarse = (np.std(error - errors[0]) for error in errors[1:])
-    assert_allclose(coarse / fine, 10.0, rtol=0.5)
-
-
 def test_seed_is_that_of_the_scenario():
     found = scenario("two_link_wall", ROUGH, *SAMPLED)
     loop, _ = build_scenario(found)
@@ -202,7 +168,7 @@ def test_encoders_and_force_sensor_of_one_seed_have_noise_of_their_own(seed):
     felt, measured = [], []
     for k in range(4):
         simulator.AdvanceTo((k + 0.5) * 2.0 * T)
-        for source, numbers in ((loop.noise, felt), (loop.encoders.noise, measured)):
+        for source, numbers in ((loop.noise, felt), (loop.encoder_noise, measured)):
             own = source.GetMyContextFromRoot(context)
             numbers.extend(source.get_output_port().Eval(own))
     assert len(set(felt)) == 4

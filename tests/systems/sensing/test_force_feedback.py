@@ -119,50 +119,6 @@ def test_measured_force_removes_the_static_error_behind_motors(stage):
     np.testing.assert_allclose(feedback[:, 0], without[:, 0], atol=1e-9)
 
 
-@pytest.mark.slow
-def test_measured_force_removes_the_misprediction_behind_springs():
-    """At rest (71) leaves Lambda_5 (lambda - r_2) = -lambda'' of the model, not 0.
-
-    With the model's lambda in its place it leaves (lambda - model's lambda) in addition. Both are
-    checked at the end, where lambda'' comes from the law's own structure.
-    """
-    model = touching("two_link", [FlexibleJoints(8000.0, inertia=1.0)])
-    for measured in (False, True):
-        _, error, chosen, state, parameters = run(model, HOLD, duration=4.0, measured=measured)
-        structure = chosen.structure
-        reference = np.zeros(8)
-        reference[0], reference[5] = 0.3, 20.0
-        force = error[-1, 1] + 20.0
-        given = {"measured_force": [force]} if measured else {}
-        u = chosen.control(state, reference, parameters=parameters, **given)
-        values = _evaluate(structure, state, parameters, u)
-        predicted, second_rate = values
-        stiffness = 100.0  # Lambda_5 of two poles at -10
-        left = -second_rate / stiffness
-        if not measured:
-            left += force - predicted
-        assert error[-1, 1] == pytest.approx(left, rel=1e-4)
-        assert abs(error[-1, 1]) > 1.0
-
-
-def _evaluate(structure, state, parameters, control):
-    """The model's lambda and lambda'' at a state under a control."""
-    from drake_dae.trace.functions import TracedFunction
-
-    dae = structure.system
-    function = TracedFunction(
-        "force",
-        {"x": dae.state, "p": dae.parameter_symbol},
-        {
-            "force": structure.output_chains[1][0],
-            "drift": structure.drift,
-            "matrix": structure.control_matrix,
-        },
-    )
-    force, drift, matrix = function(state, parameters)
-    return force[0], (drift + matrix @ control)[1]
-
-
 def test_with_a_right_model_measured_force_changes_nothing():
     """lambda is the model's lambda then: the law is the same to round-off."""
     for stages in ([MOTORS], [FlexibleJoints(8000.0, inertia=1.0)]):
@@ -298,24 +254,6 @@ def test_noise_has_its_deviation_and_its_seed():
     assert np.max(np.abs(again - other)) > 0.1
     # 2000 samples: the deviation is known to 2 % (one sigma 1.6 %).
     np.testing.assert_allclose(np.std(first, axis=1), [0.5, 2.0], rtol=0.06)
-
-
-def test_a_bias_that_drifts_moves_the_force_by_the_closed_form():
-    """tau y' = lambda - y, lambda = (1 + G) r - G (y + d t): after the transient
-
-    lambda - r = -G d / (1 + G) (t + tau G / (1 + G)), with the right model and at rest.
-    """
-    gain, lag, rate = 4.0, 0.05, 0.5
-    sensor = ForceSensor(1, lag, drift=rate)
-    arms = arm("two_link")
-    time, errors, *_ = run(arms.model, HOLD, measured=True, gain=gain, sensor=sensor, wrong=1.0)
-    share = gain / (1.0 + gain)
-    # exp(-(1 + G) t / tau) is e^-100 there; the projection leaves 1e-9 N.
-    late = time > 1.0
-    wanted = -share * rate * (time[late] + lag * share)
-    np.testing.assert_allclose(errors[late, 1], wanted, atol=1e-6)
-    assert np.abs(wanted[-1]) > 1.0
-    np.testing.assert_allclose(errors[late, 0], 0.0, atol=1e-8)
 
 
 def test_the_drift_of_a_sensor_is_set_in_a_context():

@@ -142,19 +142,6 @@ def test_a_phase_of_a_users_own_has_all_that_the_others_have():
 
 
 @pytest.mark.slow
-def test_who_holds_keeps_contact_and_force():
-    """The force has no rate in this law: it stays what it was."""
-    pushed = Move({"wall.force": 20.0}, 1.0, over=0.5, guards=[Condition("force", above=15.0)])
-    loop, context, changes = ended([PRESS, replace(pushed, on_failure="hold")], 0.0, 0.8)
-    assert [change.phase for change in changes] == ["Press", "Move", "held"]
-    record = loop.record(context)
-    after = record.time > changes[-1].time + 0.1
-    assert_allclose(record["tracking_error"][after, 1], 0.0, atol=0.01)
-    assert_allclose(record["constraint_force"][after, 0], 15.0, atol=0.6)  # Its reference then.
-    assert changes[-1].in_contact
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "phases",
     [

@@ -8,41 +8,34 @@ import pytest
 from arms import arm, numbers
 from numpy.testing import assert_allclose
 from polishing import (
-    CLIMB,
     FAR,
     OVER,
     PERIOD,
     POLE,
     SPEED,
     WHOLE,
-    add_arm,
     laws,
     push,
     run_on,
     started,
     task_loop,
 )
-from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae import (
     Approach,
     ConstantReference,
-    ContactMaterial,
-    ContactPlant,
     Dwell,
     Move,
     Press,
     Release,
     Retreat,
     RobotPlant,
-    Sampling,
     Task,
     TaskController,
     TrackingLaw,
     poles,
-    simulate,
 )
-from drake_dae.diagrams import LoopSettings, wire_loop
+from drake_dae.diagrams import wire_loop
 from drake_dae.diagrams.record import phase_spans, phases_at
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems import open_contact
@@ -149,21 +142,6 @@ def test_a_task_that_may_not_try_again_ends():
     assert (last.phase, last.failed) == ("held", True)
 
 
-@pytest.mark.slow
-def test_patience_goes_on_from_phase_to_phase():
-    """The first phase lasts for 15 ms, shorter than it; a hand pulls in it."""
-    short = [Dwell(0.015, over=0.01), Dwell(0.05, over=0.01, if_lost="hold")]
-    loop = task_loop([HOLDING, Press(10.0, over=0.1), *short], patience=0.02)
-    context = started(loop, distance=0.01)
-    run_on(loop, context, 0.255)
-    assert loop.changes(loop.record(context))[-1].phase == "Dwell"
-    push(loop, context, -40.0)
-    run_on(loop, context, 0.4)
-    last = loop.changes(loop.record(context))[-1]
-    assert (last.phase, last.reason) == ("held", "the contact of Dwell 2 is lost")
-    assert_allclose(last.time, 0.275, atol=0.01)
-
-
 def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
     """A reference below zero pulls it off, and it has gone when the last phase ends."""
     pulled = Move({"wall.force": -5.0}, 0.05, over=0.01)
@@ -193,17 +171,6 @@ def test_task_may_begin_in_contact():
     record = loop.record(context)
     assert record["constraint_force"].max() == pytest.approx(5.0, abs=0.2)
     assert loop.changes(loop.record(context))[-1].phase == "done"
-
-
-@pytest.mark.slow
-def test_robot_rests_after_a_release_as_a_free_one():
-    """It was let go at 0.5 N, 5e-6 m deep, and stays there."""
-    loop = task_loop([Press(5.0, over=0.02), Release(over=0.02)])
-    context = started(loop, distance=0.0)
-    run_on(loop, context, 0.1)
-    last = loop.changes(loop.record(context))[-1]
-    assert (last.phase, last.in_contact) == ("done", False)
-    assert_allclose(loop.record(context)["distance"][-1], 0.0, atol=1e-4)
 
 
 def test_law_may_have_another_wall(whole):
@@ -252,48 +219,6 @@ def test_free_member_is_the_robot_without_the_wall():
     gap, rate = 1.2 - tool[0], found.constraint_jacobian @ v
     wanted = 0.4 - 16.0 * (rate - 0.2) - 64.0 * (gap - 0.05)
     assert_allclose(moved, wanted, rtol=1e-10)
-
-
-@pytest.mark.slow
-def test_drakes_own_contact_is_the_plant():
-    """1e5 N/m at 1 kHz, one sample late: measured 0.4 N and 0.2 mm off at most in contact.
-
-    It touches as fast as designed except for what a delay of 1 ms does, measured 0.6 %.
-    """
-    found = arm("two_link")
-    plant = ContactPlant(
-        found.model, add_arm, ContactMaterial(radius=1e-5), structure=found.structure
-    )
-    system = found.model.dae
-    law = TrackingLaw(
-        system, poles(-25.0), structure=found.structure, constraint_damping=poles(-250.0)
-    )
-    free = TrackingLaw(
-        open_contact(system, "wall.force"), poles({"tool.z": -25.0, "wall.distance": -8.0})
-    )
-    phases = (
-        Approach(SPEED, over=0.1),
-        Press(20.0, over=0.1),
-        Move({"tool.z": CLIMB}, 0.5, over=0.2),
-        Release(over=0.1),
-        Retreat(0.01, over=0.2),
-    )
-    controller = TaskController(Task(phases), law, free, sample_period=1e-3)
-    loop = wire_loop(plant, controller, settings=LoopSettings(sampling=Sampling(1e-3, 1e-3)))
-    context = loop.diagram.CreateDefaultContext()
-    loop.set_state(context, controller.rest_state([0.3, 0.25 * FAR], system.nominal_state))
-    simulate(loop.diagram, context, 1.15, SimulatorConfig())
-    changes = loop.changes(loop.record(context))
-    assert [change.phase for change in changes][-2:] == ["Retreat", "done"]
-    record = loop.record(context)
-    touch = int(np.argmax(record["constraint_force"][:, 0] > 0.0))
-    assert_allclose(record.time[touch], 0.25 * FAR / SPEED + 0.05, atol=2e-3)
-    assert_allclose(record["distance"][touch - 1, 1], -SPEED, atol=5e-4)
-    moving = record["phase"][:, 2] > 0.0
-    assert_allclose(record["tracking_error"][moving, 1], 0.0, atol=0.6)
-    assert_allclose(record["tracking_error"][moving, 0], 0.0, atol=2e-4)
-    assert record["constraint_force"][moving, 0].min() > 19.0
-    assert_allclose(record["distance"][-1, 0], 0.01, atol=1e-3)
 
 
 @pytest.mark.parametrize(

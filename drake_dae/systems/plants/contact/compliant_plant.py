@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
@@ -14,14 +16,31 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae import ConstraintStructure, Signal, constraint_structure_of
 from drake_dae.errors import ModelError
 from drake_dae.robots import RobotModel
-from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plants.contact.compliance import OUTSIDE, CompliantEquations
-from drake_dae.systems.plants.contact.contact_checks import changed_parameters
+from drake_dae.systems.parameterized import ParameterizedSystem, changed_parameters
 from drake_dae.systems.plants.contact.contact_forces import contact_force_signals
+from drake_dae.systems.plants.contact.contact_laws import (
+    Compliance,
+    ball_normals,
+    contact_force,
+    contact_step,
+    point_contacts,
+    touching,
+)
 from drake_dae.systems.plants.contact.contact_material import FRICTION, PointMaterial
-from drake_dae.systems.plants.contact.stage_steps import check_step
-from drake_dae.systems.plants.contract import Plant
-from drake_dae.trace.functions import FailureKind
+from drake_dae.systems.plants.contact.stage_steps import check_step, stage_rates, stages_after
+from drake_dae.systems.plants.contract import Plant, port_signals
+from drake_dae.systems.plants.robot_plant import joint_outputs
+from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.functions import FailureKind, TracedFunction
+
+FITS = 1e-3
+"""The allowed depth of a ball at its contact point, relative to its radius."""
+
+OUTSIDE = (
+    "a joint reaches its limit, and this plant has no stops, or the forces of stiff contacts are "
+    "not found; `plant: !MultibodyPlant` has stops"
+)
+"""The reason why a `CompliantPlant` cannot continue."""
 
 
 @checked(ModelError)
@@ -85,10 +104,8 @@ class CompliantPlant(ParameterizedSystem, Plant):
         self.time_step, self._stepped = material.time_step, np.zeros(0)
         self._check_step(values)
         self.structure, self.material = structure, material
-        equations = CompliantEquations(model, structure, material)
-        self._place = equations.own_parameters
-        block = compliant_block(model, equations, structure, material, values)
-        super().__init__(dae, block)
+        self._equations = CompliantEquations(model, structure, material)
+        super().__init__(dae, self._equations.block(values))
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
@@ -117,11 +134,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
         return context.get_discrete_state(0).CopyToVector()
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets x as given, shape (n,), in contact or not.
-
-        Raises:
-            ModelError: The shape is wrong.
-        """
+        """Sets x as given, shape (n,), in contact or not; another shape is a ModelError."""
         if not self.time_step:
             super().set_state(context, state)
             return
@@ -157,7 +170,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
         values = context.get_numeric_parameter(0).CopyToVector()
         values = values[: self.dae.parameter_symbol.numel()]
         self._check_step(values)
-        placed = self._place(values, material)
+        placed = self._equations.own_parameters(values, material)
         context.get_mutable_numeric_parameter(0).SetFromVector(placed)
 
     def _check_step(self, values: FloatArray) -> None:
@@ -172,39 +185,161 @@ class CompliantPlant(ParameterizedSystem, Plant):
         return self.block.signals["contact_force"]
 
 
-def compliant_block(
-    model: RobotModel,
-    equations: CompliantEquations,
-    structure: ConstraintStructure,
-    material: PointMaterial,
-    values: FloatArray,
-) -> Block:
-    """The block of a robot in compliant contact, continuous or discrete; see `CompliantPlant`."""
-    dae, forces = model.dae, contact_force_signals(model)
-    fits = Requirement(equations.slack, OUTSIDE, FailureKind.OUTSIDE)
-    state, advanced = structure.manifold.project(dae.nominal_state), fits.of(equations.advanced)
-    block = Block(
-        dae.name,
-        inputs={"control": equations.control},
-        outputs=equations.outputs,
-        parameters=equations.parameters,
-        start={"state": state, "parameters": equations.own_parameters(values, material)},
-        requirements=(fits,),
-        signals={
-            "state": dae.state_signals,
-            "control": dae.control_signals,
-            "constraint_force": dae.force_signals,
-            "constraint_residual": structure.manifold.residual_signals,
-            "controlled_output": dae.output_signals,
-            "contact_force": forces,
-            "parameters": [*dae.parameter_signals, *material.signals],
-        },
-    )
-    if not material.time_step:
-        return replace(block, state=dae.state, derivative=advanced, scale=dae.scale)
-    n, rate = dae.num_states, material.time_step
-    held = {
-        "state": Held(dae.state, advanced[:n, 0], state, rate),
-        "contact_force": Held(equations.force, advanced[n:, 0], np.zeros(len(forces)), rate),
-    }
-    return replace(block, held=held)
+class CompliantEquations:
+    """The equations of a `CompliantPlant`, whose state is x, or (x, F) if it is discrete.
+
+    Parameters are those of the system, followed by `PointMaterial.values` and `ball_normals` of the
+    nominal configuration: see `own_parameters`.
+    """
+
+    def __init__(
+        self, model: RobotModel, structure: ConstraintStructure, material: PointMaterial
+    ) -> None:
+        dae, self._model, self._material = model.dae, model, material
+        self._structure = structure
+        numbers = ca.SX.sym("material", 4)
+        normals = ca.SX.sym("normals", 3 * len(model.constraints))
+        self._compliance = Compliance(numbers[0], numbers[1], material.stiction_tolerance)
+        friction = None if material.friction is None else numbers[2]
+        self._contacts = point_contacts(model, normals, numbers[3], friction)
+        self._parameters = ca.vertcat(dae.parameter_symbol, numbers, normals)
+        self._normals = dae.trace("normals", {"normals": ball_normals(model)}, often=False)
+        depths = ca.vertcat(*(contact.depth for contact in self._contacts))
+        inputs = {"state": dae.state, "parameters": self._parameters}
+        self._depths = TracedFunction("depths", inputs, {"depths": depths}, often=False)
+
+    def own_parameters(self, values: FloatArray, material: PointMaterial) -> FloatArray:
+        """All parameters, with the balls placed where they touch in the nominal configuration.
+
+        `values` are those of the system. Refuses a ball that does not fit there.
+        """
+        dae, manifold = self._model.dae, self._structure.manifold
+        state = manifold.project(dae.nominal_state, values)
+        normals = self._normals(state, values)[0]
+        parameters = np.concatenate([values, material.values, normals])
+        depths = self._depths(state, parameters)[0]
+        for constraint, depth in zip(self._model.constraints, depths.tolist(), strict=True):
+            if not depth <= FITS * material.radius:
+                raise ModelError(
+                    f"a ball with a radius of {material.radius:g} m does not fit "
+                    f"'{constraint.name}' where it shall touch, since the surface bends toward it "
+                    "more than the ball does: take a smaller radius"
+                )
+        return parameters
+
+    def block(self, values: FloatArray) -> Block:
+        """The block of the plant, with these defaults of the system's parameters."""
+        dae, structure, material = self._model.dae, self._structure, self._material
+        period, control = material.time_step, ca.SX.sym("u", dae.num_controls)
+        forces = contact_force_signals(self._model)
+        if period:
+            force = ca.SX.sym("F", len(forces))
+            advanced, slack = self._step(control, period)
+        else:
+            v = self._model.links.v
+            each = [contact_force(contact, v, self._compliance) for contact in self._contacts]
+            force = ca.vertcat(*each)
+            advanced, slack = self._rate(control, force)
+        fits = Requirement(slack, OUTSIDE, FailureKind.OUTSIDE)
+        state, advanced = structure.manifold.project(dae.nominal_state), fits.of(advanced)
+        normals = ca.horzcat(*(touch.normal for _, touch in touching(self._model)))
+        lambdas = ca.sum1(normals * ca.reshape(force, 3, -1)).T
+        block = Block(
+            dae.name,
+            inputs={"control": control},
+            outputs={
+                "state": dae.state,
+                **joint_outputs(self._model),
+                "contact_force": force,
+                "constraint_force": lambdas,
+                "constraint_residual": structure.manifold.residual_expression,
+                "controlled_output": dae.outputs(lambdas),
+            },
+            parameters=self._parameters,
+            start={"state": state, "parameters": self.own_parameters(values, material)},
+            requirements=(fits,),
+            signals={
+                **port_signals(structure),
+                "control": dae.control_signals,
+                "contact_force": forces,
+                "parameters": [*dae.parameter_signals, *material.signals],
+            },
+        )
+        if not period:
+            return replace(block, state=dae.state, derivative=advanced, scale=dae.scale)
+        n, none = dae.num_states, np.zeros(len(forces))
+        held = {
+            "state": Held(dae.state, advanced[:n, 0], state, period),
+            "contact_force": Held(force, advanced[n:, 0], none, period),
+        }
+        return replace(block, held=held)
+
+    def _balance(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """M and tau - H without contact, with torques within the limits of the actuators."""
+        model, dae, links = self._model, self._model.dae, self._model.links
+        nq, nv = links.q.numel(), links.v.numel()
+        part = slice(nq, nq + nv)
+        viscous = [
+            parameter.symbol
+            for constraint in model.constraints
+            for parameter in constraint.parameters
+            if parameter.name == f"{constraint.name}.viscous_friction"
+        ]
+        # Viscous friction belongs to the contacts here.
+        forces = dae.f[part]
+        if viscous:
+            forces = ca.substitute(forces, ca.vertcat(*viscous), ca.DM.zeros(len(viscous)))
+        limits = ca.DM(links.effort_limits)
+        torque = control if model.joint_force is None else model.joint_force
+        within = ca.fmin(ca.fmax(torque, -limits), limits)
+        if model.joint_force is not None:
+            within -= model.joint_force  # It is also part of f.
+        drive = ca.mtimes(ca.SX(ca.sparsify(ca.DM(links.actuation_matrix))), within)
+        return dae.mass_matrix[part, part], forces + drive
+
+    def _rate(self, control: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """x' of a continuous plant, and a number that is negative where it is not valid."""
+        model, links = self._model, self._model.links
+        mass, forces = self._balance(control)
+        jacobian = ca.vertcat(*(contact.jacobian for contact in self._contacts))
+        forces += ca.mtimes(jacobian.T, force)
+        change = PositiveDefiniteFactorization(mass).solve(forces)
+        velocity = ca.mtimes(links.velocity_map, links.v)
+        rate = ca.vertcat(velocity, change, stage_rates(model, control))
+        return rate, self._within_limits(links.q)
+
+    def _step(self, control: ca.SX, h: float) -> tuple[ca.SX, ca.SX]:
+        """(x, F) after a step, and a number that is negative where they are not valid."""
+        model, links = self._model, self._model.links
+        mass, forces = self._balance(control)
+        # D of the friction -D v of joints, at the velocities before the step.
+        kinematics, size = links.kinematics(), links.v.numel()
+        resistance = (load.resistance(kinematics) for load in model.known_forces)
+        mass += h * (ca.diag(ca.DM(_damping(model))) + sum(resistance, ca.SX(size, size)))
+        free = links.v + h * PositiveDefiniteFactorization(mass).solve(forces)
+        moved = contact_step(self._contacts, links.v, free, mass, h, self._compliance)
+        velocities, contact_forces, slack = moved
+        velocity = ca.mtimes(links.velocity_map, velocities)
+        # Drake's stops push if a joint would pass its limit within two steps.
+        ahead = self._within_limits(links.q + 2.0 * h * velocity)
+        stages = stages_after(model, h, control) if model.stages else ca.SX(0, 1)
+        after = ca.vertcat(links.q + h * velocity, velocities, stages, contact_forces)
+        return after, ca.fmin(slack, ahead)
+
+    def _within_limits(self, q: ca.SX) -> ca.SX:
+        """The least distance of joints from their limits; negative beyond one."""
+        low, high = self._model.links.position_limits
+        gaps = [q[i] - low[i] for i in np.flatnonzero(np.isfinite(low)).tolist()]
+        gaps += [high[i] - q[i] for i in np.flatnonzero(np.isfinite(high)).tolist()]
+        return reduce(ca.fmin, gaps, ca.SX(1))
+
+
+def _damping(model: RobotModel) -> FloatArray:
+    """The damping of the joints, which Drake takes implicitly, shape (nv,)."""
+    damping, plant = np.zeros(model.links.v.numel()), model.links.plant
+    if plant is not None:
+        for index in plant.GetJointIndices():
+            joint = plant.get_joint(index)
+            first = joint.velocity_start()
+            damping[first : first + joint.num_velocities()] = joint.default_damping_vector()
+    return damping

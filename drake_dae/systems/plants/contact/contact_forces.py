@@ -14,40 +14,27 @@ from drake_dae.blocks.block import Block, Held, Requirement
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY, port_value
 from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.robots import RobotModel, contact_normals
+from drake_dae.systems.plants.contact.contact_laws import ball_normals, point_contacts
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial
-from drake_dae.systems.plants.contact.point_contact import ball_normals, point_contacts
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
 
 class ContactForces(LeafSystem):
-    """Sums Drake's contact results to the forces of a robot's contacts.
+    """Sums the points and patches of Drake's contact results to a force F of each constraint.
 
-    Input port:
-        contact_results: Those of the MultibodyPlant.
-
-    Output port:
-        contact_force: The total force F on the robot of all contacts (points and patches) between
-            the two geometries of each constraint, in the world, N, shape (3 m,), including
-            friction.
-
-    Args:
-        model: The robot; each constraint is a contact with one force.
-        pairs: For each constraint, the geometries of the robot and those of the surface.
-
-    Attributes:
-        contact_force_signals: Names and units of `contact_force`.
+    `contact_force` is that on the robot, in the world, N, shape (3 m,), with friction. `pairs` are
+    the geometries of the robot, and those of the surface, of each constraint.
     """
 
     __slots__ = SHARED_DICTIONARY
 
     def __init__(
         self,
-        model: RobotModel,
         pairs: Sequence[tuple[Sequence[GeometryId], Sequence[GeometryId]]],
     ) -> None:
         super().__init__()
         self.set_name("contact_forces")
-        self._model, self._pairs = model, pairs
+        self._pairs = pairs
         # Geometry -> the first entry of its constraint's force, and the sign of a force on it as
         # one on the robot. A geometry of the robot collides only with its constraint's surface.
         self._owners = {
@@ -56,25 +43,23 @@ class ContactForces(LeafSystem):
             for sign, geometries in zip((1.0, -1.0), pair, strict=True)
             for geometry in geometries
         }
-        self.contact_force_signals = contact_force_signals(model)
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         # Independent of the time, which changes from a record to the next sample while the state
         # does not.
         self.DeclareVectorOutputPort(
             "contact_force",
-            len(self.contact_force_signals),
+            3 * len(pairs),
             port_value(self._contact_force),
             {self.all_input_ports_ticket()},
         )
 
     def again(self) -> "ContactForces":
-        """Another instance, for another diagram."""
-        return ContactForces(self._model, self._pairs)
+        return ContactForces(self._pairs)
 
     def contact_force(self, results: ContactResults) -> list[float]:
         """The contact forces of Drake's contact results, N: 3 m numbers."""
         # Plain numbers: this runs at each step, and arrays of three numbers take twice the time.
-        total = [0.0] * len(self.contact_force_signals)
+        total = [0.0] * (3 * len(self._pairs))
         for i in range(results.num_point_pair_contacts()):
             point = results.point_pair_contact_info(i)
             # The force is that on B.
@@ -106,31 +91,22 @@ def contact_block(
     points in the configuration of the sample before, for which Drake's solver found them:
     F = (J J^T)^-1 J tau. Where J has no full row rank, they are an input, as of `ContactForces`.
     A constraint force is the one along the normal of its surface, lambda = n(q) . F, where n is the
-    gradient of phi. An open contact has lambda = 0 and phi > 0.
-
-    Input ports:
-        state: x, shape (n,).
-        generalized_contact_force: tau, shape (nv,); or contact_force: F, shape (3 m,).
-
-    Output ports:
-        contact_force: F, N, shape (3 m,).
-        constraint_force: lambda, N, shape (m,).
-        constraint_residual: phi and phi', as for `DaePlant`; not zero, since compliant surfaces are
-            penetrated.
-        controlled_output: z = l(x) + m(x) lambda.
-
-    Args:
-        model: The robot; each constraint is a contact with one force.
-        structure: The structure of its system.
-        values: Values of all parameters.
-        material: The material.
+    gradient of phi. An open contact has lambda = 0 and phi > 0. `values` are all parameters.
     """
     dae, numbers = model.dae, ca.DM(values)
     given, held = ca.SX.sym("contact_force", 3 * len(model.constraints)), dict[str, Held]()
     inputs, contact = {"state": dae.state, "contact_force": given}, given
     required: tuple[Requirement, ...] = ()
+    # J of the velocities of all contact points, shape (3 m, nv).
     nominal = structure.manifold.project(dae.nominal_state, values)
-    jacobian = _contact_jacobian(model, nominal, numbers, material.radius)
+    normals = ca.SX.sym("normals", given.numel())
+    contacts = point_contacts(model, normals, ca.SX(material.radius), None)
+    at = ca.Function("n", [dae.state, dae.parameter_symbol], [ball_normals(model)])
+    (jacobian,) = ca.substitute(
+        [ca.vertcat(*(contact.jacobian for contact in contacts))],
+        [normals, dae.parameter_symbol],
+        [at(nominal, numbers), numbers],
+    )
     rows = ca.Function("J", [dae.state], [jacobian])(nominal).full()
     if np.linalg.matrix_rank(rows, tol=1e-6 * np.linalg.norm(rows)) == len(rows):
         tau, before = ca.SX.sym("tau", rows.shape[1]), ca.SX.sym("before", dae.num_states)
@@ -151,18 +127,6 @@ def contact_block(
         "controlled_output": output,
     }
     return Block("contact_signals", inputs, outputs, held=held, requirements=required)
-
-
-def _contact_jacobian(
-    model: RobotModel, nominal: FloatArray, values: ca.DM, radius: float
-) -> ca.SX:
-    """J of the velocities of all contact points, shape (3 m, nv)."""
-    dae, normals = model.dae, ca.SX.sym("normals", 3 * len(model.constraints))
-    contacts = point_contacts(model, normals, ca.SX(radius), None)
-    J = ca.vertcat(*(contact.jacobian for contact in contacts))
-    at = ca.Function("n", [dae.state, dae.parameter_symbol], [ball_normals(model)])
-    (J,) = ca.substitute([J], [normals, dae.parameter_symbol], [at(nominal, values), values])
-    return J
 
 
 def contact_force_signals(model: RobotModel) -> tuple[Signal, ...]:

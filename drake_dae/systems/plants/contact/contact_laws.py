@@ -1,12 +1,13 @@
-"""Drake's laws of point contact, continuous and discrete, as expressions."""
+"""Contacts of balls with surfaces, and Drake's laws of point contact, as expressions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 
-from drake_dae.systems.plants.contact.point_contact import PointContact
-from drake_dae.trace.expressions import as_constant
+from drake_dae.errors import ModelError
+from drake_dae.robots import Constraint, RobotModel, Touch
+from drake_dae.trace.expressions import as_constant, length_of
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
 
 ITERATIONS = 10
@@ -24,15 +25,109 @@ SOFT = 1e-3
 """Drake's `sigma`: the speed scale of friction relative to the change of speed by an impulse."""
 
 
+TURNS = 4
+"""The number of iterations for the deepest point of a ball, if a distance is exact only on the
+surface: they reduce the error of its direction by (radius / radius of curvature)^4."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointContact:
+    """The contact of a ball of a robot with a surface, at the point halfway into their overlap.
+
+    In the world: the depth in m, negative without contact; the unit normal of the surface, toward
+    the robot; J of the velocity J(q) v of the robot at the point; the velocity of the surface
+    there; and the coefficients of Coulomb friction and of viscous friction, N s/m.
+    """
+
+    depth: ca.SX
+    normal: ca.SX
+    jacobian: ca.SX
+    velocity: ca.SX
+    friction: ca.SX
+    viscous_friction: ca.SX
+
+
+def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
+    """The constraints of a robot with their contact points; refuses what is no such contact."""
+    if not model.constraints:
+        raise ModelError("the robot has no constraints, so there is nothing to touch")
+    contacts = []
+    for constraint in model.constraints:
+        touch = constraint.touch(model.links)
+        if touch is None:
+            raise ModelError(
+                f"'{constraint.name}' is no contact of a point with a surface, so it cannot be "
+                "compliant: take an ideal plant, or a PointOnSurface"
+            )
+        contacts.append((constraint, touch))
+    return contacts
+
+
+def ball_normals(model: RobotModel) -> ca.SX:
+    """The normals of the surfaces in the frames of their constraints, stacked, shape (3 k, 1).
+
+    Those of the nominal configuration determine the balls: there a ball touches at the point of its
+    constraint, so that its center is that point plus the radius times the normal.
+    """
+    touches = [touch for _, touch in touching(model)]
+    return ca.vertcat(*(ca.mtimes(model.links.rotation(t.frame).T, t.normal) for t in touches))
+
+
+def point_contacts(
+    model: RobotModel, normals: ca.SX, radius: ca.SX, friction: ca.SX | None
+) -> list[PointContact]:
+    """The contact of a robot's ball with the surface of each constraint.
+
+    `normals` are symbols for `ball_normals` of the nominal configuration; `friction` is the
+    coefficient of all contacts, None for those of the constraints.
+    """
+    kinematics, links = model.links.kinematics(), model.links
+    contacts = []
+    for i, (constraint, touch) in enumerate(touching(model)):
+        point = ca.SX.sym("point", 3)
+        lever = point - kinematics.position(touch.frame, touch.point)
+        moving = kinematics.velocity(touch.frame, touch.point)
+        moving += ca.cross(kinematics.angular_velocity(touch.frame), lever)
+        jacobian = ca.jacobian(kinematics.value(moving), links.v)
+        velocity = kinematics.value(touch.velocity(point))
+        parameters = {
+            p.name.removeprefix(f"{constraint.name}."): p.symbol for p in constraint.parameters
+        }
+        coefficient = parameters.get("friction", ca.SX(0)) if friction is None else friction
+        viscous = parameters.get("viscous_friction", ca.SX(0))
+        arm = radius * normals[3 * i : 3 * i + 3]
+        ball = links.position(touch.frame, touch.point) + ca.mtimes(
+            links.rotation(touch.frame), arm
+        )
+        normal, depth = _overlap(touch, ball, radius)
+        contact = ball - normal * (radius - depth / 2)
+        moves, drags = ca.substitute([jacobian, velocity], [point], [contact])
+        contacts.append(PointContact(depth, normal, moves, drags, coefficient, viscous))
+    return contacts
+
+
+def _overlap(touch: Touch, ball: ca.SX, radius: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """The unit normal of the surface and the depth of the overlap of a ball there.
+
+    If the distance is exact only on the surface, the depth is that of the deepest point of the
+    ball, p = ball - radius n(p), by fixed-point iteration.
+    """
+    point = ca.SX.sym("point", 3)
+    clearance = touch.clearance(point)
+    slope = ca.gradient(clearance, point)
+    if touch.is_exact:
+        normal, gap = ca.substitute([slope, clearance], [point], [ball])
+        return normal, radius - gap
+    slope = slope / length_of(slope)
+    normal = ca.substitute(slope, point, ball)
+    for _ in range(TURNS):
+        normal = ca.substitute(slope, point, ball - radius * normal)
+    return normal, -ca.substitute(clearance, point, ball - radius * normal)
+
+
 @dataclass(frozen=True, eq=False)
 class Compliance:
-    """The contact parameters that all contacts of a plant share.
-
-    Attributes:
-        stiffness: k in N/m.
-        dissipation: d of Hunt and Crossley in s/m.
-        stiction_tolerance: v_s in m/s.
-    """
+    """k in N/m, d of Hunt and Crossley in s/m, and v_s in m/s, of all contacts of a plant."""
 
     stiffness: ca.SX
     dissipation: ca.SX
@@ -46,15 +141,10 @@ def contact_force(contact: PointContact, v: ca.SX, compliance: Compliance) -> ca
 
     with the depth x > 0 and step5(s) = s^3 (10 - 15 s + 6 s^2) up to s = 1, and 1 beyond. Viscous
     friction c is not Drake's.
-
-    Args:
-        contact: The contact.
-        v: The generalized velocities, shape (nv, 1).
-        compliance: Its numbers.
     """
-    relative = _relative(contact, v)
-    sliding, tolerance = contact.along(relative), compliance.stiction_tolerance
-    approach = -ca.dot(contact.normal, relative)
+    relative = ca.mtimes(contact.jacobian, v) - contact.velocity
+    approach, tolerance = -ca.dot(contact.normal, relative), compliance.stiction_tolerance
+    sliding = relative + contact.normal * approach
     damping = ca.fmax(0, 1 + compliance.dissipation * approach)
     push = compliance.stiffness * contact.depth * damping
     speed = ca.sqrt(ca.sumsqr(sliding))
@@ -66,26 +156,6 @@ def contact_force(contact: PointContact, v: ca.SX, compliance: Compliance) -> ca
     return ca.if_else(contact.depth > 0, contact.normal * push + along, ca.SX(3, 1))
 
 
-def _relative(contact: PointContact, v: ca.SX) -> ca.SX:
-    """The velocity of the robot relative to the surface at the contact, m/s, shape (3, 1)."""
-    return ca.mtimes(contact.jacobian, v) - contact.velocity
-
-
-@dataclass(frozen=True, eq=False)
-class ContactStep:
-    """A step of velocities through contact.
-
-    Attributes:
-        velocities: The generalized velocities after the step, shape (nv, 1).
-        forces: The mean forces of the contacts on the robot in the step, in N, shape (3 k, 1).
-        slack: Negative where Newton's method did not find them.
-    """
-
-    velocities: ca.SX
-    forces: ca.SX
-    slack: ca.SX
-
-
 def contact_step(
     contacts: Sequence[PointContact],
     v: ca.SX,
@@ -93,7 +163,7 @@ def contact_step(
     mass: ca.SX,
     time_step: float,
     compliance: Compliance,
-) -> ContactStep:
+) -> tuple[ca.SX, ca.SX, ca.SX]:
     """The step of a discrete MultibodyPlant with Drake's default, the "lagged" approximation:
 
         A (v_+ - v*) = J^T gamma(v_c),    v_c = J v_+ - v_surface,
@@ -114,13 +184,9 @@ def contact_step(
     constants: by the implicit function theorem, first derivatives are then those of the solution,
     at a third of the operations.
 
-    Args:
-        contacts: The contacts.
-        v: The velocities before the step.
-        free: v*, the velocities after a step without contact.
-        mass: A = M + h D, with the damping D of the joints.
-        time_step: h in s.
-        compliance: The numbers of the contacts.
+    Returns:
+        v_+ from v before and v* = `free` after a step without contact; the mean forces of the
+        contacts on the robot in N; and a number that is negative where they were not found.
     """
     h, count = time_step, len(contacts)
     factored = PositiveDefiniteFactorization(mass)
@@ -174,7 +240,7 @@ def contact_step(
     slack = SOLVED * ca.fmax(ca.norm_2(target), AT_REST) - ca.norm_2(residual(velocity))
     impulse = impulses(velocity)
     forces = ca.mtimes(axes.T, impulse) / h
-    return ContactStep(free + ca.mtimes(response, impulse), forces, slack)
+    return free + ca.mtimes(response, impulse), forces, slack
 
 
 def _axes(normal: ca.SX) -> ca.SX:
@@ -227,14 +293,7 @@ class _Lagged:
         h: float,
         compliance: Compliance,
     ) -> "_Lagged":
-        """The impulse, with constants from the state before the step.
-
-        Args:
-            contact: The contact.
-            before: Its velocity before the step, in its axes.
-            jacobian: J, in these axes.
-            mass, h, compliance: As of `contact_step`.
-        """
+        """The impulse; its velocity before the step and J are in the contact's axes."""
         elastic = compliance.stiffness * ca.fmax(contact.depth, 0)
         damping = ca.fmax(0, 1 - compliance.dissipation * before[0])
         lagged = contact.friction * h * elastic * damping

@@ -47,9 +47,6 @@ class PointMaterial:
         radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
             constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
             radius.
-
-    Raises:
-        ModelError: A number is not valid.
     """
 
     time_step: float = 1e-3
@@ -68,21 +65,11 @@ class PointMaterial:
                 raise ModelError(f"{name} must be 0 or more, got {value:g}")
 
     def stiffness_at(self, force: float, sphere: float | None = None) -> float:
-        """The slope of the normal force over depth, in N/m.
-
-        Args:
-            force: The normal force in N.
-            sphere: The radius of the sphere that the ball touches, in m; None for a plane.
-        """
+        """The slope of the normal force over depth, in N/m, on a plane or a sphere of a radius."""
         return self.stiffness
 
     def stiffness_on(self, model: RobotModel, force: float) -> float:
-        """The largest of these slopes at the contacts of a robot.
-
-        Args:
-            model: The robot.
-            force: The normal force of each contact in N.
-        """
+        """The largest of these slopes at the contacts of a robot, each with this normal force."""
         values = model.dae.parameter_values
         forms = [
             solid.form

@@ -19,7 +19,14 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.meshcat import ContactVisualizer
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import Frame, ModelInstanceIndex
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Frame,
+    ModelInstanceIndex,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+)
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import MatrixGain, Multiplexer
 
@@ -29,15 +36,15 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots import ConstraintWrenches, RobotModel, frame_named, own_values
-from drake_dae.systems.plants.contact.contact_checks import (
-    changed_parameters,
-    check_model,
-    check_same,
-    other_masses,
-    set_masses,
-    solids_of,
+from drake_dae.robots import (
+    Constraint,
+    ConstraintWrenches,
+    PosedShape,
+    RobotModel,
+    frame_named,
+    own_values,
 )
+from drake_dae.systems.parameterized import changed_parameters
 from drake_dae.systems.plants.contact.contact_forces import (
     ContactForces,
     contact_block,
@@ -60,24 +67,6 @@ def _is_relevant(record: logging.LogRecord) -> bool:
     return "half spaces are not currently supported for deformable" not in record.getMessage()
 
 
-def _generalized_forces(builder: DiagramBuilder, plant: MultibodyPlant) -> OutputPort:
-    """Drake's generalized contact forces of all joints, in the order of the velocities."""
-    instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
-    moving = [instance for instance in instances if plant.num_velocities(instance)]
-    ports = [plant.get_generalized_contact_forces_output_port(each) for each in moving]
-    if len(ports) == 1:
-        return ports[0]
-    order = np.concatenate(
-        [plant.GetVelocitiesFromArray(each, np.arange(plant.num_velocities())) for each in moving]
-    )
-    stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
-    for i, port in enumerate(ports):
-        builder.Connect(port, stacked.get_input_port(i))
-    sorted_ = builder.AddSystem(MatrixGain(np.eye(order.size)[np.argsort(order)]))
-    builder.Connect(stacked.get_output_port(), sorted_.get_input_port())
-    return sorted_.get_output_port()
-
-
 @checked(ModelError)
 class ContactPlant(Diagram, Plant):
     """A robot in Drake's own contact: a discrete MultibodyPlant with the ports of a `RobotPlant`.
@@ -95,8 +84,10 @@ class ContactPlant(Diagram, Plant):
 
     Output ports:
         state, link_state: x = (q, v), shape (n,).
-        contact_force, constraint_force, constraint_residual, controlled_output: As of
-            `contact_block`.
+        contact_force: F of each contact on the robot, with friction, in the world, N, shape (3 m,).
+        constraint_force: lambda = n . F along the normal of the surface, N, shape (m,).
+        constraint_residual: phi and phi', as for `DaePlant`; not zero in compliant contact.
+        controlled_output: z = l(x) + m(x) lambda.
         contact_results: Drake's.
         query_object: Drake's, of the scene with the contact geometry.
 
@@ -150,7 +141,17 @@ class ContactPlant(Diagram, Plant):
         add_robot(plant, scene_graph)
         pairs = self._add_contacts(plant, scene_graph, material)
         plant.Finalize()
-        check_same(plant, model)
+        drawn = model.links.plant
+        assert drawn is not None  # check_model.
+        names, model_names = (
+            (robot.GetPositionNames(), robot.GetVelocityNames(), robot.GetActuatorNames())
+            for robot in (plant, drawn)
+        )
+        if names != model_names:
+            raise ModelError(
+                f"add_robot must add the robot of the model, with positions "
+                f"{', '.join(model_names[0])}; it has {', '.join(names[0]) or 'none'}"
+            )
         self._masses = other_masses(model, plant, self._values)
         if disturbances:
             frames = [frame_named(plant, disturbance.frame) for disturbance in disturbances]
@@ -167,7 +168,7 @@ class ContactPlant(Diagram, Plant):
                 signals.GetInputPort("generalized_contact_force"),
             )
         else:
-            forces = builder.AddSystem(ContactForces(model, pairs))
+            forces = builder.AddSystem(ContactForces(pairs))
             builder.Connect(results, forces.GetInputPort("contact_results"))
             builder.Connect(forces.get_output_port(), signals.GetInputPort("contact_force"))
         builder.ExportInput(plant.get_actuation_input_port(), "control")
@@ -240,7 +241,6 @@ class ContactPlant(Diagram, Plant):
         return balls
 
     def parameters(self, context: Context) -> FloatArray:
-        """All parameters in the order of `dae.parameters`, shape (k,)."""
         return self._values.copy()
 
     @property
@@ -258,19 +258,110 @@ class ContactPlant(Diagram, Plant):
             builder.Connect(self.GetOutputPort(name), contact.GetInputPort(name))
 
     def state(self, context: Context) -> FloatArray:
-        """The state x in a context, shape (n,)."""
         multibody_context = self.GetSubsystemContext(self.multibody, context)
         return np.array(self.multibody.GetPositionsAndVelocities(multibody_context))
 
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets the state x in a context, shape (n,), in contact or not.
-
-        Also sets the plant's changed masses, which Drake keeps in its context.
-
-        Raises:
-            ModelError: The shape is wrong.
-        """
+        """Sets x, shape (n,), and the plant's changed masses, which Drake keeps in its context."""
         multibody_context = self.GetMutableSubsystemContext(self.multibody, context)
         values = self.dae.state_vector(state)
         self.multibody.SetPositionsAndVelocities(multibody_context, values)
-        set_masses(multibody_context, self._masses)
+        for body, mass, center in self._masses:
+            if center is None:
+                body.SetMass(multibody_context, mass)
+            else:
+                squares = center @ center - center**2
+                unit = UnitInertia(*squares, *(-center[[0, 0, 1]] * center[[1, 2, 2]]))
+                inertia = SpatialInertia(mass, center, unit)
+                body.SetSpatialInertiaInBodyFrame(multibody_context, inertia)
+
+
+def check_model(model: RobotModel, material: ContactMaterial) -> None:
+    """Refuses a model or a material that Drake's contact cannot represent."""
+    if model.links.plant is None:
+        raise ModelError("Drake's contact needs a robot that a MultibodyPlant has read")
+    if model.dae.exogenous or model.known_forces:
+        raise ModelError(
+            "Drake's contact as the plant takes no exogenous signals and no robot.known_forces; "
+            "forces that the law does not know are disturbance forces (plant.disturbances). Use "
+            "`plant: !CompliantContact`, which has the same equations of contact, or a rollout"
+        )
+    if model.stages:
+        raise ModelError(
+            f"{model.name} has springs, motors or valves at its joints, which Drake's contact does "
+            "not step: take a CompliantPlant (`plant: !CompliantContact`)"
+        )
+    if not model.constraints:
+        raise ModelError("the robot has no constraints, so there is nothing to touch")
+    for constraint in model.constraints:
+        values = own_values(constraint, model.dae, model.dae.parameter_values)
+        surface = constraint.surface_at(values)
+        if surface is None or constraint.touch(model.links) is None:
+            raise ModelError(
+                f"'{constraint.name}' is no contact with a surface: use an ideal plant"
+            )
+        if material.contact_model != "hydroelastic" and not surface.solids():
+            raise ModelError(
+                f"'{constraint.name}' has no solid for Drake's point contact, as a "
+                "PointOnSurface has on a Plane, or on the outside of a Sphere or a "
+                "Cylinder. Use hydroelastic contact (contact_model: hydroelastic), which meshes "
+                "any smooth surface, or `plant: !CompliantContact`"
+            )
+
+
+def solids_of(
+    constraint: Constraint, values: FloatArray, point: FloatArray, material: ContactMaterial
+) -> tuple[PosedShape, ...]:
+    """The solids of a constraint in the world; `point` is its nominal contact point there."""
+    surface, pose = constraint.surface_at(values), constraint.placement(values)
+    assert surface is not None  # `check_model` refuses others.
+    solids = surface.solids()
+    exact = solids and all(isinstance(solid.form, HalfSpace | Sphere) for solid in solids)
+    # Drake's own mesh of a long cylinder is too coarse: 2 N of ripple in a force of 20 N.
+    if material.contact_model != "point" and not exact:
+        try:
+            near = pose.inverse() @ point
+            solids = (surface.layer(near, material.piece, material.thickness),)
+        except ModelError as error:
+            raise ModelError(f"{constraint.name}: {error}") from None
+    return tuple(solid.moved(pose) for solid in solids)
+
+
+def _generalized_forces(builder: DiagramBuilder, plant: MultibodyPlant) -> OutputPort:
+    """Drake's generalized contact forces of all joints, in the order of the velocities."""
+    instances = map(ModelInstanceIndex, range(plant.num_model_instances()))
+    moving = [instance for instance in instances if plant.num_velocities(instance)]
+    ports = [plant.get_generalized_contact_forces_output_port(each) for each in moving]
+    if len(ports) == 1:
+        return ports[0]
+    order = np.concatenate(
+        [plant.GetVelocitiesFromArray(each, np.arange(plant.num_velocities())) for each in moving]
+    )
+    stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
+    for i, port in enumerate(ports):
+        builder.Connect(port, stacked.get_input_port(i))
+    sorted_ = builder.AddSystem(MatrixGain(np.eye(order.size)[np.argsort(order)]))
+    builder.Connect(stacked.get_output_port(), sorted_.get_input_port())
+    return sorted_.get_output_port()
+
+
+OtherMass = tuple[RigidBody, float, FloatArray | None]
+"""A body, its mass in kg, and its place in m if it is a point mass."""
+
+
+def other_masses(
+    model: RobotModel, plant: MultibodyPlant, values: FloatArray
+) -> tuple[OtherMass, ...]:
+    """The bodies of a plant whose mass or place is not that of the robot's file."""
+    drawn = model.links.plant
+    assert drawn is not None  # check_model.
+    bodies = (drawn.get_body(BodyIndex(i)) for i in range(drawn.num_bodies()))
+    with_mass = (body for body in bodies if body.default_mass() > 0.0)
+    known = {p.name: values[model.dae.parameter_slice(p.name)] for p in model.links.parameters}
+    masses = [name for name in known if name.endswith(".mass")]
+    changed = list[OtherMass]()
+    for body, name in zip(with_mass, masses, strict=True):
+        mass, center = known[name].item(), known.get(f"{name.removesuffix('mass')}center")
+        if mass != body.default_mass() or (center is not None and center.any()):
+            changed.append((plant.get_body(body.index()), mass, center))
+    return tuple(changed)

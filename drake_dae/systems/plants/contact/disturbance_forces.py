@@ -81,16 +81,7 @@ class DisturbanceForce:
 
 
 class AppliedDisturbances(LeafSystem):
-    """Applies disturbance forces to Drake's MultibodyPlant.
-
-    Output port:
-        spatial_forces: The input of its port `applied_spatial_force`.
-
-    Args:
-        plant: The plant, finalized.
-        disturbances: The disturbances.
-        frames: The frame of each.
-    """
+    """Applies disturbance forces to the frames of Drake's MultibodyPlant."""
 
     __slots__ = SHARED_DICTIONARY
 
@@ -120,7 +111,6 @@ class AppliedDisturbances(LeafSystem):
         )
 
     def again(self) -> "AppliedDisturbances":
-        """Another instance, for another diagram."""
         return AppliedDisturbances(*self._arguments)
 
     def _calc(self, context: Context, output: Value) -> None:

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.robots import RobotModel
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -27,11 +27,6 @@ def stages_after(model: RobotModel, time_step: float, control: ca.SX) -> ca.SX:
     For springs, links and shafts together this is the symplectic Euler method: an undamped
     oscillation of frequency w keeps its amplitude for w h < 2, with the frequency w_h of sin(w_h h
     / 2) = w h / 2 in place of w. An unstable step is refused: see `check_step`.
-
-    Args:
-        model: The robot.
-        time_step: h in s.
-        control: u, shape (p, 1).
     """
     dae, size = model.dae, _num_link_states(model)
     rates = stage_rates(model, control)
@@ -56,22 +51,24 @@ def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> N
     whose eigenvalues must not be outside the unit circle. For springs without damping this means w
     h <= 2; for the electric part of a motor R h / L <= 2, and less if it oscillates with the
     inertia.
-
-    Args:
-        model: The robot, with any stage.
-        time_step: h in s.
-        parameters: Values of all parameters.
-
-    Raises:
-        ModelError: The step is too long; which one would do.
     """
-    slope, is_position = _linear(model, parameters)
+    dae, links = model.dae, model.links
+    assert model.joint_force is not None
+    # C of x' = C x for links and stages without weight.
+    B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
+    velocity = ca.mtimes(links.velocity_map, links.v)
+    stages = dae.f[_num_link_states(model) :]
+    forces = ca.vertcat(velocity, ca.mtimes(B, model.joint_force), stages)
+    outputs = {"mass": dae.mass_matrix, "slope": ca.jacobian(forces, dae.state)}
+    mass, force = dae.trace("linear motion", outputs, often=False)(dae.nominal_state, parameters)
+    slope: FloatArray = np.asarray(np.linalg.solve(mass, force))
+    positions = [*range(links.q.numel()), *_shafts(model)]
+    moved = np.zeros_like(slope)
+    moved[positions] = slope[positions]
 
     def growth(step: float) -> float:
-        moved = np.where(is_position[:, None], slope, 0.0)
-        matrix = np.linalg.solve(
-            np.eye(len(slope)) - step * moved, np.eye(len(slope)) + step * (slope - moved)
-        )
+        one = np.eye(len(slope))
+        matrix = np.linalg.solve(one - step * moved, one + step * (slope - moved))
         return float(np.abs(np.linalg.eigvals(matrix)).max())
 
     if growth(time_step) <= 1.0 + _GROWTH:
@@ -88,22 +85,6 @@ def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> N
                 f"{what}. Take {shorter:g} s or less; the law may keep its period with `sampling`"
             )
     raise ModelError(f"{what}, and so is one of {shorter:g} s; damp it, or take an ideal plant")
-
-
-def _linear(model: RobotModel, parameters: FloatArray) -> tuple[FloatArray, Booleans]:
-    """C of x' = C x for links and stages without weight, and which entries are positions."""
-    dae, links = model.dae, model.links
-    assert model.joint_force is not None
-    nq, size = links.q.numel(), _num_link_states(model)
-    B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
-    velocity = ca.mtimes(links.velocity_map, links.v)
-    forces = ca.vertcat(velocity, ca.mtimes(B, model.joint_force), dae.f[size:])
-    outputs = {"mass": dae.mass_matrix, "slope": ca.jacobian(forces, dae.state)}
-    function = dae.trace("linear motion", outputs, often=False)
-    mass, slope = function(dae.nominal_state, parameters)
-    is_position = np.arange(dae.num_states) < nq
-    is_position[list(_shafts(model))] = True
-    return np.asarray(np.linalg.solve(mass, slope)), is_position
 
 
 def _num_link_states(model: RobotModel) -> int:

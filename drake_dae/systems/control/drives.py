@@ -1,4 +1,4 @@
-"""Sampled laws: inputs at samples, with delay, held between samples."""
+"""What acts on a robot of a control: it is sampled, late, held between samples, and limited."""
 
 from dataclasses import dataclass
 from math import ceil, floor, isfinite
@@ -6,6 +6,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import EventStatus
 
 from drake_dae.arguments import checked
@@ -76,23 +77,10 @@ class ControlHold(TracedSystem):
     The controller is evaluated only at samples. Before the first control acts, that of the start is
     held, as if the robot had been at rest there.
 
-    The updates are unrestricted, which Drake computes before discrete ones and all from the same
-    instant: so the controller sees time, state and reference at t_k, even if a discrete
-    MultibodyPlant steps at t_k (also an unrestricted update). That plant uses the previously held
-    control, and so sees a delay longer by one of its steps.
-
-    Input port:
-        control: The present control of the controller, shape (p,).
-
-    Output port:
-        control: The held control, shape (p,); no direct feedthrough.
-
-    Args:
-        size: The number of controls, p.
-        sampling: Period and delay.
-
-    Raises:
-        WiringError: At the start of a run: the first control depends on itself.
+    The updates are unrestricted: so the controller sees time, state and reference at t_k, even if
+    a discrete MultibodyPlant steps at t_k. That plant uses the previously held control, and so sees
+    a delay longer by one of its steps. The output has no direct feedthrough. A first control that
+    depends on itself is a WiringError at the start.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -100,7 +88,17 @@ class ControlHold(TracedSystem):
     def __init__(self, size: int, sampling: Sampling) -> None:
         check_whole_number("size", size, 1)
         self.sampling, self.sample_period = sampling, sampling.period
-        super().__init__(hold_block(size, sampling))
+        # The control that is held, and those on the way, the oldest first.
+        count, rate = sampling.whole_periods + (sampling.rest > 0.0), sampling.period
+        control, now = ca.SX.sym("control", size), ca.SX.sym("now", size)
+        later, unknown = ca.SX.sym("later", count * size), np.full(size, np.nan)
+        first, coming = ca.vertsplit(ca.vertcat(later, control), [0, size, (count + 1) * size])
+        held = {"now": Held(now, first, unknown, rate, sampling.rest, begin=control)}
+        if count:
+            begin = ca.repmat(control, count, 1)
+            held["later"] = Held(later, coming, np.tile(unknown, count), rate, begin=begin)
+        inputs, outputs = {"control": control}, {"control": now}
+        super().__init__(Block("control_hold", inputs, outputs, held=held))
 
     def _begin(self, *arguments: Any) -> EventStatus:
         try:
@@ -114,14 +112,37 @@ class ControlHold(TracedSystem):
             ) from error
 
 
-def hold_block(size: int, sampling: Sampling) -> Block:
-    """The held control, and those on the way, the oldest first; see `ControlHold`."""
-    count, rate = sampling.whole_periods + (sampling.rest > 0.0), sampling.period
-    control, now = ca.SX.sym("control", size), ca.SX.sym("now", size)
-    later, unknown = ca.SX.sym("later", count * size), np.full(size, np.nan)
-    first, coming = ca.vertsplit(ca.vertcat(later, control), [0, size, (count + 1) * size])
-    held = {"now": Held(now, first, unknown, rate, sampling.rest, begin=control)}
-    if count:
-        begin = ca.repmat(control, count, 1)
-        held["later"] = Held(later, coming, np.tile(unknown, count), rate, begin=begin)
-    return Block("control_hold", {"control": control}, {"control": now}, held=held)
+@checked(ModelError)
+class ControlLimits(TracedSystem):
+    """Limits each control, and reports the excess.
+
+    Input port:
+        control: The control before the limits, shape (p,).
+
+    Output ports:
+        control: The limited control, max(-limit, min(limit, control)), shape (p,).
+        excess: The control minus the limited control, shape (p,): 0 within the limits.
+        is_limited: 1 while any control is limited, else 0, shape (1,); for the `hold` of a
+            `TrackingController` with integrals.
+
+    Args:
+        limits: The largest |control|, shape (p,), positive; infinite without a limit.
+
+    Raises:
+        ModelError: A limit is not positive, or there are no limits.
+    """
+
+    __slots__ = SHARED_DICTIONARY
+
+    def __init__(self, limits: ArrayLike) -> None:
+        self.limits = np.array(limits, dtype=float)
+        if self.limits.ndim != 1 or not self.limits.size or not np.all(self.limits > 0.0):
+            raise ModelError(f"limits must be positive numbers of shape (p,), got {limits!r}")
+        control = ca.SX.sym("control", self.limits.size)
+        limited = ca.fmax(-self.limits, ca.fmin(self.limits, control))
+        outputs = {
+            "control": limited,
+            "excess": control - limited,
+            "is_limited": ca.mmax(ca.fabs(control) - self.limits) > 0,
+        }
+        super().__init__(Block("control_limits", {"control": control}, outputs))
