@@ -23,18 +23,10 @@ class StaticPlacement:
     def __init__(self, dae: DaeSystem, q: ca.SX, phi: ca.SX, h_1: ca.SX) -> None:
         of_outputs = ca.SX.sym("of outputs", dae.parameter_symbol.numel())
         h_1 = ca.substitute(h_1, dae.parameter_symbol, of_outputs)
+        p, slopes = dae.parameter_symbol, {"J": ca.jacobian(phi, q), "P": ca.jacobian(h_1, q)}
         self._name = f"{dae.name} positions"
-        self._inputs = {
-            "q": q,
-            "parameters": dae.parameter_symbol,
-            "parameters of outputs": of_outputs,
-        }
-        self._outputs = {
-            "phi": phi,
-            "h_1": h_1,
-            "J": ca.jacobian(phi, q),
-            "P": ca.jacobian(h_1, q),
-        }
+        self._inputs = {"q": q, "parameters": p, "parameters of outputs": of_outputs}
+        self._outputs = {"phi": phi, "h_1": h_1, **slopes}
         self._robot, rows = dae.name, phi.numel() + h_1.numel()
         self._is_traced = 0 < rows <= q.numel() and rows**2 * q.numel() <= MOST
         self._function = TracedFunction(self._name, self._inputs, self._outputs)
@@ -51,11 +43,7 @@ class StaticPlacement:
         return TracedFunction(self._name, inputs, {"step": -step}, factors.pivot)
 
     def solve(
-        self,
-        outputs: FloatArray,
-        guess: FloatArray,
-        parameters: FloatArray,
-        of_outputs: FloatArray,
+        self, outputs: FloatArray, guess: FloatArray, parameters: FloatArray, of_outputs: FloatArray
     ) -> FloatArray:
         """A solution near a guess; InconsistentStateError if there is none. Nothing is checked.
 
