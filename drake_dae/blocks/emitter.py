@@ -59,7 +59,7 @@ def can_be_emitted(function: ca.Function) -> bool:
 
 
 def emitted(function: ca.Function, name: str, constants: list[float]) -> str:
-    """A function as C; it reads its constants, appended to a list, from `c`, so that code is shared."""
+    """A function as C that reads its constants, appended to a list, from `c`: code is shared."""
     if not can_be_emitted(function):
         raise ModelError(f"{function.name()} has an operation that lanes do not support")
     places: dict[int, str | float] = {}
