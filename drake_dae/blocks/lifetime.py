@@ -18,7 +18,7 @@ diagram is.
 
 
 def weakly(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
-    """A callback by a bound method whose system Drake, which stores it in C++, does not keep alive."""
+    """A callback by a bound method, which Drake stores in C++ without keeping its system alive."""
     weak = MethodType(method.__func__, proxy(method.__self__))  # type: ignore[attr-defined]
     return partial(weak, *first) if first else weak
 
