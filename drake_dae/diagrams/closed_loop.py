@@ -31,6 +31,10 @@ from drake_dae.systems.sensing.force_sensor import ForceSensor
 class ClosedLoop:
     """A plant under a controller: a Drake diagram with named parts, and the record of its runs.
 
+    With the numbers of a context, `TracedSystem(compile_diagram(loop.diagram, context=context))` is
+    the loop as one block with the same output ports. Drake's contact and sources of noise stay
+    outside, and their outputs are its inputs.
+
     Attributes:
         diagram: The diagram, with the output ports `state`, `constraint_force`,
             `constraint_residual`, `controlled_output`, `control`, further signals of plant,
@@ -72,11 +76,7 @@ class ClosedLoop:
 
     @property
     def reference(self) -> ReferenceGenerator:
-        """The generator of references.
-
-        Raises:
-            ModelError: There is none.
-        """
+        """The generator of references, or a ModelError."""
         if self.generator is None:
             raise ModelError(
                 f"{self.controller.get_name()} plans its references itself and has no generator, "
@@ -99,14 +99,9 @@ class ClosedLoop:
 
     @checked(WiringError)
     def set_state(self, context: Context, state: ArrayLike) -> None:
-        """Sets the state x of the plant, without a projection onto the constraints.
+        """Sets the state x of the plant, shape (n,), without a projection onto the constraints.
 
-        Args:
-            context: The diagram's context.
-            state: x, shape (n,).
-
-        Raises:
-            ModelError: The shape is wrong.
+        `context` is that of the diagram.
         """
         self.plant.set_state(context_in(self.plant, context), state)
 
@@ -129,23 +124,13 @@ class ClosedLoop:
         """
         context_in(self.plant, context)  # The log has no name.
         logged = Record.from_log(self.log, self.signals, context, after)
-        return self.with_errors(logged, context).while_finite()
+        return self.with_errors(logged).while_finite()
 
     @checked(WiringError)
-    def with_errors(self, record: Record, context: Context | None = None) -> Record:
-        """Adds the derived signals of the controller, such as `tracking_error`, to a record.
-
-        Args:
-            record: The record.
-            context: The diagram's context after the run, for controllers that need it.
-        """
-        plant, controller, at_controller = self.plant, self.controller, None
+    def with_errors(self, record: Record) -> Record:
+        """Adds the derived signals of the controller, such as `tracking_error`, to a record."""
         values = {name: recorded.values for name, recorded in record.signals.items()}
-        if context is not None:
-            at_controller = context_in(controller, context)
-            along = self.plant_parameters(record, context)
-            values["parameters"] = controller.law.system.parameters_of(plant.dae, along)
-        derived = controller.derived(at_controller, record.time, values)
+        derived = self.controller.derived(values)
         added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
         return computed_record(record.time, {**record.signals, **added})
 
@@ -153,11 +138,7 @@ class ClosedLoop:
     def plant_parameters(self, record: Record, context: Context) -> FloatArray:
         """The parameters of the plant at the times of a record, one row each.
 
-        They are those of the context, and exogenous ones those of the record.
-
-        Args:
-            record: The record.
-            context: The diagram's context after the run.
+        They are those of the context after the run, and exogenous ones those of the record.
         """
         plant = self.plant
         own = plant.parameters(context_in(plant, context))

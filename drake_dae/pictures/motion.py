@@ -27,18 +27,11 @@ _EXTENT_STATES = 60
 
 @dataclass(frozen=True, eq=False)
 class RunMotion:
-    """The motion of a robot in a run, at the times of k frames.
+    """The motion of a robot in a run, at k frames, whose times in s begin at 0.
 
-    Attributes:
-        model: The robot.
-        times: The times of the frames, in s after the start, shape (k,).
-        start_time: The time at which the run starts, in s.
-        states: x, shape (k, n).
-        parameters: The values of all parameters, shape (k, number of parameters).
-        wrenches: The constraint wrenches in each frame.
-        desired: Link states at rest (q, 0) with the desired outputs, until these are out of reach,
-            shape (j, nq + nv) with j <= k.
-        acting: The function of the constraint wrenches, for the parameters at the start.
+    States have shape (k, n), the values of all parameters a row each. `desired` are link states at
+    rest (q, 0) with the desired outputs, until these are out of reach, shape (j, nq + nv), j <= k.
+    `acting` gives the constraint wrenches, for the parameters at the start.
     """
 
     model: RobotModel
@@ -82,12 +75,8 @@ class RunMotion:
 class ContactPath:
     """The path of a contact point on a surface, in the plane normal to the surface's mean normal.
 
-    Attributes:
-        name: The constraint's name.
-        actual: The path along two axes of the surface, m, shape (k, 2).
-        desired: The desired path, m, shape (j, 2).
-        points_left: Whether an observer on the free side who sees the second axis upward sees the
-            first axis to the left.
+    Actual and desired coordinates are in m, shapes (k, 2) and (j, 2). `points_left` tells whether
+    who looks from the free side, with the second axis up, sees the first axis to the left.
     """
 
     name: str
@@ -101,14 +90,7 @@ def follow(
 ) -> RunMotion:
     """The motion of a robot in a recorded run of a loop, with so many frames per second.
 
-    Args:
-        loop: A loop of a `RobotPlant`.
-        record: The record of a run of this loop.
-        context: The context of its diagram, which contains the parameters; not changed.
-        rate: Frames per second.
-
-    Raises:
-        ModelError: The plant is not a robot.
+    The context of the loop's diagram has the parameters.
     """
     plant = loop.plant
     model = plant.robot("a picture of a run")
@@ -140,11 +122,9 @@ def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
 
 
 def contact_paths(motion: RunMotion) -> list[ContactPath]:
-    """The paths of moving contact points on their surfaces.
+    """The paths of moving contact points on their surfaces, from the surface's reference point on.
 
-    The points are relative to the surface's reference point, and projected along the surface's mean
-    normal. On a plane these are the plane's coordinates; on a curved surface those of a tangent
-    plane.
+    On a plane these are its coordinates, on a curved surface those of a tangent plane.
     """
     size = float(np.max(np.abs(motion.points), initial=0.0))
     normals, desired_points, paths = motion.normals, motion.desired_points, []
@@ -186,11 +166,7 @@ def run_view(
 ) -> tuple[FloatArray, FloatArray]:
     """The position of a camera that shows a whole run, and a point on its axis, m.
 
-    Args:
-        motion: The motion of the robot.
-        scene_graph: The geometry of its links, or None.
-        view: The angles of view of the camera, as `view_angles` computes them.
-        arrow: The length of the longest arrow of a force, in m.
+    `view` is that of `view_angles`, and `arrow` the length of the longest arrow of a force, in m.
     """
     forces = np.array([wrench.forces for wrench in motion.wrenches])
     largest = np.max(np.linalg.norm(forces, axis=2), initial=1e-6)

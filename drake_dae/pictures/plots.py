@@ -98,18 +98,7 @@ def save_plots(
     folder: Path,
     accuracy: float | None = None,
 ) -> None:
-    """Writes the plots of a run as PNG files, `PLOTS`.
-
-    Args:
-        loop: The loop of a robot.
-        record: The record of a run of this loop.
-        context: The context of its diagram, which contains the parameters; not changed.
-        folder: The folder to write to.
-        accuracy: The accuracy of the integrator; None with fixed steps.
-
-    Raises:
-        OSError: They cannot be written.
-    """
+    """Writes the plots of a run of a loop of a robot as PNG files, `PLOTS`."""
     motion, predicted = follow(loop, record, context), loop.predicted_error(record)
     events, limits = events_of(record, motion.model), motion.model.control_limits
     figures = figures_of_run(record, predicted, limits, accuracy, events)
@@ -129,13 +118,8 @@ def figures_of_run(
 ) -> dict[str, Figure]:
     """Name of a file -> its figure: outputs, errors, residual and controls of one run.
 
-    Args:
-        record: The record.
-        predicted: The predicted tracking error, shape (k, p).
-        limits: The largest |u|, shape (p,), inf for an actuator without a limit; None without any.
-        accuracy: The accuracy of the integrator, below which errors are grey; None with fixed
-            steps.
-        events: The events of the run, marked on the time axes.
+    `limits` are the largest |u|, shape (p,), inf for an actuator without one. Errors below the
+    accuracy of the integrator are grey.
     """
     outputs = record.signals["controlled_output"].signals
     signals = {**record.signals, "predicted_error": Recorded(predicted, outputs)}

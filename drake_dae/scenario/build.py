@@ -297,9 +297,7 @@ class _NoController(TracedSystem, Controller):
     def check_plant(self, plant: Plant) -> None:
         pass
 
-    def derived(
-        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
-    ) -> Derived:
+    def derived(self, values: Mapping[str, FloatArray]) -> Derived:
         none = np.zeros((*values["state"].shape[:-1], 0))
         return {name: (none, ()) for name in ("desired_output", "tracking_error")}
 

@@ -86,10 +86,16 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
                 f"plant_disturbance_{i}.force": d.force for i, d in enumerate(of_plant.disturbances)
             },
         }
+        before = plant.parameters(at_plant)
         for key, values in numbers.items():
             with at(key):
                 for name, value in values.items():
-                    plant.set_parameter(at_plant, name, value)
+                    # A user's own plant may not let these be set, and has been made with them.
+                    is_set = key != "plant.parameters" and np.array_equal(
+                        before[plant.dae.parameter_slice(name)], np.ravel(value)
+                    )
+                    if not is_set:
+                        plant.set_parameter(at_plant, name, value)
     with at("plant"):
         of_plant.begin(plant, at_plant)
     force, encoders = scenario.sensors.force, scenario.sensors.encoders

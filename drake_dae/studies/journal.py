@@ -59,13 +59,7 @@ class Journal:
 def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
     """Creates the file of a sweep with missing folders, or opens it to continue.
 
-    Args:
-        path: The path of the file.
-        head: What the sweep is, name -> text; equal sweeps have equal ones.
-
-    Raises:
-        ModelError: The file belongs to another sweep (the message names what differs), or is none,
-            or cannot be written.
+    `head` says what the sweep is, name -> text; equal sweeps have equal ones.
     """
     unusable = f"cannot use {brief(str(path))} as the file of a sweep: "
     try:

@@ -59,14 +59,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class RunResult:
-    """The result of a run of a sweep.
-
-    Attributes:
-        outcome: How the run ended.
-        reason: Why the run did not finish; empty if it finished.
-        figures: Name with unit -> value, from `figures_of`.
-        exceeded: The names of the signals that exceed their limits.
-    """
+    """How a run of a sweep ended and why, its figures, and the signals beyond their limits."""
 
     outcome: Outcome
     reason: str = ""
@@ -95,6 +88,7 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
         patterns.append(r"plant\.friction")
     if not plant.carries:
         patterns.append(r"plant\.parameters(\..+)?")
+    if plant.adjusts and not plant.carries:
         patterns.append(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
     if not (isinstance(base.law.gains, Matrices) or base.is_advised or base.task is not None):
         patterns.append(r"law\.gains\..+")
@@ -110,13 +104,8 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
 class Runner:
     """Makes runs of a sweep, and keeps the closed loop as long as the structure is the same.
 
-    Args:
-        base: The plain data of the sweep's scenario.
-        lasting: The simulated time of all runs with one loop, in s, for rollouts; None for Drake's
-            Simulator.
-
-    Attributes:
-        builds: The number of loops that were built.
+    `lasting` is the simulated time of all runs with one loop, in s, for rollouts; None for Drake's
+    Simulator. `builds` counts the loops that were built.
     """
 
     def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
@@ -151,11 +140,7 @@ class Runner:
         return RunResult(Outcome.FINISHED, "", {**figures, "steps": float(steps)}, exceeded)
 
     def check(self, variation: Variation) -> None:
-        """Checks keys and values of a variation; that it starts is no question here.
-
-        Raises:
-            ScenarioError: A key or a value is not valid, or a rollout does not support the loop.
-        """
+        """Checks keys and values of a variation; that it starts is no question here."""
         try:
             scenario, loop = self._built(variation)
             if self._lasting is not None:
@@ -230,10 +215,7 @@ _ALONE = Lock()
 
 
 def run_one(settings: str, variation: Variation) -> RunResult:
-    """Makes one run, in whatever process or thread.
-
-    The settings are the arguments of `Runner` as JSON; equal ones have one runner in a process.
-    """
+    """Makes one run, in whatever process or thread; the settings are those of `Runner` as JSON."""
     with _ALONE:  # The threads of a process share its loop.
         return _runner(settings).run(variation)
 

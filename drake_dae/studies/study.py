@@ -29,12 +29,7 @@ MOST_AXES = 24
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """The results of a sweep.
-
-    Attributes:
-        variations: For each run, dotted key of the scenario -> value.
-        results: The result of each run.
-    """
+    """The results of a sweep: for each run, dotted key of the scenario -> value, and its result."""
 
     variations: tuple[Variation, ...]
     results: tuple[RunResult, ...]
@@ -84,11 +79,7 @@ class Study:
         return tuple(dict.fromkeys(name for result in self.results for name in result.figures))
 
     def values(self, figure: str) -> FloatArray:
-        """A figure of every run, shape (number of runs,); nan for runs without this figure.
-
-        Raises:
-            ModelError: There is no such figure.
-        """
+        """A figure of every run, shape (number of runs,); nan for runs without this figure."""
         if figure not in self.figures:
             raise ModelError(unknown_name("figure", figure, self.figures))
         return np.array([result.figures.get(figure, np.nan) for result in self.results])
@@ -96,9 +87,7 @@ class Study:
     def table(self) -> dict[str, list[Any]]:
         """The study as a table: name of a column -> one entry for each run, None if it has none.
 
-        The columns are the number of the run, the keys that vary, the outcome with its reason, the
-        signals that exceed their limits, and the figures. The table does not depend on the machine
-        or on interruptions.
+        It does not depend on the machine or on interruptions.
         """
         return {
             "run": list(range(len(self.results))),
@@ -111,15 +100,14 @@ class Study:
 
     def extent(self) -> dict[str, dict[str, float]]:
         """Name of a figure -> its least, median and largest value over the runs that have it."""
-        return {
-            name: {
-                "least": float(np.nanmin(values)),
-                "median": float(np.nanmedian(values)),
-                "largest": float(np.nanmax(values)),
-            }
-            for name in self.figures
-            for values in [self.values(name)]
-        }
+        found = {}
+        for name in self.figures:
+            values = self.values(name)
+            numbers = np.nanmin(values), np.nanmedian(values), np.nanmax(values)
+            found[name] = dict(
+                zip(("least", "median", "largest"), map(float, numbers), strict=True)
+            )
+        return found
 
     def plot(self) -> Figure:
         """Each figure that varies over the first key with numbers that vary, or over the runs.

@@ -32,21 +32,12 @@ def make_variations(
 ) -> list[Variation]:
     """Returns the variations of a sweep: a grid of values, values together, or random ones.
 
-    Random values of a key depend only on the seed and on its name. Therefore a sweep with more runs
-    or further keys contains the values of the smaller one.
-
-    Args:
-        values: Dotted key -> its values, as on the command line: a list; or a text
-            "LOW..HIGH:COUNT" for so many equally spaced values. Random values are drawn from a
-            list, or evenly from "LOW..HIGH", which may stand within a value, as in
-            [["0.69..0.71", 0.0, 0.0]]; those of a seed are whole numbers.
-        count: The number of runs with random values; None for every combination of the values, in
-            which the last key changes fastest.
-        seed: The seed of the random values, 0 or more.
-        together: Whether run i has the i-th value of each key, instead of a grid.
-
-    Raises:
-        ScenarioError: A key has no values, a range is empty, or there are more than a million runs.
+    The values of a dotted key are a list, or a text "LOW..HIGH:COUNT" for so many equally spaced
+    ones. For `count` runs random values are drawn from a list, or evenly from "LOW..HIGH", which
+    may stand within a value, as in [["0.69..0.71", 0.0, 0.0]]; those of a seed are whole numbers.
+    They depend only on the seed and on the key, so that a sweep with more runs or keys contains the
+    values of the smaller one. Without a count there is a run for every combination, in which the
+    last key changes fastest, or with `together` for the i-th value of each key.
     """
     for what, number, least in (("count", count, 1), ("seed", seed, 0)):
         try:
@@ -71,11 +62,7 @@ def make_variations(
 def parse_variations(
     texts: Sequence[str], count: int | None, seed: int, together: bool
 ) -> list[Variation]:
-    """The variations of options "KEY=VALUES" of the command line, where VALUES is YAML or a range.
-
-    Raises:
-        ScenarioError: An option cannot be read, or its values are empty.
-    """
+    """The variations of options "KEY=VALUES" of the command line: VALUES is YAML or a range."""
     columns = dict[str, Any]()
     for text in texts:
         key, separator, values = text.partition("=")
@@ -161,11 +148,7 @@ def _ends(key: str, interval: re.Match[str]) -> tuple[float, float]:
 
 
 def plain(key: str, value: Any) -> Any:
-    """A value in JSON types.
-
-    Raises:
-        ScenarioError: The value has no JSON type, for example a function.
-    """
+    """A value in JSON types."""
     try:
         return json.loads(json.dumps(value, default=lambda each: each.tolist()))
     except (TypeError, AttributeError, ValueError):

@@ -35,18 +35,6 @@ def test_a_wall_and_a_board_on_it_share_what_a_law_presses():
     np.testing.assert_allclose((wall + board)[-1], alone["constraint_force"][-1, 0], rtol=1e-9)
 
 
-@pytest.mark.slow
-def test_walls_with_friction_share_their_force_and_their_friction():
-    """Both of one wall with friction: the motion is that of the wall alone."""
-    rough = WALL.replace("frame: tool", "frame: tool, friction: 0.3")
-    both = TWICE[0].replace("frame: tool", "frame: tool, friction: 0.3")
-    _, _, record = run_scenario(scenario("two_link_wall", both, *TWICE[1:], "compliances={}"))
-    _, _, alone = run_scenario(scenario("two_link_wall", f"constraints=[{rough}]", "duration=0.3"))
-    wall, board = record["constraint_force"].T
-    np.testing.assert_allclose(wall, board, rtol=1e-12)
-    np.testing.assert_allclose(record["state"][-1], alone["state"][-1], atol=1e-12)
-
-
 def test_what_is_foreseen_is_what_all_constraints_bear():
     foreseen = find_feasibility(scenario("two_link_wall", *TWICE, "compliances={}"))
     assert [r.signal.name for r in foreseen.of(LimitKind.FORCE)] == ["wall.force", "board.force"]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from runs import run_scenario, scenario
+from runs import run_scenario, scenario, some
 
 from drake_dae import Record, plot_runs
 from drake_dae.cli import main
@@ -132,7 +132,7 @@ def test_paths_are_drawn_to_scale():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["seven_joint_wall", "cart_wall"])
+@pytest.mark.parametrize("name", some(["cart_wall", "seven_joint_wall"]))
 def test_paths_are_seen_from_the_free_side(name):
     """Who looks against the normal n, with e up, has e x n to the right."""
     loop, context, run = run_scenario(scenario(name, "duration=0.5"))
@@ -147,7 +147,7 @@ def test_paths_are_seen_from_the_free_side(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("count", some([7, 1, 3, 2]))
 def test_nothing_overlaps_or_is_cut_off(count):
     for figure in figures_of_run(*record(count, contacts=count), accuracy=1e-8).values():
         figure.draw_without_rendering()

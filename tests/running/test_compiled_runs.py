@@ -26,26 +26,15 @@ FIXED = ("integrator.use_error_control=false", "integrator.max_step_size=0.001")
 LOOPS = {
     "observer and integrals": ("wall_point_contact",),
     "hydroelastic contact": ("wall_hydroelastic",),
-    "encoders": (
-        "wall_point_contact",
-        "sensors.encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}",
-    ),
     "noise": ("wall_point_contact", NOISE),
     "a control that is late": ("wall_point_contact", "sampling={period: 2.0e-3, delay: 3.0e-3}"),
-    "drives with limits": ("wall_point_contact", "saturation=true"),
     "a start between two samples": ("wall_point_contact", "integrator.start_time=0.0104"),
     "springs on a contact that gives way": ("wall_flexible_contact",),
     "ideal contact": ("seven_joint_wall", *FIXED),
     "a mechanism with springs": ("slider_crank_flexible", *FIXED),
 }
 
-DEAR = (
-    "hydroelastic contact",
-    "encoders",
-    "noise",
-    "drives with limits",
-    "a start between two samples",
-)
+DEAR = ("hydroelastic contact", "noise", "a start between two samples")
 """What has no other rates than the others."""
 
 

@@ -15,51 +15,15 @@ from drake_dae.scenario.build import build_scenario
 from drake_dae.scenario.rolled import roll_scenario
 from tests.support.runs import scenario
 
-
-def run(name, *settings):
-    """Simulates a shipped scenario with settings."""
-    case = scenario(name, *settings)
-    loop, context = build_scenario(case)
-    return simulate(
-        loop.diagram,
-        context,
-        case.duration,
-        case.integrator,
-        may_diverge=case.judgement.may_diverge,
-    )
-
-
 LATE = "sampling={period: %g, delay: %g}"
 
 
-@pytest.mark.parametrize(
-    ("name", "settings", "grew"),
-    [
-        # Read late: the law answers an error of long ago.
-        (
-            "two_link_wall",
-            ("law.gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001)),
-            "wall.force",
-        ),
-        pytest.param(
-            "five_bar",
-            ("law.gains=!Poles {all: [-1500.0]}", LATE % (0.002, 0.002)),
-            "pin.f",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            "seven_joint_dome",
-            ("law.gains=!Poles {all: [-400.0]}", LATE % (0.004, 0.004)),
-            "dome.force",
-            marks=pytest.mark.slow,
-        ),
-    ],
-)
-def test_a_loop_that_diverges_ends_with_what_grew_and_since_when(name, settings, grew):
-    with pytest.raises(SimulationError, match="may_diverge") as caught:
-        run(name, *settings)
-    text = str(caught.value)
-    assert grew in text
+def test_a_loop_that_diverges_ends_with_what_grew_and_since_when():
+    """Read late: the law answers an error of long ago."""
+    case = scenario("two_link_wall", "law.gains=!Poles {all: [-2000.0]}", LATE % (0.001, 0.001))
+    loop, context = build_scenario(case)
+    with pytest.raises(SimulationError, match=r"wall\.force.*may_diverge") as caught:
+        simulate(loop.diagram, context, case.duration, case.integrator)
     # Far before numbers end: the reported numbers can be read.
     assert np.isfinite(caught.value.state).all()
     assert caught.value.time < 1.0

@@ -7,26 +7,14 @@ import numpy as np
 import pytest
 from arms import numbers
 from numpy.testing import assert_allclose
+from scenario_texts import task_text
 
 from drake_dae import Record, build_scenario, load_scenario
 from drake_dae.cli import main
 from drake_dae.diagrams.record import phase_spans
 from drake_dae.errors import ScenarioError
 
-# At rest 20 mm before the wall, which gives way.
-SHORT = """
-robot: {file: package://drake_dae_models/two_link_arm.urdf}
-constraints:
-- {name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
-outputs:
-- {frame: tool, axes: z}
-law:
-  gains: {all: [-25]}
-  constraint_damping: {all: [-250]}
-plant: !CompliantContact {radius: 1.0e-5}
-task:
-  gains: {outputs: {wall.distance: [-8], "*": [-25]}}
-  phases:
+SHORT = task_text("""
   - !Approach
     name: feel
     speed: 0.05
@@ -42,9 +30,7 @@ task:
     guards: [{of: force, above: 40}, {of: control, above: 200}]
   - !Release {over: 0.1}
   - !Retreat {name: away, distance: 0.03, over: 0.1}
-start: {positions: {joint1: 1.1653, joint2: -1.8326}}
-duration: 1.0
-"""
+""")
 BARE = [
     "--rollout",
     "--force",

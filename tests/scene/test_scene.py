@@ -25,7 +25,7 @@ from drake_dae import (
     start_meshcat,
 )
 from drake_dae.pictures.motion import follow, run_points
-from drake_dae.robots import ConstraintWrenches, Wrenches
+from drake_dae.robots import ConstraintWrenches
 from drake_dae.scene.arrows import ForceArrows
 from drake_dae.scene.camera import direction_of, framed
 from drake_dae.scene.surroundings import floor_below, surroundings
@@ -182,36 +182,6 @@ def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
     assert seen[10.0] == pytest.approx((-1.0, 1.0), abs=1e-6)
     assert seen[-20.0] == pytest.approx((1.0, 1.0), abs=1e-6)
     assert arrows.largest_force == 20.0
-
-
-def test_round_off_of_a_moment_is_no_arrow_of_full_length():
-    arrows = ForceArrows(start_meshcat(), arm("two_link").model, length=0.3)
-    row = np.array([[0.0, 0.0, 1.0]])
-    arrows.measure([Wrenches(0.0 * row, 40.0 * row, 1e-9 * row)])
-    assert not arrows.has_moment
-    assert arrows.largest_moment > 1e3 * 1e-9
-    arrows.measure([Wrenches(0.0 * row, 40.0 * row, 2.0 * row)])
-    assert arrows.has_moment
-    assert arrows.largest_moment == 2.0
-
-
-def test_the_force_of_a_pin_is_drawn():
-    """At the pin, along what the one link does to the other; by Drake's forward kinematics."""
-    loop, _ = build_scenario(scenario("five_bar"))
-    model = loop.plant.model
-    (pin,) = model.constraints
-    state, page = shown_at_rest(model, np.array([30.0, -40.0]))
-    context = model.links.plant.CreateDefaultContext()
-    model.links.plant.SetPositions(context, state[: model.links.q.numel()])
-    frame = model.links.plant.GetFrameByName(pin.frame_b)
-    tracks, path = animation(page), f"/contact/{pin.name}/force"
-    point = frame.CalcPoseInWorld(context) @ np.array(pin.point_b)
-    np.testing.assert_allclose(tracks[path, "position"].values[0], point, atol=1e-6)
-    expected = np.zeros(3)
-    expected[["xyz".index(axis) for axis in pin.axes]] = [0.6, -0.8]
-    direction = turned(tracks[path, "quaternion"].values[0])
-    np.testing.assert_allclose(direction, expected, atol=1e-6)
-    assert f"/contact/{pin.name}/moment" not in [path for path, _ in tracks]
 
 
 @pytest.mark.slow

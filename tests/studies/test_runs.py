@@ -6,6 +6,7 @@ from runs import run_scenario, scenario, some
 
 from drake_dae import build_scenario
 from drake_dae.analysis import robot_limits
+from drake_dae.errors import ScenarioError
 from drake_dae.running.summary import figures_of
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
@@ -76,6 +77,14 @@ LOADED = (
 )
 
 
+@pytest.fixture(scope="module", params=some([None, 1.0]))
+def loaded(request):
+    """Scenario, runner and first result, by Drake's Simulator and by rollouts."""
+    base = scenario_data(scenario("two_link_wall", *LOADED))
+    runner = Runner(base, request.param)
+    return base, request.param, runner, runner.run({})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "value"),
@@ -92,17 +101,14 @@ LOADED = (
         ("law.gains.all", [-3.0]),
     ],
 )
-@pytest.mark.parametrize("is_rollout", some([False, True]))
-def test_each_value_of_a_context_is_that_of_its_run(key, value, is_rollout):
+def test_each_value_of_a_context_is_that_of_its_run(loaded, key, value):
     """And not of the run before, or of the loop: as in a loop that is built with the value."""
-    base = scenario_data(scenario("two_link_wall", *LOADED))
-    lasting = 1.0 if is_rollout else None
-    runner, other = Runner(base, lasting), Runner(varied_data(base, {key: value}), lasting)
-    first, found, again = (runner.run(changes) for changes in ({}, {key: value}, {}))
+    base, lasting, runner, first = loaded
+    found, again = runner.run({key: value}), runner.run({})
     assert runner.builds == 1
     assert first.outcome == Outcome.FINISHED, first
     assert first == again
-    wanted = other.run({})
+    wanted = Runner(varied_data(base, {key: value}), lasting).run({})
     assert found.figures.keys() == wanted.figures.keys()
     for name, number in wanted.figures.items():  # Round-off of constants that are folded.
         assert found.figures[name] == pytest.approx(number, rel=1e-6, abs=1e-9), name
@@ -162,10 +168,25 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
             assert 0.0 < result.figures["end [s]"] < 2.0
 
 
+UNTRACED = "plant=!OwnPlant {maker: 'members:SpringyPlant'}"
+
+
+def test_what_no_rollout_has_is_reported():
+    base = scenario_data(scenario("two_link_wall", *SHORT, UNTRACED))
+    Runner(base).check({})
+    with pytest.raises(ScenarioError, match="Simulator"):
+        Runner(base, 1.0).check({})
+
+
 @pytest.mark.slow
 def test_a_rollout_is_that_of_the_scenario_alone():
     """On the contact that rollouts have in place of Drake's, and with its noise."""
-    chosen = scenario("wall_point_contact", "duration=0.1", "compiled=false")
+    settings = (
+        "plant=!MultibodyPlant {time_step: 1.0e-3, friction: 0.1}",
+        "sampling={period: 1.0e-3, delay: 1.0e-3}",
+        "sensors.force={sample_period: 1.0e-3, noise_deviation: 0.1}",
+    )
+    chosen = scenario("two_link_wall", *settings, "duration=0.1", "compiled=false")
     result = Runner(scenario_data(chosen), 0.1).run({"plant.friction": 0.2})
     rolled = for_rollout(read_scenario(varied_data(scenario_data(chosen), {"plant.friction": 0.2})))
     loop, _ = build_scenario(rolled[0])

@@ -203,9 +203,9 @@ class RestingController(LeafSystem, Controller):
         given = self._state.Eval(context), self._goal, self.law.all_parameters()
         output.SetFromVector(self.law.function(*given)[0])
 
-    def derived(self, context, times, values):
+    def derived(self, values):
         signals, outputs = self.law.system.output_signals, values["controlled_output"]
-        desired = np.tile(self._goal[self.law.layout.lowest], (times.size, 1))
+        desired = np.tile(self._goal[self.law.layout.lowest], (len(outputs), 1))
         return {
             "desired_output": (desired, signals),
             "tracking_error": (outputs - desired, signals),

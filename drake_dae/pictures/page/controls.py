@@ -28,17 +28,12 @@ _ORDER = ("N", "m")
 
 @dataclass(frozen=True)
 class Control:
-    """A slider, or an object that a person drags, and the parameters that it sets.
+    """A slider, or an object that a person drags, and the places of the parameters that it sets.
 
-    Attributes:
-        kind: "reference", "surface", "signal", "plant" or "pole".
-        label, unit: Its name and unit.
-        low, high, value: The smallest, the largest and the initial value.
-        inputs: The places of the parameters that it sets.
-        known: The places of the same parameters in the law's model, which it sets, too, if the
-            person so chooses.
-        factors, powers: For poles: it sets parameter i to `factors[i] * |value| ** powers[i]`.
-        rate: The largest rate of change, in its unit per s; 0 for no limit.
+    Its kind is "reference", "surface", "signal", "plant" or "pole". `known` are the places of the
+    same parameters in the law's model, which it sets, too, if the person so chooses. One for poles
+    sets parameter i to `factors[i] * |value| ** powers[i]`. `rate` is the largest rate of change
+    per s, 0 for no limit.
     """
 
     kind: str

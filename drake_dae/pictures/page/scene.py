@@ -30,12 +30,8 @@ _BACKGROUND = [0.97, 0.97, 0.98]
 class RobotScene:
     """The drawn parts of a robot.
 
-    Attributes:
-        plant: The plant of the robot.
-        bodies: Name, path in Meshcat and frame of each moving body.
-        wrenches: The wrenches of its constraints.
-        surfaces: The constraints with a moving surface.
-        targets: The outputs that are coordinates of a point.
+    Moving bodies have name, path in Meshcat and frame; `surfaces` move, and `targets` are
+    outputs that are coordinates of a point.
     """
 
     plant: Plant
@@ -46,11 +42,6 @@ class RobotScene:
 
     @classmethod
     def of(cls, plant: Plant, scene_graph: SceneGraph | None) -> "RobotScene":
-        """The scene of a robot.
-
-        Raises:
-            ModelError: The plant is not a robot.
-        """
         model = plant.robot("a page")
         surfaces = [c for c in model.constraints if _has_moving_surface(c, plant.is_ideal)]
         targets = [output for output in model.outputs if isinstance(output, PointCoordinates)]

@@ -41,16 +41,9 @@ _ARGUMENTS = (
 
 
 def in_pieces(source: str, longest: int = LONGEST) -> str:
-    """Splits the long functions of a C source into pieces, which the function calls in turn.
+    """Splits the long functions of a C source of CasADi into pieces, which each calls in turn.
 
     The array `shared` passes values of a piece to later pieces.
-
-    Args:
-        source: A C source from CasADi, for a compiler that supports __attribute__((noinline)).
-        longest: The largest number of assignments in a piece.
-
-    Returns:
-        The new source.
     """
     return _FUNCTION.sub(lambda function: _split(function, longest), source)
 

@@ -130,14 +130,8 @@ class Controller(System):
         """Refuses a plant that does not fit, by a WiringError."""
         check_law(plant.dae, self.law)
 
-    def derived(
-        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
-    ) -> Derived:
-        """Derived signals of a record: desired outputs, errors and others.
-
-        `values` are its other signals, and with a context of this system, after the run,
-        "parameters": those of the law's system as the plant has them, one row for each time.
-        """
+    def derived(self, values: Mapping[str, FloatArray]) -> Derived:
+        """Desired outputs, errors and others from the other signals of a record."""
         return {}
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:

@@ -131,9 +131,7 @@ class TrackingController(ParameterizedSystem, Controller):
         integral = self.law.integral
         return {"integral": integral.signals} if integral.outputs else {}
 
-    def derived(
-        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
-    ) -> Derived:
+    def derived(self, values: Mapping[str, FloatArray]) -> Derived:
         """`desired_output` r and `tracking_error` z - r (29), from "reference" and z."""
         law = self.law
         desired, signals = values["reference"][..., law.layout.lowest], law.system.output_signals

@@ -145,12 +145,7 @@ class Plant(System):
     @property
     def port_signals(self) -> dict[str, tuple[Signal, ...]]:
         """Name of an output port of rule 1 -> names and units of its entries."""
-        return {
-            "state": tuple(self.dae.state_signals),
-            "constraint_force": tuple(self.dae.force_signals),
-            "constraint_residual": tuple(self.structure.manifold.residual_signals),
-            "controlled_output": tuple(self.dae.output_signals),
-        }
+        return port_signals(self.structure)
 
     def add_own_view(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         """Adds the plant's own part of the Meshcat view, with its wires, to its diagram."""
@@ -162,6 +157,17 @@ class Plant(System):
                 f"{needed_by} needs a robot, such as a RobotPlant, and '{self.dae.name}' is none"
             )
         return self.model
+
+
+def port_signals(structure: ConstraintStructure) -> dict[str, tuple[Signal, ...]]:
+    """Names and units of the output ports that every plant has."""
+    dae = structure.system
+    return {
+        "state": tuple(dae.state_signals),
+        "constraint_force": tuple(dae.force_signals),
+        "constraint_residual": tuple(structure.manifold.residual_signals),
+        "controlled_output": tuple(dae.output_signals),
+    }
 
 
 def plants_in(diagram: Diagram) -> list[Plant]:

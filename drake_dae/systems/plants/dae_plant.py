@@ -20,7 +20,7 @@ from drake_dae.dae import ConstraintStructure, DaeSystem, constraint_structure_o
 from drake_dae.dae.redundancy import manifold_of_left_out
 from drake_dae.errors import ModelError, SimulationError, SingularityError
 from drake_dae.systems.parameterized import ParameterizedSystem
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.contract import Plant, port_signals
 
 
 @checked(ModelError)
@@ -156,11 +156,8 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
         scale=system.scale,
         requirements=(regular,),
         signals={
-            "state": system.state_signals,
+            **port_signals(structure),
             "control": system.control_signals,
-            "constraint_force": system.force_signals,
-            "constraint_residual": manifold.residual_signals,
-            "controlled_output": system.output_signals,
             "parameters": system.parameter_signals,
         },
     )

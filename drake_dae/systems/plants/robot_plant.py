@@ -66,7 +66,8 @@ class RobotPlant(DaePlant):
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
-        return loop_signals(self.model)
+        names = ["loop_state"] if self.model.loop_joints.signals else []
+        return {name: self.block.signals[name] for name in names}
 
 
 def robot_block(model: RobotModel, structure: ConstraintStructure, project: bool = True) -> Block:
@@ -80,32 +81,22 @@ def robot_block(model: RobotModel, structure: ConstraintStructure, project: bool
         **joint_outputs(model),
         "constraint_wrenches": ca.substitute(wrenches, force, lambdas),
     }
-    named = {**block.signals, **loop_signals(model), "constraint_wrenches": signals}
+    named = {**block.signals, "constraint_wrenches": signals}
+    if "loop_state" in outputs:
+        named["loop_state"] = model.loop_joints.signals
     return replace(block, outputs=outputs, signals=named)
 
 
 def joint_outputs(model: RobotModel) -> dict[str, ca.SX]:
     """The output ports of a robot's plant that are functions of its state and parameters."""
-    size = model.links.q.numel() + model.links.v.numel()
-    parts = {"link_state": slice(0, size), **stage_ports(model, size)}
-    outputs = {name: model.dae.state[part, 0] for name, part in parts.items()}
+    first = model.links.q.numel() + model.links.v.numel()
+    outputs = {"link_state": model.dae.state[:first, 0]}
+    for stage in model.stages:
+        own = model.dae.state[first:, 0]
+        outputs |= {name: own[part, 0] for name, part in stage.ports.items()}
+        first += stage.state.numel()
     if model.loop_joints.signals:
         outputs["loop_state"] = model.loop_joints.state
     if model.joint_force is not None:
         outputs["joint_torque"] = model.joint_force
     return outputs
-
-
-def loop_signals(model: RobotModel) -> dict[str, Sequence[Signal]]:
-    """Names and units of `loop_state` under that name; empty without it."""
-    return {"loop_state": model.loop_joints.signals} if model.loop_joints.signals else {}
-
-
-def stage_ports(model: RobotModel, start: int = 0) -> dict[str, slice]:
-    """Name of a port of a robot's stages -> its part of (..., s), where s begins at `start`."""
-    parts = {}
-    for stage in model.stages:
-        for name, part in stage.ports.items():
-            parts[name] = slice(start + part.start, start + part.stop)
-        start += stage.state.numel()
-    return parts

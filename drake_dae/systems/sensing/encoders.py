@@ -130,48 +130,38 @@ class StateSensor(TracedSystem):
     ) -> None:
         check_whole_number("num_positions", num_positions, 1)
         check_whole_number("size", size, 2 * num_positions)
-        self.encoders, self.period = encoders, positive("period", period)
-        self.sample_period = self.period
-        super().__init__(encoder_block(size, num_positions, encoders, period))
-
-
-def encoder_block(size: int, count: int, encoders: Encoders, period: float) -> Block:
-    """The measured state, and the last sample with its index; see `StateSensor`."""
-    resolution, bias, position_noise, velocity_noise = (
-        _each(name, getattr(encoders, name), count)
-        for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
-    )
-    state, held = ca.SX.sym("state", size), ca.SX.sym("held", 1 + 2 * count)
-    q, v = state[:count] + bias, state[count : 2 * count]
-    inputs = {"state": state}
-    if encoders.has_noise:
-        inputs["noise"] = noise = ca.SX.sym("noise", 2 * count)
-        q, v = q + position_noise * noise[:count], v + velocity_noise * noise[count:]
-    for i in np.flatnonzero(resolution).tolist():
-        q[i] = resolution[i] * _rounded(q[i] / resolution[i])
-    sample, first = ca.floor(TIME / period + _SAME), ca.vertcat(q, v)
-    later = first
-    if encoders.velocity_bandwidth is not None:
-        a = np.exp(-encoders.velocity_bandwidth * period)
-        before, q_before = held[1 + count :], held[1 : 1 + count]
-        later = ca.vertcat(q, a * before + (1.0 - a) * (q - q_before) / period)
-    # Before the first sample it is nan.
-    fresh = ca.if_else(ca.fabs(held[0]) < np.inf, later, first)
-    current = ca.if_else(ca.eq(held[0], sample), held, ca.vertcat(sample, fresh))
-    return Block(
-        "state_sensor",
-        inputs,
-        {"estimated_state": ca.vertcat(current[1:], state[2 * count :])},
-        held={
-            "sample": Held(
-                held,
-                current,
-                np.full(1 + 2 * count, np.nan),
-                period,
-                begin=ca.vertcat(sample, first),
-            )
-        },
-    )
+        self.encoders, self.sample_period = encoders, positive("period", period)
+        count = num_positions
+        resolution, bias, position_noise, velocity_noise = (
+            _each(name, getattr(encoders, name), count)
+            for name in ("resolution", "position_bias", "position_noise", "velocity_noise")
+        )
+        state, held = ca.SX.sym("state", size), ca.SX.sym("held", 1 + 2 * count)
+        q, v = state[:count] + bias, state[count : 2 * count]
+        inputs = {"state": state}
+        if encoders.has_noise:
+            inputs["noise"] = noise = ca.SX.sym("noise", 2 * count)
+            q, v = q + position_noise * noise[:count], v + velocity_noise * noise[count:]
+        for i in np.flatnonzero(resolution).tolist():
+            q[i] = resolution[i] * _rounded(q[i] / resolution[i])
+        sample, first = ca.floor(TIME / period + _SAME), ca.vertcat(q, v)
+        later = first
+        if encoders.velocity_bandwidth is not None:
+            a = np.exp(-encoders.velocity_bandwidth * period)
+            before, q_before = held[1 + count :], held[1 : 1 + count]
+            later = ca.vertcat(q, a * before + (1.0 - a) * (q - q_before) / period)
+        # Before the first sample it is nan.
+        fresh = ca.if_else(ca.fabs(held[0]) < np.inf, later, first)
+        current = ca.if_else(ca.eq(held[0], sample), held, ca.vertcat(sample, fresh))
+        # The last sample with its index.
+        unknown, begin = np.full(1 + 2 * count, np.nan), ca.vertcat(sample, first)
+        block = Block(
+            "state_sensor",
+            inputs,
+            {"estimated_state": ca.vertcat(current[1:], state[2 * count :])},
+            held={"sample": Held(held, current, unknown, period, begin=begin)},
+        )
+        super().__init__(block)
 
 
 def _rounded(number: ca.SX) -> ca.SX:

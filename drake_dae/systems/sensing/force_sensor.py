@@ -91,9 +91,6 @@ class ForceSensor(TracedSystem):
                 "a ForceSensor needs a time_constant or a sample_period: without state it would "
                 "close an algebraic loop"
             )
-        super().__init__(self._make_block(size))
-
-    def _make_block(self, size: int) -> Block:
         force, y, sampled, noise = (
             ca.SX.sym(name, size) for name in ("force", "y", "sampled", "noise")
         )
@@ -120,7 +117,7 @@ class ForceSensor(TracedSystem):
             start, period = np.zeros(size), self.sample_period
             held = Held(sampled, measured, start, period, is_unrestricted=False)
             block = replace(block, held={"measured_force": held})
-        return block
+        super().__init__(block)
 
     def set_errors(
         self,

@@ -143,9 +143,7 @@ class TaskController(ParameterizedSystem, Controller):
                 "take a CompliantPlant or a ContactPlant (in a scenario: plant: !CompliantContact)"
             )
 
-    def derived(
-        self, context: Context | None, times: FloatArray, values: Mapping[str, FloatArray]
-    ) -> Derived:
+    def derived(self, values: Mapping[str, FloatArray]) -> Derived:
         """Outputs are positions, forces and distances; "phase" is 1 for the current one, else 0."""
         signals, residual = self.output_signals, values["constraint_residual"]
         outputs = np.concatenate([values["controlled_output"], residual[..., self._distances]], -1)

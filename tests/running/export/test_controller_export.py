@@ -59,16 +59,9 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
         ("two_link_wall", (SAMPLED,)),
         pytest.param("two_link_wall", (SAMPLED, MANY_PIECES), marks=pytest.mark.slow),
         pytest.param("two_link_wall", EVERYTHING, marks=pytest.mark.slow),
-        pytest.param(
-            "seven_joint_moving_plate", (SAMPLED,), marks=[pytest.mark.slow, pytest.mark.thorough]
-        ),
-        pytest.param("wall_point_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
         # Another mass than the model has: what the observer holds is more than rounding.
         pytest.param(
             "wall_polish", ("plant.parameters={link6.mass: 3.0}",), marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "wall_point_contact", ("sampling=null",), marks=[pytest.mark.slow, pytest.mark.thorough]
         ),
         pytest.param("wall_flexible_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
     ],

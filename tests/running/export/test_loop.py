@@ -62,7 +62,6 @@ def assert_as_in_drake(name: str, settings, duration: float, folder) -> CLoop:
     [
         ("two_link_wall", (), 0.3),
         ("two_link_wall", EVERYTHING, 0.3),
-        pytest.param("seven_joint_wall", (SAMPLED,), 0.1, marks=pytest.mark.thorough),
         pytest.param("seven_joint_moving_plate", (), 0.1, marks=pytest.mark.thorough),
         pytest.param(
             "wall_guarded",

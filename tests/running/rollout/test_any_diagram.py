@@ -30,9 +30,10 @@ from scipy.linalg import expm
 
 from drake_dae import rollout
 from drake_dae.errors import ModelError
-from drake_dae.running import export_loop, rollout_program, start_values
+from drake_dae.running import export_loop, start_values
 from drake_dae.running import rollout as module
 from drake_dae.running.events import events_within
+from drake_dae.running.rollout_program import program_of
 
 
 def fixed(step=1e-3):
@@ -129,33 +130,6 @@ def test_random_diagrams_roll_out(seed):
         np.testing.assert_allclose(
             found.record[f"out {number}"][:-1, 0], log.data()[0, rows], rtol=1e-11, atol=1e-11
         )
-
-
-@both
-def test_noise_and_samples_of_several_rates(compiled):
-    """To 1e-12: the numbers of Drake's RandomSource, held and filtered."""
-    builder = DiagramBuilder()
-    noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 2, 0.01))
-    hold = builder.AddSystem(ZeroOrderHold(0.015, 2))
-    low = builder.AddSystem(FirstOrderLowPassFilter(0.05, 2))
-    builder.Connect(noise.get_output_port(), hold.get_input_port())
-    builder.Connect(hold.get_output_port(), low.get_input_port())
-    builder.ExportOutput(low.get_output_port(), "filtered")
-    log = LogVectorOutput(low.get_output_port(), builder)
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    start, parameters = start_values(diagram, context)
-    assert start.size == 4
-    times = np.linspace(0.0, 0.3, 61)
-    (found,) = rollout(diagram, start, parameters, times, config=fixed(5e-3), compiled=compiled)
-    simulator = Simulator(diagram, context)
-    ApplySimulatorConfig(fixed(5e-3), simulator)
-    simulator.AdvanceTo(0.3)
-    data = log.FindLog(context)
-    rows = np.searchsorted(data.sample_times(), times[:-1] - 1e-9)
-    wanted = data.data().T[rows]
-    assert np.abs(wanted).max() > 0.1
-    np.testing.assert_allclose(found.record["filtered"][:-1], wanted, rtol=0, atol=1e-12)
 
 
 def test_what_drake_alone_can_run_is_named():
@@ -335,30 +309,11 @@ def test_a_diagram_without_outputs_has_nothing_to_record():
         start_values(diagram, diagram.CreateDefaultContext())
 
 
-def test_a_diagram_is_compiled_once(monkeypatch):
+def test_a_diagram_is_compiled_once():
     """To compile one takes many times as long as a short run; another diagram is another."""
-    made = []
-
-    whole = rollout_program.RolloutProgram
-
-    def counted(diagram, *arguments):
-        made.append(diagram)
-        return whole(diagram, *arguments)
-
-    monkeypatch.setattr(rollout_program, "RolloutProgram", counted)
-    ends = []
-    for factor in (1.0, 2.0):
-        builder = DiagramBuilder()
-        source = builder.AddSystem(ConstantVectorSource([factor]))
-        integrator = builder.AddSystem(Integrator(1))
-        builder.Connect(source.get_output_port(), integrator.get_input_port())
-        builder.ExportOutput(integrator.get_output_port(), "sum")
-        diagram = builder.Build()
-        for start in (0.0, 1.0):
-            (run,) = rollout(diagram, [start], None, [0.0, 0.5], config=fixed(), compiled=False)
-            ends.append(run.record["sum"][-1, 0] - start)
-    assert len(made) == 2
-    np.testing.assert_allclose(ends, [0.5, 0.5, 1.0, 1.0], rtol=1e-12)
+    first, other = random_diagram(0)[0], random_diagram(0)[0]
+    assert program_of(first) is program_of(first)
+    assert program_of(first) is not program_of(other)
 
 
 def test_a_stiff_rollout_says_so(monkeypatch):

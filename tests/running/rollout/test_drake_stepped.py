@@ -19,7 +19,6 @@ CONTINUOUS = (
     "law.gains.all=[-25.0]",
     "references={tool.z: 0.3, wall.force: 20}",
 )
-ENCODERS = "sensors.encoders={resolution: 1.0e-5, velocity_noise: 1.0e-4, seed: 3}"
 NOISE = "sensors.force={sample_period: 0.001, noise_deviation: 0.1, seed: 7}"
 LATE = "sampling={period: 2.0e-3, delay: 3.0e-3}"
 
@@ -29,22 +28,13 @@ LOOPS = {
     "a continuous law": ("two_link_wall", *CONTINUOUS),
     "a continuous law whose references move": ("two_link_wall", *CONTINUOUS[:3]),
     "a law that acts late, at another period": ("two_link_wall", *CONTINUOUS, LATE),
-    "encoders": ("wall_point_contact", ENCODERS),
-    "noise": (
-        "wall_point_contact",
-        "sensors.force={sample_period: 0.001, noise_deviation: 0.1, seed: 7}",
-    ),
-    "drives with limits": ("wall_point_contact", "saturation=true"),
+    "noise": ("wall_point_contact", NOISE),
     "a push": (
         "wall_point_contact",
         "plant.disturbances=[{frame: link7, start_time: 0.01, end_time: 0.03, force: [5, 0, 0]}]",
     ),
     "a start between two steps": ("wall_point_contact", "integrator.start_time=0.0104"),
 }
-
-
-DEAR = ("behind springs", "encoders", "drives with limits")
-"""What test_combinations.py has with Drake's own contact, too, of cheaper robots."""
 
 
 def chosen(name, duration=0.06):
@@ -54,7 +44,7 @@ def chosen(name, duration=0.06):
 
 @pytest.mark.slow
 @mostly_compiled
-@pytest.mark.parametrize("name", some(first_quick(LOOPS), dear=DEAR))
+@pytest.mark.parametrize("name", some(first_quick(LOOPS)))
 def test_the_record_is_that_of_simulate(name, compiled):
     """Drake makes the same steps of the plant in both, so that only round-off differs.
 
@@ -93,16 +83,9 @@ def test_many_starts_are_each_alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("robot", "setting"),
-    [
-        ("wall_point_contact", "sensors.force={time_constant: 0.002}"),
-        ("two_link_wall", "sensors.force={time_constant: 0.002}"),
-    ],
-)
-def test_a_continuous_state_beside_it_is_refused(robot, setting):
-    settings = CONTINUOUS if robot == "two_link_wall" else ()
-    loop, context = build_scenario(scenario(robot, *settings, setting))
+def test_a_continuous_state_beside_it_is_refused():
+    lag = "sensors.force={time_constant: 0.002}"
+    loop, context = build_scenario(scenario("two_link_wall", *CONTINUOUS, lag))
     with pytest.raises(ModelError, match="'force_sensor'"):
         start_values(loop, context)
 

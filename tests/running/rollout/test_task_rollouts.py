@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from golden.cases import FIXTURE
-from polishing import CLIMB, push, run_on, started, task_loop
+from polishing import CLIMB, push, started, task_loop
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from runs import mostly_compiled, some
 
@@ -21,7 +21,6 @@ from drake_dae import (
     simulate,
 )
 from drake_dae.running import start_values
-from drake_dae.running.rollout_program import program_of
 from drake_dae.systems import Condition
 
 
@@ -38,12 +37,6 @@ LEAVING = Move({"tool.z": CLIMB}, 0.2, over=0.1), Release(over=0.1), Retreat(0.0
 TASKS = {
     "whole": lambda: pulled(*HOLDING, *LEAVING),
     "sampled and late": lambda: pulled(*HOLDING, *LEAVING, sampling=Sampling(0.004, 0.002)),
-    "sampled and pulled off": lambda: pulled(
-        Approach(0.1, over=0.1),
-        Press(10.0, over=0.2, if_lost="hold"),
-        pull=-8.0,
-        sampling=Sampling(0.002, 0.002),
-    ),
     "feels, tries again and is stopped by guards": lambda: pulled(
         Approach(
             0.1,
@@ -74,13 +67,9 @@ TASKS = {
         ),
     ),
     "begins in contact": lambda: pulled(Press(5.0, over=0.05), Dwell(0.1), Release(over=0.05)),
-    "waits in vain": lambda: pulled(Approach(0.01, within=0.1, if_late="hold")),
-    **{
-        f"is pulled off: {reaction}": lambda reaction=reaction: pulled(
-            Approach(0.1, over=0.1), Press(10.0, over=0.2, if_lost=reaction), pull=-8.0
-        )
-        for reaction in ("hold", "approach")
-    },
+    "is pulled off": lambda: pulled(
+        Approach(0.1, over=0.1), Press(10.0, over=0.2, if_lost="approach"), pull=-8.0
+    ),
 }
 
 
@@ -95,7 +84,7 @@ def assert_same_records(found, wanted, tolerance):
 
 @pytest.mark.slow
 @mostly_compiled
-@pytest.mark.parametrize("name", some(TASKS, of=4))
+@pytest.mark.parametrize("name", some(TASKS, of=3))
 def test_tasks_are_those_of_drake(name, compiled):
     """To 1e-9: when each phase begins and why, and all signals."""
     loop, context = TASKS[name]()
@@ -110,22 +99,6 @@ def test_tasks_are_those_of_drake(name, compiled):
     told = [(one.phase, one.reason, one.time) for one in loop.changes(found.record)]
     assert told == [(one.phase, one.reason, pytest.approx(one.time, abs=1e-9)) for one in changes]
     assert_same_records(found.record, wanted, 1e-9)
-
-
-@pytest.mark.slow
-def test_at_each_moment_of_a_task_its_functions_are_what_its_blocks_show():
-    """To 1e-12 of the largest value, before and after its changes."""
-    loop, context = TASKS["whole"]()
-    program, phases = program_of(loop), set()
-    for end in (0.05, 0.12, 0.21, 0.3, 0.5, 0.62, 0.7, 0.9):
-        run_on(loop, context, end)
-        row = program.functions.row(context.get_time(), *program.values_in(context))
-        wanted = [loop.diagram.GetOutputPort(name).Eval(context) for name in program.signals]
-        column = np.concatenate(wanted)
-        scale = np.abs(column).max()
-        np.testing.assert_allclose(row.full()[:, 0], column, rtol=0.0, atol=1e-12 * scale)
-        phases.add(float(loop.diagram.GetOutputPort("phase").Eval(context)[0]))
-    assert len(phases) >= 4
 
 
 @pytest.mark.slow

@@ -11,13 +11,10 @@ from alone import alone
 from arms import arm, law
 from blocks_of_users import Counter_
 from problems import PROBLEMS
-from pydrake.math import sin
 from pydrake.symbolic import Variable, if_then_else, logical_and
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
-    BasicVector_,
     DiagramBuilder,
-    LeafSystem_,
 )
 from pydrake.systems.primitives import (
     Adder,
@@ -41,7 +38,6 @@ from pydrake.systems.primitives import (
     WrapToSystem,
     ZeroOrderHold,
 )
-from pydrake.systems.scalar_conversion import TemplateSystem
 from runs import some
 
 from drake_dae import (
@@ -156,9 +152,6 @@ BLOCKS = {
     "ReferenceGenerator with parameters": references_with_parameters,
     "TrackingController": lambda: TrackingController(law("two_link")),
     "TrackingController of a measured force": lambda: TrackingController(measured_law(())),
-    "TrackingController with an integral": lambda: TrackingController(
-        measured_law(("tool.z",)), integral_limits=0.3
-    ),
     "TrackingController with the integral of a force": lambda: TrackingController(
         measured_law(("wall.force",), 0.0)
     ),
@@ -173,12 +166,10 @@ BLOCKS = {
     ),
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
-    "ControlHold of one control": lambda: ControlHold(1, Sampling(0.01)),
     "StateEstimator of exact states": lambda: observer(least_force=1e-3),
     "StateEstimator of exact states of a contact that sticks": lambda: observer(
         least_speed=1e3, least_force=1e-3
     ),
-    "StateEstimator of exact states of a contact that is lost": lambda: observer(least_force=1e3),
     "StateEstimator of exact states behind springs": observer_behind_springs,
     "StateEstimator": lambda: estimator(0.5, least_force=1e-3),
     "StateEstimator without a force sensor": lambda: estimator(0.5, law=found_friction(False)),
@@ -194,37 +185,7 @@ BLOCKS = {
         4, 2, Encoders(position_noise=0.1, velocity_noise=0.2), 0.01
     ),
     "ForceSensor with all of it": lambda: ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2], 0.4),
-    "ForceSensor that drifts": lambda: ForceSensor(2, 0.02, drift=[0.4, -0.3]),
 }
-
-
-@TemplateSystem.define("Pendulum_")
-def Pendulum_(T):
-    """A user's system, templated on the scalar type."""
-
-    class Impl(LeafSystem_[T]):
-        def _construct(self, length=0.5, converter=None):
-            super().__init__(converter)
-            self.length = length
-            self.DeclareNumericParameter(BasicVector_[T]([9.81]))
-            self.DeclareContinuousState(2)
-            self.DeclareVectorInputPort("torque", 1)
-            self.DeclareVectorOutputPort("angle", 1, self._calc, {self.xc_ticket()})
-
-        def _construct_copy(self, other, converter=None):
-            Impl._construct(self, other.length, converter=converter)
-
-        def DoCalcTimeDerivatives(self, context, derivatives):
-            angle, rate = context.get_continuous_state_vector().CopyToVector()
-            gravity = context.get_numeric_parameter(0)[0]
-            torque = self.GetInputPort("torque").Eval(context)[0]
-            value = [rate, torque - gravity / self.length * sin(angle)]
-            derivatives.get_mutable_vector().SetFromVector(value)
-
-        def _calc(self, context, output):
-            output[0] = context.get_continuous_state_vector()[0]
-
-    return Impl
 
 
 def symbolic_system():
@@ -264,7 +225,6 @@ SYSTEMS = {
     "MatrixGain": lambda: MatrixGain([[1.0, 2.0], [3.0, 4.0]]),
     "SymbolicVectorSystem": symbolic_system,
     "a diagram of primitives": lambda: StateInterpolatorWithDiscreteDerivative(2, 0.1),
-    "a template of the user's": lambda: Pendulum_[None](0.8),
     "a template whose updates begin later": lambda: Counter_[None](0.1, 0.03),
 }
 

@@ -3,13 +3,12 @@
 import casadi as ca
 import numpy as np
 import pytest
-from arms import error_controlled, fixed_step
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from runs import some
 
-from drake_dae import DaePlant, DaeSystem, ForceSensor, simulate
+from drake_dae import DaePlant, DaeSystem, simulate
 from drake_dae.errors import NonFiniteError, SimulationError, SingularityError
 
 ERROR_CONTROLLED = (
@@ -31,21 +30,6 @@ def tank(f=lambda x: -500 * (ca.sqrt(x) - 0.1), start=1.0):
         h=lambda s: [1],
         l=lambda s: [s[0]],
         nominal_state=[start],
-        name="tank",
-    )
-
-
-def leaking_tank_with_force():
-    """The tank, and a constraint whose force is the root of its level: y' = sqrt(x) + v, y = 0."""
-    return DaeSystem.from_functions(
-        ["x", "y"],
-        f=lambda s: [-500 * (ca.sqrt(s[0]) - 0.1), ca.sqrt(s[0])],
-        g=lambda s: [0, 1],
-        h=lambda s: [1, 0],
-        k=lambda s: [s[1]],
-        l=lambda s: [s[0]],
-        m=lambda s: [[0]],
-        nominal_state=[1.0, 0.0],
         name="tank",
     )
 
@@ -171,20 +155,6 @@ def test_nan_from_a_block_of_someone_else_ends_the_run(name, since):
     assert np.isfinite(logger.FindLog(simulator.get_context()).data()).all()
 
 
-def test_a_sensor_feels_what_a_trial_does_not_have():
-    """Its state, like that of the plant, is finite at each step; tau f' = -sqrt(x) - f."""
-    builder = DiagramBuilder()
-    plant = builder.AddSystem(DaePlant(leaking_tank_with_force()))
-    sensor = builder.AddSystem(ForceSensor(1, 0.01))
-    source = builder.AddSystem(ConstantVectorSource([0.0]))
-    builder.Connect(source.get_output_port(), plant.get_input_port())
-    builder.Connect(plant.GetOutputPort("constraint_force"), sensor.get_input_port())
-    logger = LogVectorOutput(sensor.get_output_port(), builder)
-    context = by_drake(builder.Build(), 0.5, error_controlled(1e-6))
-    # At rest: the level is 0.01, its root 0.1.
-    assert logger.FindLog(context).data()[0, -1] == pytest.approx(-0.1, abs=1e-4)
-
-
 class Reading(LeafSystem):
     """Compares each entry of a plant's ports with those of its state, in each derivative."""
 
@@ -267,15 +237,3 @@ def test_an_overflow_is_not_called_singular():
     with pytest.raises(NonFiniteError, match=r"\bx\b") as caught:
         plant.EvalTimeDerivatives(context)
     assert not isinstance(caught.value, SingularityError)
-
-
-def test_how_slow_is_endless():
-    """A thousand steps of 2 ns add 2e-9 of the 1000 s that were simulated before."""
-    diagram, _ = alone(DaePlant(tank(lambda x: -x)))
-    simulator = Simulator(diagram)
-    ApplySimulatorConfig(fixed_step(1.0), simulator)
-    simulator.AdvanceTo(1000.0)
-    simulator.get_mutable_integrator().set_maximum_step_size(2e-9)
-    with pytest.raises(SimulationError, match="1000"):
-        simulator.AdvanceTo(1000.1)
-    assert simulator.get_context().get_time() < 1000.0001

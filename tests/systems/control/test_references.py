@@ -25,18 +25,6 @@ def table(signal, degree, time):
     return generator.reference(time).reshape(signal.size, degree + 1)
 
 
-def test_layout_is_output_major():
-    generator = ReferenceGenerator(
-        [SinusoidReference(1.0, 2.0, 3.0), ConstantReference([7.0, 8.0])], [2, 1, 0]
-    )
-    expected = [1.0, 6.0, 0.0, 7.0, 0.0, 8.0]
-    np.testing.assert_allclose(generator.reference(0.0), expected, atol=1e-15)
-    context = generator.CreateDefaultContext()
-    context.SetTime(0.4)
-    port = generator.GetOutputPort("reference").Eval(context)
-    np.testing.assert_array_equal(port, generator.reference(0.4))
-
-
 def test_sums_of_sinusoids():
     t, a, w, p = 0.7, np.array([0.5, -2.0]), np.array([3.0, 0.4]), np.array([0.1, 1.0])
     found = table(SinusoidReference(4.0, a, w, p), 4, t)[0]
@@ -76,15 +64,6 @@ def test_moves_are_smooth_at_both_ends_and_held_outside(order):
         assert np.max(np.abs(table(signal, order, time)[:, 1:])) < 1e-2
     middle = table(signal, order, 1.5)
     np.testing.assert_allclose(middle[:, 0], [0.5, 4.5], atol=1e-12)
-
-
-def test_expressions_of_time():
-    signal = ExpressionReference(lambda t: [t**3, ca.exp(-t) * t])
-    np.testing.assert_allclose(
-        table(signal, 2, 2.0),
-        [[8.0, 12.0, 12.0], np.exp(-2.0) * np.array([2.0, -1.0, 0.0])],
-        atol=1e-14,
-    )
 
 
 def test_drake_trajectories():

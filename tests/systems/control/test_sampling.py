@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from arms import arm, error_controlled
 from numpy.testing import assert_allclose
-from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
 from runs import run, run_scenario, scenario
 
@@ -148,58 +147,6 @@ def test_integrals_stand_still_while_a_drive_is_at_its_limit():
     record = run(loop, context, 1.0, STEP)
     assert np.all(record["excess"] > 0.0)
     assert_allclose(record["integral"], 0.0)
-
-
-def test_sampled_law_reads_a_force_as_it_is():
-    """lambda_k = (1 + G) r - G lambda_(k-1) with the exact model: a start off by 1 N alternates.
-
-    At rest, where the exact model holds: the force error is multiplied by -G = -0.5 a sample.
-    """
-    found = arm("two_link")
-    tracking = TrackingLaw(
-        found.model.dae,
-        poles(-4.0),
-        structure=found.structure,
-        measured_force=True,
-        force_gain=0.5,
-    )
-    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
-    loop = make_closed_loop(
-        RobotPlant(found.model, structure=found.structure),
-        tracking,
-        wanted,
-        LoopSettings(sampling=Sampling(0.01)),
-    )
-    context = loop.diagram.CreateDefaultContext()
-    plant = loop.plant
-    state = found.model.rest_state(found.model.configuration([0.3], [1.2, -1.6]), [20.0])
-    own = plant.GetMyMutableContextFromRoot(context)
-    plant.set_consistent_state(own, state)
-    hold = loop.diagram.GetSubsystemByName("control_hold")
-    held = hold.GetMyMutableContextFromRoot(context)
-    torque = _torque(found.model, state, 19.0)
-    held.SetDiscreteState(torque)
-    record = run(loop, context, 0.05, STEP)
-    errors = at(record, "constraint_force", 0.01 * np.arange(1, 5)) - 20.0
-    # The torque at the start is 1 N too little until the first sample, at once.
-    assert_allclose(errors, [0.5, -0.25, 0.125, -0.0625], rtol=0.02)
-
-
-def _torque(model, state, force):
-    """What holds the arm at rest against gravity and a force, by the plant alone."""
-    plant = model.links.plant
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, state[:2])
-    jacobian = plant.CalcJacobianTranslationalVelocity(
-        context,
-        JacobianWrtVariable.kV,
-        plant.GetFrameByName("tool"),
-        np.zeros(3),
-        plant.world_frame(),
-        plant.world_frame(),
-    )
-    normal = np.array([-1.0, 0.0, 0.0])
-    return -plant.CalcGravityGeneralizedForces(context) - jacobian.T @ normal * force
 
 
 @pytest.mark.parametrize(

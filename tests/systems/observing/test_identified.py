@@ -23,7 +23,6 @@ from drake_dae import (
     rollout,
     simulate,
 )
-from drake_dae.cli import main
 from drake_dae.dae import DerivativeLayout, Observation, Parameter, find_structure, with_disturbance
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, ScenarioError
@@ -242,19 +241,6 @@ def test_errors_of_the_model_are_found_and_compensated(settings, position, force
     for name, (value, deviation) in zip(names, pairs, strict=True):
         if name in true:
             assert abs(value - true[name]) < 2.0 * deviation
-
-
-@pytest.mark.slow
-def test_the_summary_says_what_is_known_and_what_the_motion_does_not_excite(tmp_path, capsys):
-    settings = [*KILOGRAM, "duration=0.5", "write={plots: false, animation: false}"]
-    words = [word for setting in settings for word in ("--set", setting)]
-    out = str(tmp_path / "run")
-    assert main(["simulate", "wall_point_contact", "--rollout", *words, "--out", out]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert any(line.startswith("identified           payload.mass = 0.") for line in lines)
-    (line,) = [line for line in lines if line.startswith("not identified")]
-    assert "payload.center[0]" in line
-    assert line.endswith("this motion does not excite them")
 
 
 @pytest.mark.slow

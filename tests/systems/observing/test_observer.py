@@ -6,7 +6,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from arms import consistent_states, error_controlled, numbers, touching
+from arms import error_controlled, numbers, touching
 from numpy.testing import assert_allclose
 from pydrake.common import RandomDistribution
 from pydrake.systems.analysis import Simulator
@@ -34,7 +34,7 @@ from drake_dae import (
     poles,
     simulate,
 )
-from drake_dae.dae import ConstraintStructure, Observation, with_disturbance
+from drake_dae.dae import ConstraintStructure, with_disturbance
 from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, WiringError
@@ -194,43 +194,10 @@ def test_friction_is_identified_while_it_slides():
     assert np.abs(record["disturbance"][-1]).max() < 0.05 * 0.3 * 20.0
 
 
-@pytest.mark.slow
-def test_friction_of_an_ideal_contact_is_found_while_it_creeps():
-    """At v_s, where it has 0.71 of its full size: 0.21 if it were taken for fully developed.
-
-    To 2 per cent: the speed changes by 12 per cent, and what is found is late.
-    """
-    creep = [SinusoidReference(0.3, 0.002, 0.5), ConstantReference(20.0)]
-    _, record = slide(creep, 1.0, Observing(20.0, friction_rate=10.0, least_speed=1e-4))
-    assert_allclose(record["friction"][-1], 0.3, rtol=0.02)
-
-
 def test_friction_stands_still_where_the_contact_is_taken_for_lost():
     _, record = slide(SWAY, 0.1, Observing(20.0, friction_rate=10.0, least_force=100.0))
     assert np.all(record["friction"] == 0.0)
     assert np.abs(record["disturbance"][-1]).max() > 0.5
-
-
-@pytest.mark.slow
-def test_friction_stands_still_where_nothing_slides():
-    """A reaction holds the arm still then; what is found is what the wall answers, at its own rate.
-
-    With t the joint velocities along the wall, t . r = 0: no part of r moves the tool. What is
-    found of a constant load in 0.29 s is 1 - e^(-k_n t) of it, whatever k_n is; the rest is how the
-    arm comes to rest.
-    """
-    wanted, found = [ConstantReference(0.3), ConstantReference(20.0)], []
-    for rate in (None, 5.0):
-        observing = Observing(20.0, force_rate=rate)
-        _, record = slide(wanted, 0.3, observing, change={"link2.mass": 5.0})
-        assert np.all(record["friction"] == 0.0)
-        r = at_samples(record, "disturbance", 1e-3)[1][290]
-        n = numbers("two_link", *np.split(record["state"][-1], 2))
-        along = np.array([n.constraint_jacobian[0, 1], -n.constraint_jacobian[0, 0]])
-        assert_allclose(r @ along, 0.0, atol=0.02 * np.linalg.norm(r * along))
-        found.append(r / -np.expm1(-(rate or 20.0) * 0.29))
-    assert np.abs(found[0]).max() > 0.5
-    assert_allclose(found[1], found[0], rtol=0.1)
 
 
 def test_handing_over_to_friction_moves_nothing():
@@ -368,29 +335,6 @@ def test_what_pulls_across_the_sliding_is_no_friction(count):
         assert_allclose(evaluated(shares, *given, d), wanted[0], rtol=1e-8)
         assert_allclose(evaluated(shares, *given, 0.3 * friction), 0.3, rtol=1e-8)
         assert_allclose(evaluated(shares, *given, columns[-1]), 2.0 - count, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_gradients_of_sliding_span_what_derivatives_of_friction_at_rest_span():
-    """What is left of a disturbance beside them, at consistent states, to round-off."""
-    dae = frictional(0.3, "seven_joint")[1]
-    plain = replace(dae, contacts=tuple(replace(each, sliding=None) for each in dae.contacts))
-    found, other = (
-        Observation.of(law.structure, law.layout)
-        for law in (TrackingLaw(system, poles(-4.0)) for system in (dae, plain))
-    )
-    random, size = np.random.default_rng(3), len(found.rows)
-    assert (found.widths, other.widths) == ((2,), (size,))
-    for state in consistent_states("seven_joint", 3):
-        given = state, np.array([20.0]), dae.parameter_values
-        unit = [found.metric(state, d, dae.parameter_values)[0].copy() for d in np.eye(size)]
-        d = random.standard_normal(size)
-        left = [
-            evaluated(beside, each.directions(*given)[1].reshape(size, -1), metric_of(unit), d)
-            for each in (found, other)
-        ]
-        assert np.abs(left[0] - d).max() > 0.1
-        assert_allclose(left[0], left[1], rtol=0.0, atol=1e-9)
 
 
 def test_law_cancels_a_disturbance_that_acts_as_a_known_torque():

@@ -41,15 +41,6 @@ def test_direct_feedthrough_is_exact():
         assert found == through
 
 
-def test_outputs_without_feedthrough_need_no_control():
-    plant = two_link()
-    context = plant.CreateDefaultContext()
-    assert np.max(np.abs(plant.GetOutputPort("constraint_residual").Eval(context))) < 1e-14
-    np.testing.assert_array_equal(
-        plant.GetOutputPort("state").Eval(context), plant.GetOutputPort("link_state").Eval(context)
-    )
-
-
 def test_outputs_follow_state_control_and_parameters():
     """The declared prerequisites are complete: no cached value is stale."""
     plant = two_link()
@@ -103,19 +94,6 @@ def test_projection_is_due_at_the_start_of_the_next_step():
     before = np.max(np.abs(port.Eval(context)))
     simulator.AdvancePendingEvents()
     assert np.max(np.abs(port.Eval(context))) < 1e-13 < before
-
-
-def test_projection_does_not_change_the_reported_force():
-    """The force at a consistent state is that of the dynamics, to round-off."""
-    first, second = two_link(), two_link(project=False)
-    values = []
-    for plant in (first, second):
-        simulator, context = driven(plant, [40.0, 20.0])
-        ApplySimulatorConfig(fixed_step(1e-3), simulator)
-        simulator.AdvanceTo(0.2)
-        simulator.AdvancePendingEvents()
-        values.append(plant.GetOutputPort("constraint_force").Eval(context)[0])
-    assert values[0] == pytest.approx(values[1], rel=1e-10)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

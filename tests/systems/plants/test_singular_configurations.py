@@ -39,23 +39,3 @@ def test_of_two_constraints_the_one_without_gradient_is_named():
     with pytest.raises(SingularityError, match="cross") as refused:
         simulate(plant, context, 2.0, fixed_step(0.125))
     assert refused.value.constraints == ("cross",)
-
-
-@pytest.mark.parametrize("accuracy", [1e-4, 1e-9])
-def test_a_miss_of_a_hundredth_is_none(accuracy):
-    """On z^2 - x^2 = miss^2 a point that comes down on one side goes up again on the other one."""
-    miss = 1e-2
-    system = system_of(
-        4,
-        f=lambda x: [x[2], x[3], 0, 0],
-        g=lambda x: [[0], [0], [-2 * x[0]], [2 * x[1]]],
-        k=lambda x: [x[1] ** 2 - x[0] ** 2 - miss**2],
-        nominal_state=[-1.0, 1.0, 1.0, -1.0],
-    )
-    plant = DaePlant(system)
-    context = plant.CreateDefaultContext()
-    plant.set_consistent_state(context, [-1.0, 1.0, 1.0, -1.0])
-    simulate(plant, context, 2.0, error_controlled(accuracy))
-    x, z, *_ = plant.state(context)
-    assert x > 0.5
-    assert z > 0.5

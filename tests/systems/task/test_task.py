@@ -142,21 +142,6 @@ def test_a_task_that_may_not_try_again_ends():
     assert (last.phase, last.failed) == ("held", True)
 
 
-@pytest.mark.slow
-def test_patience_goes_on_from_phase_to_phase():
-    """The first phase lasts for 15 ms, shorter than it; a hand pulls in it."""
-    short = [Dwell(0.015, over=0.01), Dwell(0.05, over=0.01, if_lost="hold")]
-    loop = task_loop([HOLDING, Press(10.0, over=0.1), *short], patience=0.02)
-    context = started(loop, distance=0.01)
-    run_on(loop, context, 0.255)
-    assert loop.changes(loop.record(context))[-1].phase == "Dwell"
-    push(loop, context, -40.0)
-    run_on(loop, context, 0.4)
-    last = loop.changes(loop.record(context))[-1]
-    assert (last.phase, last.reason) == ("held", "the contact of Dwell 2 is lost")
-    assert_allclose(last.time, 0.275, atol=0.01)
-
-
 def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
     """A reference below zero pulls it off, and it has gone when the last phase ends."""
     pulled = Move({"wall.force": -5.0}, 0.05, over=0.01)

@@ -28,7 +28,7 @@ from drake_dae.systems.plants.contact.contact_laws import (
 )
 from drake_dae.systems.plants.contact.contact_material import FRICTION, PointMaterial
 from drake_dae.systems.plants.contact.stage_steps import check_step, stage_rates, stages_after
-from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.plants.contract import Plant, port_signals
 from drake_dae.systems.plants.robot_plant import joint_outputs
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import FailureKind, TracedFunction
@@ -259,11 +259,8 @@ class CompliantEquations:
             start={"state": state, "parameters": self.own_parameters(values, material)},
             requirements=(fits,),
             signals={
-                "state": dae.state_signals,
+                **port_signals(structure),
                 "control": dae.control_signals,
-                "constraint_force": dae.force_signals,
-                "constraint_residual": structure.manifold.residual_signals,
-                "controlled_output": dae.output_signals,
                 "contact_force": forces,
                 "parameters": [*dae.parameter_signals, *material.signals],
             },

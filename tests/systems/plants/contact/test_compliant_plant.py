@@ -268,17 +268,29 @@ def sled(stop: float = np.inf) -> RobotModel:
     return RobotModel.from_multibody(plant, [contact], [], forces=[])
 
 
-def run_sled(time_step, pull, duration, **material):
-    """The state of the sled under a pull and a press of 10 N, after a time."""
-    plant = CompliantPlant(sled(), PointMaterial(time_step, stiffness=1e4, **material))
+PRESSED = [0.0, -1e-3, 0.0, 0.0]
+"""Pressed in by 10 N / 1e4 N/m."""
+
+
+def driven(plant, state, **inputs):
+    """A diagram of a plant with constant inputs, its context and the plant's, from a state on."""
     builder = DiagramBuilder()
     builder.AddSystem(plant)
-    source = builder.AddSystem(ConstantVectorSource([pull, -10.0]))
-    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
+    for name, values in inputs.items():
+        source = builder.AddSystem(ConstantVectorSource(values))
+        builder.Connect(source.get_output_port(), plant.GetInputPort(name))
+    builder.ExportOutput(plant.GetOutputPort("state"), "state")
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
-    plant.set_state(own, [0.0, -1e-3, 0.0, 0.0])  # Pressed in by 10 N / 1e4 N/m.
+    plant.set_state(own, state)
+    return diagram, context, own
+
+
+def run_sled(time_step, pull, duration, **material):
+    """The state of the sled under a pull and a press of 10 N, after a time."""
+    plant = CompliantPlant(sled(), PointMaterial(time_step, stiffness=1e4, **material))
+    diagram, context, own = driven(plant, PRESSED, control=[pull, -10.0])
     simulate(diagram, context, duration, fixed_step(1e-4))
     return plant.state(own)
 
@@ -314,14 +326,7 @@ def test_a_contact_opens_and_strikes_with_the_restitution_of_hunt_and_crossley()
     Steps of 1e-5 s of RK5 leave 1e-6 of it.
     """
     plant = CompliantPlant(sled(), PointMaterial(0.0, stiffness=1e4, friction=0.0))
-    builder = DiagramBuilder()
-    builder.AddSystem(plant)
-    source = builder.AddSystem(ConstantVectorSource([0.0, -20.0]))
-    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    own = plant.GetMyMutableContextFromRoot(context)
-    plant.set_state(own, [0.0, 0.05, 0.0, 0.0])
+    diagram, context, own = driven(plant, [0.0, 0.05, 0.0, 0.0], control=[0.0, -20.0])
     fall = np.sqrt(2 * 0.05 / 10.0)
     simulate(diagram, context, fall, fixed_step(1e-5))
     assert_allclose(plant.state(own)[3], -np.sqrt(2 * 10.0 * 0.05), rtol=1e-6)
@@ -346,19 +351,9 @@ def test_a_moving_floor_takes_the_sled_along(time_step):
         ),
         PointMaterial(time_step, stiffness=1e4),
     )
-    builder = DiagramBuilder()
-    builder.AddSystem(plant)
-    source = builder.AddSystem(ConstantVectorSource([0.0, -10.0]))
-    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
-    layout = plant.exogenous_layout
-    moving = np.zeros(layout.reference_size)
+    moving = np.zeros(plant.exogenous_layout.reference_size)
     moving[1] = 0.2  # x, x', ...
-    floor = builder.AddSystem(ConstantVectorSource(moving))
-    builder.Connect(floor.get_output_port(), plant.GetInputPort("exogenous"))
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    own = plant.GetMyMutableContextFromRoot(context)
-    plant.set_state(own, [0.0, -1e-3, 0.0, 0.0])
+    diagram, context, own = driven(plant, PRESSED, control=[0.0, -10.0], exogenous=moving)
     simulate(diagram, context, 0.05, fixed_step(1e-4))
     assert_allclose(plant.state(own)[2], 0.05 * 5.0 / 2.1, rtol=0.03)
     simulate(diagram, context, 0.2, fixed_step(1e-4))
@@ -382,15 +377,7 @@ def test_numbers_of_the_contact_change_in_a_context():
 def test_a_joint_at_its_limit_ends_the_run_with_a_reason():
     """The sled slides up to the stop of its rail."""
     plant = CompliantPlant(sled(stop=0.2), PointMaterial(1e-3, stiffness=1e4))
-    builder = DiagramBuilder()
-    builder.AddSystem(plant)
-    source = builder.AddSystem(ConstantVectorSource([6.0, -10.0]))
-    builder.Connect(source.get_output_port(), plant.GetInputPort("control"))
-    builder.ExportOutput(plant.GetOutputPort("state"), "state")
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    own = plant.GetMyMutableContextFromRoot(context)
-    plant.set_state(own, [0.0, -1e-3, 0.5, 0.0])
+    diagram, context, _ = driven(plant, [0.0, -1e-3, 0.5, 0.0], control=[6.0, -10.0])
     with pytest.raises(SimulationError, match="!MultibodyPlant") as found:
         simulate(diagram, context, 1.0)
     assert 0.15 < found.value.state[0] < 0.2

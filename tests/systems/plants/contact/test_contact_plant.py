@@ -121,13 +121,6 @@ def test_state_reference_and_log_belong_to_one_instant():
     assert_allclose(record["control"][1:], wanted[:-1], atol=1e-12)
 
 
-def test_integrals_are_sums_over_the_same_instants():
-    """sigma_(k+1) = sigma_k + T (z - r)(t_k) of what is logged."""
-    _, _, record = run_scenario(two_link(ONE_LATE, "law.integral=[tool.z]", "duration=0.05"))
-    summed = 1e-3 * np.cumsum(record["tracking_error"][:, 0])
-    assert_allclose(record["integral"][1:, 0], summed[:-1], atol=1e-15)
-
-
 def test_law_may_be_sampled_more_slowly_than_the_plant_steps():
     """Held for four steps, and one sample late."""
     settings = "plant.time_step=2.5e-4", ONE_LATE, "duration=0.02"
