@@ -56,7 +56,7 @@ def test_accelerations_are_those_of_the_continuous_plant(seed):
         plant.get_actuation_input_port().FixValue(context, u)
     q, v = state(plant, context)
     derivatives = plant.EvalTimeDerivatives(context).CopyToVector()
-    M, H, N, _ = robot.terms(q, v, default_masses(expressions))
+    M, H, N = robot.terms(q, v, default_masses(expressions))
     acceleration = derivatives[q.size :]
     inertial = M @ acceleration
     assert_close(N @ v, derivatives[: q.size], "q'")
