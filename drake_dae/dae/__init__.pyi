@@ -8,9 +8,9 @@ from .beyond.advised_gains import advised_gains as advised_gains
 from .beyond.contact_gains import ContactGains as ContactGains
 from .beyond.contact_gains import contact_damping as contact_damping
 from .beyond.contact_gains import contact_gains as contact_gains
+from .beyond.disturbance import IdentifiedTerms as IdentifiedTerms
 from .beyond.disturbance import Observation as Observation
 from .beyond.disturbance import with_disturbance as with_disturbance
-from .beyond.identified import IdentifiedTerms as IdentifiedTerms
 from .beyond.lags import Lags as Lags
 from .beyond.one_direction import SensorNoise as SensorNoise
 from .beyond.sampled import sampled_poles as sampled_poles

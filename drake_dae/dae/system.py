@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, vector
+from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
 from drake_dae.dae.contacts import Contacts, UnilateralInput
 from drake_dae.dae.fields import checked_fields, fields_of_functions
-from drake_dae.dae.signals import Exogenous, Parameter, Signal, parameter_slice, parameter_symbol
+from drake_dae.dae.signals import Exogenous, Parameter, Signal, parameter_symbol
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
@@ -24,11 +24,7 @@ from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
 
 @dataclass(frozen=True, eq=False)
 class ForceSharing:
-    """The distribution of forces among redundant constraints, some of which are removed.
-
-    The motion determines the sum v = G(x) v_all alone. Among all v_all with that sum the one with
-    the least sum of c_i v_i^2 is shown, v_all = T(x) v: G T = 1. See `share_forces`.
-    """
+    """The distribution of forces among redundant constraints, some of which are removed."""
 
     split: ca.SX
     gather: ca.SX
@@ -112,8 +108,8 @@ class DaeSystem:
             object.__setattr__(self, key, value)
 
     def __repr__(self) -> str:
-        counts = (self.num_states, self.num_constraints, self.num_controls)
-        return f"DaeSystem('{self.name}', n={counts[0]}, m={counts[1]}, p={counts[2]})"
+        counts = f"n={self.num_states}, m={self.num_constraints}, p={self.num_controls}"
+        return f"DaeSystem('{self.name}', {counts})"
 
     @classmethod
     @checked(ModelError)
@@ -225,10 +221,9 @@ class DaeSystem:
     @property
     def parameter_signals(self) -> list[Signal]:
         """Names and units of the entries of `parameter_symbol`."""
-        moving = self.exogenous.moving
         rates = [
             signal.derivative(order)
-            for p in moving
+            for p in self.exogenous.moving
             for order in range(1, len(p.derivatives) + 1)
             for signal in p.signals
         ]
@@ -276,17 +271,18 @@ class DaeSystem:
     @checked(ModelError)
     def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
         """Returns the same system with other defaults of some parameters."""
-        return self._with_parameters({name: {"value": value} for name, value in values.items()})
+        known = {p.name: p for p in self.parameters}
+        return self._with_parameters(
+            {
+                name: {"value": known[name].entries(value) if name in known else value}
+                for name, value in values.items()
+            }
+        )
 
     def _with_parameters(self, changes: Mapping[str, dict[str, Any]]) -> "DaeSystem":
         for name in changes:
             self.parameter_slice(name)
-        parameters = []
-        for p in self.parameters:
-            change = dict(changes.get(p.name, {}))
-            if "value" in change:
-                change["value"] = p.entries(change["value"])
-            parameters.append(replace(p, **change) if change else p)
+        parameters = (replace(p, **changes.get(p.name, {})) for p in self.parameters)
         return replace(self, parameters=tuple(parameters))
 
     @property
@@ -329,17 +325,14 @@ class DaeSystem:
         pivot: ca.SX | None = None,
         regular: str = "a matrix",
         often: bool = True,
-        doubt: ca.SX | None = None,
-        lean: bool = False,
     ) -> TracedFunction:
         """Compiles expressions to a function of the state, of other inputs and of the parameters.
 
         Further inputs stand between these; the other arguments are those of `TracedFunction`.
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
-        return TracedFunction(
-            f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled, doubt, lean
-        )
+        whole = f"{self.name} {name}"
+        return TracedFunction(whole, every, outputs, pivot, regular, often, self.compiled)
 
     def agree(self, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
         """Returns whether two expressions agree at random states around the nominal state.
@@ -393,14 +386,14 @@ class DaeSystem:
             )
         parameters = np.empty((*values.shape[:-1], self._defaults.size))
         parameters[...] = self._defaults
-        sizes, rates = {p.name: p.value.size for p in other.parameters}, other.exogenous.rates()
+        sizes = {p.name: p.value.size for p in other.parameters}
+        own, others = self.exogenous, other.exogenous
         for p in self.parameters:
             if sizes.get(p.name) != p.value.size:
                 continue
-            place = self.parameter_slice(p.name)
-            parameters[..., place] = values[..., other.parameter_slice(p.name)]
-            if p.exogenous and p.name in rates:
-                to, source = self.exogenous.rates()[p.name], rates[p.name]
+            parameters[..., own.slices[p.name]] = values[..., others.slices[p.name]]
+            if p.name in own.rates and p.name in others.rates:
+                to, source = own.rates[p.name], others.rates[p.name]
                 count = min(to.stop - to.start, source.stop - source.start)
                 moved = values[..., source.start : source.start + count]
                 parameters[..., to.start : to.start + count] = moved
@@ -412,4 +405,7 @@ class DaeSystem:
 
     def parameter_slice(self, name: str) -> slice:
         """Returns the place of a parameter in the parameter vector."""
-        return parameter_slice(self.name, self.parameters, name)
+        if name not in self.exogenous.slices:
+            known = [p.name for p in self.parameters]
+            raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
+        return self.exogenous.slices[name]

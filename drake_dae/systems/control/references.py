@@ -22,8 +22,8 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.errors import DrakeDaeError, ReferenceSignalError
 from drake_dae.references import Reference, ReferenceRows
-from drake_dae.references.polynomials import PiecewisePolynomials
 from drake_dae.references.reference import with_degrees
+from drake_dae.references.splines import PiecewisePolynomials
 from drake_dae.trace.functions import FailureKind
 
 
