@@ -181,7 +181,7 @@ class TracedFunction:
         return float(self._arrays.pivot[0])
 
     def failure(self) -> Failure:
-        """Returns the failure of the last evaluation, if it was not valid."""
+        """The failure of the last evaluation, if it was not valid."""
         for fault, limit in ((FailureKind.INPUT, np.inf), (FailureKind.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(argument) < limit)))
