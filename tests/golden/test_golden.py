@@ -16,6 +16,7 @@ from golden.recording import (
     SIGNALS,
     analysis_of,
     built,
+    config_of,
     gains_found,
     rollout_of,
     run_of,
@@ -45,24 +46,23 @@ def assert_near(found, wanted, tolerance):
 
 
 @pytest.mark.parametrize("name", params(CASES))
-def test_runs_are_as_recorded(name):
-    case = CASES[name]
+def test_theory_run_and_rollouts_are_as_recorded(name):
+    """A, B, alpha, beta, law and residual at 20 consistent states; then all signals of a run."""
+    case, wanted = CASES[name], KEPT[f"run/{name}"]
+    loop, context = built(case)
+    kept = {key.rsplit("/", 1)[1]: KEPT[key] for key in KEPT.files if key.startswith(f"at/{name}/")}
+    for key, value in values_at(loop, kept["states"]).items() if kept else ():
+        size = np.max(np.abs(kept[key]), initial=1e-300)
+        np.testing.assert_allclose(value, kept[key], rtol=0, atol=1e-11 * size, err_msg=key)
+    for compiled in (False, True) if case.rolls else ():
+        if compiled and shutil.which("cc") is None:
+            continue
+        found = rollout_of(case, loop, context, compiled)
+        assert_near(found, wanted, CONTACT if case.amplifies else 1e-9)
     if case.contact and OTHER_DRAKE:
         pytest.skip(f"recorded with Drake {KEPT['drake']}, whose contact solver makes the steps")
     loose = case.contact or case.amplifies
-    assert_near(run_of(case), KEPT[f"run/{name}"], CONTACT if loose else IDEAL)
-
-
-@pytest.mark.parametrize("name", params(name for name, case in CASES.items() if case.rolls))
-@pytest.mark.parametrize("compiled", [False, True])
-def test_rollouts_are_as_recorded(name, compiled):
-    if compiled and shutil.which("cc") is None:
-        pytest.skip("there is no C compiler")
-    assert_near(
-        rollout_of(CASES[name], compiled),
-        KEPT[f"run/{name}"],
-        CONTACT if CASES[name].amplifies else 1e-9,
-    )
+    assert_near(run_of(case, loop, context), wanted, CONTACT if loose else IDEAL)
 
 
 @pytest.mark.parametrize("name", params(["two_link_wall", "seven_joint_wall"]))
@@ -70,25 +70,13 @@ def test_exported_c_is_as_recorded(name, tmp_path):
     """All signals of the loop in C, whose rows come after a projection, recorded ones before."""
     if shutil.which("cc") is None:
         pytest.skip("there is no C compiler")
-    chosen, loop, context = built(CASES[name])
-    c, found = CLoop(code_of(loop, context), tmp_path, chosen.integrator, "-O1"), []
+    loop, context = built(CASES[name])
+    c, found = CLoop(code_of(loop, context), tmp_path, config_of(CASES[name]), "-O1"), []
     for time in times_of(CASES[name])[::2]:
         assert c.advance(time) == 0
         found.append({signal: c.output(signal) for signal in SIGNALS})
     columns = np.vstack([np.hstack([row[signal] for signal in SIGNALS]) for row in found])
     assert_near(columns, KEPT[f"run/{name}"], 1e-9)  # As of rollouts.
-
-
-@pytest.mark.parametrize(
-    "name", params(name for name, case in CASES.items() if f"analysis/{name}" in KEPT)
-)
-def test_the_theory_is_as_recorded(name):
-    """A, B, alpha, beta, the law and residual at 20 consistent states."""
-    kept = {key.rsplit("/", 1)[1]: KEPT[key] for key in KEPT.files if key.startswith(f"at/{name}/")}
-    found = values_at(CASES[name], kept["states"])
-    for key, wanted in kept.items():
-        size = np.max(np.abs(wanted), initial=1e-300)
-        np.testing.assert_allclose(found[key], wanted, rtol=0, atol=1e-11 * size, err_msg=key)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import warnings
 from importlib.metadata import version
 
 import numpy as np
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 
 from drake_dae import build_scenario, contact_gains, load_scenario, rollout
 from drake_dae.cli import main
@@ -20,9 +20,13 @@ SIGNALS = ("state", "constraint_force", "control", "controlled_output")
 
 
 def built(case: Case):
-    chosen = load_scenario(find_scenario(case.scenario), case.all_settings)
-    loop, context = build_scenario(chosen)
-    return chosen, loop, context
+    return build_scenario(load_scenario(find_scenario(case.scenario), case.all_settings))
+
+
+def config_of(case: Case) -> SimulatorConfig:
+    return SimulatorConfig(
+        integration_scheme="runge_kutta3", max_step_size=case.step, use_error_control=False
+    )
 
 
 def times_of(case: Case) -> np.ndarray:
@@ -34,11 +38,10 @@ def signals_at(loop, context) -> np.ndarray:
     return np.concatenate([port.Eval(context) for port in ports])
 
 
-def run_of(case: Case) -> np.ndarray:
+def run_of(case: Case, loop, context) -> np.ndarray:
     """All signals at every second moment, by Drake's Simulator."""
-    chosen, loop, context = built(case)
     simulator = Simulator(loop.diagram, context)
-    ApplySimulatorConfig(chosen.integrator, simulator)
+    ApplySimulatorConfig(config_of(case), simulator)
     simulator.Initialize()
     rows = [signals_at(loop, context)]
     for number, time in enumerate(times_of(case)[1:].tolist(), start=1):
@@ -48,20 +51,18 @@ def run_of(case: Case) -> np.ndarray:
     return np.array(rows)
 
 
-def rollout_of(case: Case, compiled: bool) -> np.ndarray:
+def rollout_of(case: Case, loop, context, compiled: bool) -> np.ndarray:
     """The same by a rollout."""
-    chosen, loop, context = built(case)
-    config = chosen.integrator
     starts, parameters = start_values(loop, context)
-    (found,) = rollout(loop, starts, parameters, times_of(case), config=config, compiled=compiled)
+    times, config = times_of(case), config_of(case)
+    (found,) = rollout(loop, starts, parameters, times, config=config, compiled=compiled)
     if found.failure is not None:
         raise found.failure
     return np.hstack([found.record[name] for name in SIGNALS])[::2]
 
 
-def values_at(case: Case, states: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def values_at(loop, states: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """A, B, alpha, beta, the law and residual at 20 consistent states; of matrices a product."""
-    loop = built(case)[1]
     law = loop.controller.law
     structure, system = law.structure, law.structure.system
     if states is None:
@@ -145,9 +146,9 @@ def record(names: list[str]) -> None:
         if names and name not in names:
             continue
         print(name, flush=True)
-        kept[f"run/{name}"] = run_of(case)
+        kept[f"run/{name}"] = run_of(case, *built(case))
         if case.scenario == name:
-            for key, value in values_at(case).items():
+            for key, value in values_at(built(case)[0]).items():
                 kept[f"at/{name}/{key}"] = value
             kept[f"analysis/{name}"] = np.array(json.dumps(analysis_of(name)))
         np.savez_compressed(FIXTURE, **kept)
