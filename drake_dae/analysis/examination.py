@@ -24,7 +24,7 @@ from drake_dae.dae import (
     ZeroDynamics,
     why_no_law,
 )
-from drake_dae.dae.margins import ContactMargins, find_margin, is_regular
+from drake_dae.dae.margins import ContactMargins, find_margin
 from drake_dae.dae.samples import Samples
 from drake_dae.dae.structure import (
     check_system,
@@ -243,7 +243,7 @@ def _examine(
         margin = find_margin(samples, matrix, search=search)
         constrained = replace(constrained, constraint_margin=margin)
         judge(margin, constraint_violation(constrained), 2)
-        regular = is_regular(samples, matrix)
+        regular = margin.is_regular_at_samples
     if regular:
         results["constraint_structure"] = constrained
         if system.frictional_contacts:
@@ -262,7 +262,7 @@ def _examine(
             structure = replace(structure, control_margin=margin)
             judge(margin, control_violation(structure), 5)
             results["output_degrees"] = structure.output_degrees
-            if is_regular(samples, matrix, structure.round_off):
+            if margin.is_regular_at_samples:
                 results["structure"] = structure
     assumptions = _assumptions(satisfied, violations, margins, without_law)
     return Analysis(system, where, samples.states, assumptions, **results)

@@ -11,7 +11,7 @@ import numpy as np
 from drake_dae.analysis.tables import digits
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import DaeSystem, PinnedMotion, Signal, Structure
-from drake_dae.dae.pinned_outputs import PinnedOutputs
+from drake_dae.dae.pinned_motion import PinnedOutputs
 from drake_dae.diagrams.record import Record
 from drake_dae.errors import ModelError
 from drake_dae.robots import FrictionCone, RobotModel

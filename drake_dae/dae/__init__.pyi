@@ -8,9 +8,9 @@ from .beyond.advised_gains import advised_gains as advised_gains
 from .beyond.contact_gains import ContactGains as ContactGains
 from .beyond.contact_gains import contact_damping as contact_damping
 from .beyond.contact_gains import contact_gains as contact_gains
+from .beyond.disturbance import IdentifiedTerms as IdentifiedTerms
 from .beyond.disturbance import Observation as Observation
 from .beyond.disturbance import with_disturbance as with_disturbance
-from .beyond.identified import IdentifiedTerms as IdentifiedTerms
 from .beyond.lags import Lags as Lags
 from .beyond.one_direction import SensorNoise as SensorNoise
 from .beyond.sampled import sampled_poles as sampled_poles
@@ -25,7 +25,6 @@ from .equilibria import Stability as Stability
 from .equilibria import Verdict as Verdict
 from .extension import Extension as Extension
 from .extension import dynamic_extension as dynamic_extension
-from .extension import extend as extend
 from .fields import as_expression as as_expression
 from .floquet import StabilityAlong as StabilityAlong
 from .gains import FeedbackGains as FeedbackGains

@@ -1,6 +1,6 @@
 """How a system can violate Assumptions (1)-(5), as values, and which rows depend on which."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -24,10 +24,6 @@ from drake_dae.trace.round_off import (
     significant,
     smallest_singular_value,
 )
-
-ON_MANIFOLD = 1e-8
-"""The residual of a constraint that a state on N* may have. It appears in the gradient of an output
-that is a constraint times a factor."""
 
 
 class ViolationKind(Enum):
@@ -74,15 +70,12 @@ class ViolationKind(Enum):
 
 @dataclass(frozen=True)
 class Combination:
-    """A row of a matrix that is a linear combination of others: row = sum factors_j row_j.
-
-    It is `constant` if the factors are the same at all states.
-    """
+    """A row of a matrix that is a linear combination of others: row = sum factors_j row_j."""
 
     name: str
     others: tuple[str, ...]
     factors: FloatArray
-    constant: bool
+    constant: bool  # Whether the factors are the same at all states.
 
     def __str__(self) -> str:
         terms = " + ".join(
@@ -94,112 +87,88 @@ class Combination:
 
 @dataclass(frozen=True, eq=False)
 class Violation:
-    """A violation of one of Assumptions (1)-(5) by a system.
+    """A violation of one of Assumptions (1)-(5) by a system."""
 
-    Attributes:
-        assumption: The number of the assumption, 1 to 5.
-        cause: Its kind.
-        names: The constraints or outputs.
-        order: The order of the derivative on which an input acts.
-        state: Where, shape (n,).
-        singular_value: The smallest singular value there, rows and columns scaled.
-        combinations: The rows that are combinations of others.
-        deciding: The parameters on which it depends.
-        least: The value below which a singular value counts as zero.
-    """
-
-    assumption: int
+    assumption: int  # Its number, 1 to 5.
     cause: ViolationKind
-    names: tuple[str, ...]
-    order: int | None = None
-    state: FloatArray | None = None
-    singular_value: float | None = None
-    combinations: tuple[Combination, ...] = ()
-    deciding: Deciding | None = None
-    least: float | None = None
-
-    def __str__(self) -> str:
-        text = f"Assumption ({self.assumption}): {self._statement()}. {self.cause.value}"
-        if self.deciding is None or self.cause in (ViolationKind.NUMBERS, ViolationKind.BOUNDS):
-            return text
-        acts = {
-            ViolationKind.NO_FORCE: "a constraint input acts",
-            ViolationKind.NO_CONTROL: "the control acts",
-        }
-        regular = f"{'A' if self.assumption <= 3 else 'B'}(x) is regular"
-        return (
-            f"{text}. This depends on parameter values: {acts.get(self.cause, regular)} "
-            f"{self.deciding}"
-        )
+    names: tuple[str, ...]  # The constraints or outputs.
+    order: int | None = None  # Of the derivative on which an input acts.
+    state: FloatArray | None = None  # Where, shape (n,).
+    singular_value: float | None = None  # The smallest one there, rows and columns scaled,
+    least: float | None = None  # and the value below which it counts as zero.
+    combinations: tuple[Combination, ...] = ()  # The rows that are combinations of others.
+    deciding: Deciding | None = None  # The parameters on which it depends.
 
     def error(self) -> AssumptionError:
         """Returns the exception for this violation."""
         return AssumptionError(str(self), self.assumption, self.state, self)
 
-    def _statement(self) -> str:
-        names = ", ".join(f"'{name}'" for name in self.names)
+    def __str__(self) -> str:
+        kind, cause, deciding = ViolationKind, self.cause, self.deciding
+        of_constraints = self.assumption <= 3
+        matrix = "A(x)" if of_constraints else "B(x) of (16)"
+        what = f"{'constraint' if of_constraints else 'output'} " + ", ".join(
+            f"'{name}'" for name in self.names
+        )
+        acts = "the constraint inputs act" if self.assumption == 1 else "the control acts"
         where = "" if self.state is None else f" at x = {show(self.state)}"
-        value = "" if self.singular_value is None else f"{self.singular_value:.1e}"
-        if value:
-            value = f"smallest singular value {value}, rows and columns scaled"
-            value += "" if self.least is None else f", below the least_margin of {self.least:.0e}"
         rows = "; ".join(map(str, self.combinations))
-        kind = ViolationKind
-        match self.cause:
-            case kind.COUNT:
-                return f"the m = {len(self.names)} constraints are more than the states"
-            case kind.CONSTRAINT_DEGREE | kind.OUTPUT_DEGREE:
-                what, inputs = "constraint", "constraint inputs act"
-                if self.cause is kind.OUTPUT_DEGREE:
-                    what, inputs = "output", "control acts"
-                return (
-                    f"the relative degree of {what} {names} is not defined{where}: the {inputs} "
-                    f"on its derivative {self.order} around this state, but not there"
-                )
-            case kind.EARLY_CONTROL:
-                return (
-                    f"the control acts on derivative {self.order} of constraint {names}, before "
-                    f"any constraint input does{where}, and so binds the control, not the state"
-                )
-            case kind.NO_FORCE:
-                return (
-                    f"no constraint input ever acts on constraint {names}: none reaches it, or its "
-                    "derivatives repeat each other or fill the state"
-                    f"{f'; gradients of constraints: {rows}' if rows else ''}"
-                )
-            case kind.NO_CONTROL:
-                why = f"it follows from the constraints, {rows}"
-                if not rows:
-                    why = "its derivatives repeat those of the constraints, or none reaches it"
-                return (
-                    f"the control never acts on output {names}: {why}, so it has no relative "
-                    "degree and B(x) no row for it"
-                )
-            case kind.NUMBERS:
-                what = "output" if self.assumption == 4 else "constraint"
-                inputs = "constraint inputs act" if self.assumption == 1 else "control acts"
-                return (
-                    f"the relative degree of {what} {names} depends on numbers: the {inputs} on "
-                    f"its derivative {self.order} {self.deciding}"
-                )
-            case kind.BOUNDS:
-                matrix = "A(x)" if self.assumption == 2 else "B(x) of (16)"
-                places = [
-                    f" of '{name}', between its default {default:.6g} and {bound:.6g}"
-                    for name, bound, default in (self.deciding.pairs if self.deciding else ())
-                ]
-                return f"{matrix} loses rank within the bounds{','.join(places)}"
-            case kind.CONTROL_RANK:
-                return (
-                    f"B(x) of (16) is singular{where}: the controlled outputs "
-                    f"{', '.join(self.names)} cannot be steered independently; {value}"
-                    f"{f'; rows of B(x): {rows}' if rows else ''}"
-                )
-            case _:  # A(x) has lost its rank.
-                in_rows = self.cause in (kind.CONSTRAINT_RANK, kind.HIDDEN_DEGREE)
-                what = "rows of A(x)" if in_rows else "gradients of constraints"
-                parts = [part for part in (value, rows and f"{what}: {rows}") if part]
-                return f"A(x) loses rank{where}: {'; '.join(parts)}"
+        value = ""
+        if self.singular_value is not None:
+            value = f"smallest singular value {self.singular_value:.1e}, rows and columns scaled"
+            value += "" if self.least is None else f", below the least_margin of {self.least:.0e}"
+        if cause is kind.COUNT:
+            text = f"the m = {len(self.names)} constraints are more than the states"
+        elif cause in (kind.CONSTRAINT_DEGREE, kind.OUTPUT_DEGREE):
+            text = (
+                f"the relative degree of {what} is not defined{where}: {acts} on its derivative "
+                f"{self.order} around this state, but not there"
+            )
+        elif cause is kind.EARLY_CONTROL:
+            text = (
+                f"the control acts on derivative {self.order} of {what}, before any constraint "
+                f"input does{where}, and so binds the control, not the state"
+            )
+        elif cause is kind.NO_FORCE:
+            text = (
+                f"no constraint input ever acts on {what}: none reaches it, or its derivatives "
+                f"repeat each other or fill the state"
+            )
+            text += f"; gradients of constraints: {rows}" if rows else ""
+        elif cause is kind.NO_CONTROL:
+            text = (
+                f"the control never acts on {what}: none reaches it, or it follows from the "
+                "constraints or from its own derivatives, so it has no relative degree and B(x) no "
+                "row for it"
+            )
+        elif cause is kind.NUMBERS:
+            text = (
+                f"the relative degree of {what} depends on numbers: {acts} on its derivative "
+                f"{self.order} {deciding}"
+            )
+        elif cause is kind.BOUNDS:
+            places = [
+                f" of '{name}', between its default {default:.6g} and {bound:.6g}"
+                for name, bound, default in (deciding.pairs if deciding else ())
+            ]
+            text = f"{matrix} loses rank within the bounds{','.join(places)}"
+        elif cause is kind.CONTROL_RANK:
+            text = (
+                f"B(x) of (16) is singular{where}: the controlled outputs {', '.join(self.names)} "
+                f"cannot be steered independently; {value}"
+            )
+            text += f"; rows of B(x): {rows}" if rows else ""
+        else:  # A(x) has lost its rank.
+            in_rows = cause in (kind.CONSTRAINT_RANK, kind.HIDDEN_DEGREE)
+            of = "rows of A(x)" if in_rows else "gradients of constraints"
+            parts = [part for part in (value, rows and f"{of}: {rows}") if part]
+            text = f"A(x) loses rank{where}: {'; '.join(parts)}"
+        text = f"Assumption ({self.assumption}): {text}. {cause.value}"
+        if deciding is None or cause in (kind.NUMBERS, kind.BOUNDS):
+            return text
+        then = {kind.NO_FORCE: "a constraint input acts", kind.NO_CONTROL: "the control acts"}
+        regular = then.get(cause, f"{matrix[:4]} is regular")
+        return f"{text}. This depends on parameter values: {regular} {deciding}"
 
 
 def rank_violation(
@@ -212,23 +181,17 @@ def rank_violation(
     """Returns the violation by a singular matrix: another kind if a whole row vanishes."""
     if margin is None or not margin.is_singular:
         return None
-    row = margin.vanishing_row
+    row, state = margin.vanishing_row, margin.state
     if row is not None:
-        return Violation(*vanishing, (signals[row].name,), degrees[row], margin.state)
+        return Violation(*vanishing, (signals[row].name,), degrees[row], state)
     names = tuple(signal.name for signal in signals)
-    return Violation(
-        *dependent, names, state=margin.state, singular_value=margin.relative, least=margin.least
-    )
+    return Violation(*dependent, names, None, state, margin.relative, margin.least)
 
 
 def find_dependence(
     manifold: Manifold, elimination: Elimination, states: FloatArray, where: FloatArray
-) -> tuple[tuple[Combination, ...], bool, bool]:
-    """Finds how the constraints depend on each other at a state where A(x) is singular.
-
-    Also returns whether A(x) is singular at all states, and whether the gradients of k_i, k_i', ...
-    depend on each other at all states examined: at that one, or at all.
-    """
+) -> tuple[ViolationKind, tuple[Combination, ...]]:
+    """Finds how the constraints depend on each other at a state where A(x) is singular."""
     system = manifold.system
     names = [signal.name for signal in system.constraint_output_signals]
     rows = {"a": elimination.constraint_matrix, "last": elimination.constraint_gradient}
@@ -248,7 +211,11 @@ def find_dependence(
     # Chains may depend on each other below their last derivatives alone.
     by_gradients = in_gradients and are_dependent(matrices(where)[1])
     values = [matrices(state)[1 if by_gradients else 0] for state in examined]
-    return tuple(combinations_of(names, values)), everywhere, in_gradients
+    if in_gradients:
+        kind = ViolationKind.REDUNDANT if everywhere else ViolationKind.SINGULAR_CONFIGURATION
+    else:
+        kind = ViolationKind.HIDDEN_DEGREE if everywhere else ViolationKind.CONSTRAINT_RANK
+    return kind, tuple(combinations_of(names, values))
 
 
 def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
@@ -261,26 +228,7 @@ def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
     return tuple(combinations_of(names, [gradient * system.scale for (gradient,) in values]))
 
 
-def following_outputs(samples: Samples, names: Sequence[str]) -> Iterator[Combination]:
-    """Yields the outputs that are functions of the constraints, by their gradients."""
-    system, manifold = samples.system, samples.manifold
-    constraints = [signal.name for signal in manifold.residual_signals]
-    for row, signal in enumerate(system.output_signals):
-        if signal.name in names and not system.m[row, :].nnz():
-            both = ca.vertcat(manifold.residual_expression, system.l[row])
-            gradients = []
-            for (gradient,) in samples.values(gradient=ca.densify(ca.jacobian(both, system.state))):
-                # A residual alone in its column counts as much as any other entry.
-                sizes = np.abs(gradient * system.scale)
-                is_residual = sizes < ON_MANIFOLD * sizes.max(axis=1, keepdims=True)
-                gradients.append(np.where(is_residual, 0.0, gradient * system.scale))
-            rows = combinations_of([*constraints, signal.name], gradients, ON_MANIFOLD)
-            yield from (row for row in rows if row.name == signal.name)
-
-
-def combinations_of(
-    names: list[str], values: list[FloatArray], least: float = SINGULAR
-) -> list[Combination]:
+def combinations_of(names: list[str], values: list[FloatArray]) -> list[Combination]:
     """Returns the rows that depend on earlier rows at the first of some states."""
     scaled = []
     for value in values:
@@ -291,10 +239,10 @@ def combinations_of(
     combinations = []
     for i, name in enumerate(names):
         factors, error = _fit(scaled[0][0], independent, i)
-        if error >= least:
+        if error >= SINGULAR:
             independent.append(i)
             continue
-        used = [j for j, factor in zip(independent, factors, strict=True) if abs(factor) > least]
+        used = [j for j, c in zip(independent, factors, strict=True) if abs(c) > SINGULAR]
         plain, *others = [_fit(m, used, i)[0] * lengths[i] / lengths[used] for m, lengths in scaled]
         constant = all(np.allclose(other, plain, rtol=1e-6, atol=0.0) for other in others)
         combinations.append(Combination(name, tuple(names[j] for j in used), plain, constant))

@@ -52,10 +52,7 @@ class PainleveOutcome(Enum):
 
 
 class Contacts:
-    """The unilateral contacts of a system in which at least one contact has friction.
-
-    `rows` are their constraint inputs, and `frictions` the coefficient of each, or None.
-    """
+    """The unilateral contacts of a system in which at least one contact has friction."""
 
     def __init__(
         self,
@@ -88,12 +85,7 @@ class Contacts:
         return ca.substitute(matrix, symbols, ca.SX.zeros(symbols.numel()))
 
     def reserve(self, matrix: ca.SX) -> ca.SX:
-        """Returns the smallest principal minor of A(x), relative to its value without friction.
-
-        Minors are those of sets of contacts with all other constraints, of which none can open. The
-        least ratio is the same in any order of the contacts and in any units, 1 without friction,
-        and positive exactly where all minors are.
-        """
+        """Returns the smallest principal minor of A(x), relative to its value without friction."""
         smallest = ca.SX(1)
         others = [i for i in range(matrix.shape[0]) if i not in self.rows]
         both = [matrix, self.without_friction(matrix)]
@@ -110,11 +102,7 @@ def _eliminated(matrix: ca.SX, i: int) -> ca.SX:
 
 
 def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> Iterator[ca.SX]:
-    """All principal minors of some rows, one for each set of them.
-
-    A minor with the first row is a_11 times that of the Schur complement of a_11 without it; one
-    without the first row is that of A without it.
-    """
+    """All principal minors of some rows, one for each set of them."""
     if rows:
         first, *others = rows
         with_first = before * matrix[first, first]

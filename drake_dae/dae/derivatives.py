@@ -33,19 +33,9 @@ from drake_dae.trace.factorization import (
 class Derivatives:
     """The motion of a system on N* and its time derivatives, for a constant control.
 
-    Args:
-        system: The system (1)-(3).
-        constraint: The column c = (L_f^(r_1 - 1) k_1, ..., L_f^(r_m - 1) k_m), shape (m, 1).
-        damping: The prescribed value of -c', an expression of the state that vanishes on N*, shape
-            (m, 1); c' = 0 if None. Higher derivatives of c are zero in both cases.
-
-    Attributes:
-        control: The symbols u, shape (p, 1).
-        constraint_gradient: dc/dx, shape (m, n).
-        constraint_matrix: A(x) of Assumption (2), shape (m, m).
-        pivot: A scalar that is 0 exactly where A(x) is singular, see `trace.factorization`. With
-            frictional contacts it is not positive where the Painleve paradox occurs, see
-            `dae.contacts`.
+    `constraint` is the column c. Its rate c' is 0, or minus `damping`, an expression that vanishes
+    on N*; its higher derivatives are 0 in both cases. `pivot` is 0 exactly where A(x) is singular;
+    with frictional contacts it is not positive where the Painleve paradox occurs.
     """
 
     def __init__(self, system: DaeSystem, constraint: ca.SX, damping: ca.SX | None = None) -> None:
@@ -100,14 +90,7 @@ class Derivatives:
         return self._rates[0]
 
     def derivative(self, expression: ca.SX) -> ca.SX:
-        """Returns the time derivative of an expression along the motion.
-
-        Args:
-            expression: An expression of the state and of the unknowns, shape (k, 1).
-
-        Returns:
-            The derivative in terms of the state and of unknowns, shape (k, 1); see `expand`.
-        """
+        """Returns the time derivative of an expression along the motion."""
         if ca.depends_on(expression, self._symbols[-1]):
             self._add_order()
         return self._total_derivative(expression)
@@ -117,17 +100,7 @@ class Derivatives:
         return self._inline(expression, len(self._values))
 
     def by_control(self, expression: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Returns a(x) and B(x) of an expression a(x) + B(x) u of the motion.
-
-        B is formed by the chain rule over the unknowns, which takes far fewer operations than
-        differentiating the expanded expression.
-
-        Args:
-            expression: An expression of the state and of the unknowns, shape (k, 1).
-
-        Returns:
-            a and B in terms of the state alone, shapes (k, 1) and (k, p); B is sparse.
-        """
+        """Returns a(x) and B(x) of an expression a(x) + B(x) u of the motion."""
         orders = self._orders_in(expression)
         slope = self._slope(expression, orders)
         unknowns = ca.vertcat(ca.SX(0, 1), *self._symbols[1 : orders + 1])
@@ -172,17 +145,8 @@ class Derivatives:
         The equations of the motion and `expression = desired` are solved together for the control
         and for the unknowns that it moves, block by block along their structure (Dulmage and
         Mendelsohn 1958). So B(x) of (16) is not formed, and with rigid joints no inverse of M(q):
-        it is inverse dynamics.
-
-        Args:
-            expression: An expression of the state and of the unknowns, shape (p, 1).
-            desired: The desired values, shape (p, 1).
-            shown: Further expressions of the motion to evaluate at that control, shape (k, 1).
-
-        Returns:
-            u in terms of the state, shape (p, 1), a scalar that is 0 exactly where it is not
-            determined, and what is shown; None if the equations are not linear in what the control
-            moves.
+        it is inverse dynamics. Also returns a scalar that is 0 exactly where the control is not
+        determined, and what is shown; None if the equations are not linear in what it moves.
         """
         shown = ca.SX(0, 1) if shown is None else shown
         orders = self._orders_in(ca.vertcat(expression, shown))

@@ -13,33 +13,22 @@ from drake_dae.trace.round_off import Sized, equilibration, multiply, without_ro
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """Equations (9)-(14) as expressions of the state.
+    """Equations (9)-(14) as expressions of the state; not finite where A(x) is singular.
 
     On the manifold N* the constraint inputs are v = alpha + beta u (25), and
 
         x' = f* + h* u,    z = l* + n* u.
-
-    Attributes:
-        constraint_gradient: The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
-        constraint_matrix: A(x) of Assumption (2), shape (m, m).
-        alpha: v where u = 0, equation (13), shape (m, 1).
-        beta: The factor of u in v, equation (14), shape (m, p).
-        f_star: f + g alpha (9), shape (n, 1).
-        h_star: h + g beta (10), shape (n, p).
-        l_star: l + m alpha (11), shape (p, 1).
-        n_star: m beta (12), a row for each output, shape (p, p).
-        pivot: A scalar that is 0 exactly where A(x) is singular; see `trace.factorization`.
     """
 
-    constraint_gradient: ca.SX
-    constraint_matrix: ca.SX
-    alpha: ca.SX
-    beta: ca.SX
-    f_star: ca.SX
-    h_star: ca.SX
-    l_star: ca.SX
-    n_star: ca.SX
-    pivot: ca.SX
+    constraint_gradient: ca.SX  # The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
+    constraint_matrix: ca.SX  # A(x) of Assumption (2), shape (m, m).
+    alpha: ca.SX  # v where u = 0 (13), shape (m, 1).
+    beta: ca.SX  # The factor of u in v (14), shape (m, p).
+    f_star: ca.SX  # f + g alpha (9), shape (n, 1).
+    h_star: ca.SX  # h + g beta (10), shape (n, p).
+    l_star: ca.SX  # l + m alpha (11), shape (p, 1).
+    n_star: ca.SX  # m beta (12), shape (p, p).
+    pivot: ca.SX  # A scalar that is 0 exactly where A(x) is singular.
 
 
 def eliminate(derivatives: Derivatives) -> Elimination:
@@ -47,16 +36,10 @@ def eliminate(derivatives: Derivatives) -> Elimination:
     system = derivatives.system
     alpha, beta = derivatives.by_control(derivatives.constraint_input)  # (13), (14)
     f_star, h_star = derivatives.by_control(derivatives.rate)  # (9), (10)
+    l_star, n_star = system.outputs(alpha), ca.sparsify(ca.mtimes(system.m, beta))  # (11), (12)
+    gradient, matrix = derivatives.constraint_gradient, derivatives.constraint_matrix
     return Elimination(
-        constraint_gradient=derivatives.constraint_gradient,
-        constraint_matrix=derivatives.constraint_matrix,
-        alpha=alpha,
-        beta=beta,
-        f_star=f_star,
-        h_star=h_star,
-        l_star=system.outputs(alpha),  # (11)
-        n_star=ca.sparsify(ca.mtimes(system.m, beta)),  # (12)
-        pivot=derivatives.pivot,
+        gradient, matrix, alpha, beta, f_star, h_star, l_star, n_star, derivatives.pivot
     )
 
 
@@ -65,27 +48,15 @@ def eliminate_numbers(
     constraint_gradient: FloatArray,
     constraint_matrix: FloatArray,
     scale: FloatArray,
-    negligible: float,
 ) -> tuple[Sized, Sized]:
-    """Returns h* (10) and n* (12) at one state, without round-off.
-
-    The expressions of `eliminate` do not show how large their cancelled terms were; the factors of
-    beta (14) do.
-
-    Args:
-        fields: g, h and m of the system with E = 1, by letter.
-        constraint_gradient: The rows d L_f^(r_i - 1) k_i / dx, shape (m, n).
-        constraint_matrix: A, shape (m, m).
-        scale: The size of each state, shape (n,).
-        negligible: `DaeSystem.negligible`.
-    """
+    """Returns h* (10) and n* (12) at one state, without round-off."""
     h, size = fields["h"], np.abs(fields["h"])
-    by_control = multiply(constraint_gradient, (h, size), scale, negligible)
+    by_control = multiply(constraint_gradient, (h, size), scale)
     # Units of the constraints' derivatives, and of the constraint inputs.
     rows, columns = equilibration(np.abs(constraint_matrix))
     scaled = np.linalg.inv(constraint_matrix / rows[:, None] / columns)
     inverse = scaled / columns[:, None] / rows
-    beta = multiply(-inverse, by_control, rows, negligible)
-    added, added_size = multiply(fields["g"], beta, 1.0 / columns, negligible)
+    beta = multiply(-inverse, by_control, rows)
+    added, added_size = multiply(fields["g"], beta, 1.0 / columns)
     h_star = without_round_off(h + added, size + added_size)
-    return h_star, multiply(fields["m"], beta, 1.0 / columns, negligible)
+    return h_star, multiply(fields["m"], beta, 1.0 / columns)

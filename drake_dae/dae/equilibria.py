@@ -8,7 +8,7 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.manifold import coordinates
-from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
+from drake_dae.dae.pinned_motion import PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
@@ -48,11 +48,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """The stability of the internal states about an equilibrium, with constant outputs.
-
-    The verdict is local: for states near this equilibrium and outputs near its outputs. The global
-    sufficient conditions (i) and (ii) below (36) are not examined.
-    """
+    """The stability of the internal states about an equilibrium, with constant outputs."""
 
     verdict: Verdict
     reason: str
@@ -63,11 +59,7 @@ class Stability:
 def linearized_eigenvalues(
     pinned: PinnedSet, scale: FloatArray, state: FloatArray
 ) -> tuple[ComplexArray, FloatArray]:
-    """Returns the eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), with errors.
-
-    They come from round-off in the derivative, and from the error of the equilibrium, which is
-    large if Newton's method converges slowly. Both in 1/s, largest real part first.
-    """
+    """Returns the eigenvalues of d(f* + h* u)/dx on the tangent space of Z(R), with errors."""
     slopes = pinned.slopes(state)
     free, moved = coordinates(pinned.gradients(state), scale)
     # The tangent directions are known to round-off, relative to the scale of the states.
@@ -95,9 +87,8 @@ def linearized_eigenvalues(
 def _stays_off_the_axis(matrix: FloatArray, error: FloatArray, rounded: float) -> bool:
     """Whether no eigenvalue can be on the imaginary axis, within the matrix's error.
 
-    Eigenvalues of a defective matrix have errors of the root of its error, even if all are far from
-    the axis. A perturbation that moves one to i w is at least the smallest singular value of A - i
-    w; this equals e for some w only if i w is an eigenvalue of [[A, -e], [e, -A^T]] (Byers 1988).
+    A perturbation that moves one to i w is at least the smallest singular value of A - i w; this
+    equals e for some w only if i w is an eigenvalue of [[A, -e], [e, -A^T]] (Byers 1988).
     """
     balanced, units = balanced_matrix(matrix)
     norm = float(np.linalg.norm(balanced, 2))
@@ -123,9 +114,8 @@ def eigenvalues_of(
     """Returns eigenvalues, largest real part first, and their error bounds.
 
     To first order an error E of the matrix moves an eigenvalue by at most |y|^H |E| |x| / |y^H x|,
-    with its left and right eigenvectors y and x. So in a triangular matrix a small eigenvalue is as
-    accurate as its own entry. Balancing removes the units first.
-    `error` bounds the entries of the matrix, `rounded` those of the balanced one.
+    with its left and right eigenvectors y and x. Balancing removes the units first. `error` bounds
+    the entries of the matrix, `rounded` those of the balanced one.
     """
     if not matrix.size:
         return np.zeros(0, dtype=complex), np.zeros(0)
@@ -141,10 +131,7 @@ def eigenvalues_of(
 def judge(
     values: ComplexArray, errors: FloatArray, state: FloatArray, place: str, degenerate: int = 0
 ) -> Stability:
-    """Judges a state at rest by its eigenvalues.
-
-    In `degenerate` directions its Jacobian is singular: as many eigenvalues are known to nothing.
-    """
+    """Judges a state at rest by its eigenvalues."""
     smallest = np.argsort(np.abs(values))[:degenerate]
     errors = errors.copy()
     errors[smallest] = np.maximum(errors[smallest], 2.0 * np.abs(values[smallest]))
@@ -181,24 +168,16 @@ def without_dynamics(structure: Structure) -> Stability:
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Where a search for an equilibrium ends: a state, x' there, and why it is not at rest, if so.
-
-    `degenerate` is the number of directions in which the Jacobian of a state at rest is singular.
-    """
+    """Where a search for an equilibrium ends."""
 
     state: FloatArray
-    rate: FloatArray
-    unrest: str
-    degenerate: int = 0
+    rate: FloatArray  # x' there.
+    unrest: str  # Why it is not at rest; empty if it is.
+    degenerate: int  # The number of directions in which its Jacobian is singular.
 
 
 class Equilibria:
-    """The equilibria on Z(R).
-
-    An equilibrium is a state at rest whose Jacobian is not singular: Newton's step from there is
-    short, and its slopes hardly change beside it. A small rate alone shows nothing: that of
-    x' = exp(-x) is small for all large x, and Newton's step is 1 everywhere.
-    """
+    """The equilibria on Z(R)."""
 
     def __init__(self, pinned: PinnedOutputs) -> None:
         self.pinned, system = pinned, pinned.system
@@ -212,10 +191,7 @@ class Equilibria:
                 self._clocks[i] = float(explicit.f[i])
 
     def constant_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
-        """Returns R with the outputs of a state and zero derivatives.
-
-        The state does not determine outputs of degree 0; they are chosen to minimize its rate.
-        """
+        """Returns R with the outputs of a state and zero derivatives."""
         layout, scale = self.pinned.layout, self.pinned.system.scale
         reference = np.zeros(layout.reference_size)
         chain = self.pinned.at(reference, parameters).residual(state)[-layout.chain_size :]
@@ -225,33 +201,28 @@ class Equilibria:
         if direct.size and not self._clocks.any():
             pinned = self.pinned.at(reference, parameters)
             still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
-            slopes, rate = pinned.slopes_along(state, still, by), pinned.rate(state)
+            slopes, rate = pinned.slopes(state, still, by), pinned.rate(state)
             if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
                 nearest = -np.linalg.pinv(slopes / scale[:, None], DEPENDENT) @ (rate / scale)
                 reference[direct] = nearest
         return reference
 
-    def find(self, pinned: PinnedSet, guess: FloatArray) -> FloatArray:
-        """Returns the equilibrium at which a search from a guess ends, shape (n,)."""
-        rest = self.search(pinned, guess)
-        unrest = rest.unrest or ("the Jacobian is singular" if rest.degenerate else "")
+    def find(self, pinned: PinnedSet, guess: FloatArray, regular: bool = True) -> Rest:
+        """Returns the state at rest at which a search from a guess ends."""
+        rest = self._search(pinned, guess)
+        unrest = rest.unrest
+        if regular and rest.degenerate and not unrest:
+            unrest = "the Jacobian is singular"
         if unrest:
-            raise InconsistentStateError(self.none(pinned, rest.state, unrest), rest.rate)
-        return rest.state
+            raise InconsistentStateError(
+                f"{self.pinned.system.name}: {pinned.describe()} have no regular state at rest "
+                f"near the given one: the search ends at x = {show(rest.state)}, where {unrest}",
+                rest.rate,
+            )
+        return rest
 
-    def none(self, pinned: PinnedSet, state: FloatArray, unrest: str) -> str:
-        """Returns in words that a search ended at a state that is no equilibrium."""
-        return (
-            f"{self.pinned.system.name}: {pinned.describe()} have no regular state at rest near "
-            f"the given one: the search ends at x = {show(state)}, where {unrest}"
-        )
-
-    def search(self, pinned: PinnedSet, guess: FloatArray) -> Rest:
-        """Searches by Newton's method for C(x) = 0 and T^T x' = 0.
-
-        T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
-        shortest step is taken.
-        """
+    def _search(self, pinned: PinnedSet, guess: FloatArray) -> Rest:
+        """Searches by Newton's method for C(x) = 0 and T^T x' = 0."""
         system, scale = self.pinned.system, self.pinned.system.scale
         if self._clocks.any():
             running = ", ".join(
@@ -292,10 +263,7 @@ class Equilibria:
         return Rest(point.state, point.rate, unrest, degenerate)
 
     def unrest(self, pinned: PinnedSet, point: PinnedPoint) -> str:
-        """Returns why a point is no regular state at rest, as text; empty if it is one.
-
-        A state that a tiny change brings to rest, as in a fast system, does not count as changing.
-        """
+        """Returns why a point is no regular state at rest, as text; empty if it is one."""
         if flaw := pinned.flaw(point):
             return flaw
         slow = np.abs(point.rate) <= AT_REST * np.abs(pinned.slopes(point.state)) @ self.sizes

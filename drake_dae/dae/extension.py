@@ -74,50 +74,6 @@ class Extension:
 
 
 @checked(ModelError)
-def extend(
-    system: DaeSystem,
-    integrators: Mapping[str, int] | Sequence[str],
-    nominal_control: Mapping[str, float] | None = None,
-) -> DaeSystem:
-    """Puts integrators before controls: u_i, u_i', ... become states, the next one the control.
-
-    Constraints, outputs, parameters and mass matrix do not change, and the degrees r_i neither if
-    Assumption (3) holds. If it is violated, since u_i acts on a derivative of a constraint before
-    any constraint input does, integrators repair it: the constraint then restricts the state u_i.
-
-    Args:
-        system: The system (1)-(3).
-        integrators: Name of a control -> number of integrators; or names, for one each.
-        nominal_control: Values of controls at the nominal state, for the integrators that hold
-            them; zero where not given. B(x) is often singular at zero.
-
-    Raises:
-        ModelError: A control is unknown, a number of integrators is below 1, or the system has a
-            `control_metric`.
-    """
-    _refuse_metric(system)
-    if not isinstance(integrators, Mapping):
-        integrators = dict.fromkeys(integrators, 1)
-    if any(type(count) is not int or count < 1 for count in integrators.values()):
-        raise ModelError(
-            f"{system.name}: integrators must be whole numbers from 1, got {dict(integrators)}"
-        )
-    nominal = _by_control(system, "nominal_control", nominal_control or {})
-    _by_control(system, "integrators", integrators)
-    base = system.control_signals
-    for order in range(max(integrators.values(), default=0)):
-        columns = [i for i, signal in enumerate(base) if integrators.get(signal.name, 0) > order]
-        system = _integrated(
-            system,
-            columns,
-            added=[base[i].derivative(order) for i in columns],
-            following=[base[i].derivative(order + 1) for i in columns],
-            nominal=nominal[columns] if order == 0 else np.zeros(len(columns)),
-        )
-    return system
-
-
-@checked(ModelError)
 def dynamic_extension(
     system: DaeSystem,
     *,
@@ -145,37 +101,81 @@ def dynamic_extension(
 
     Raises:
         AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
-            isolated states only, or more than n are needed; or Assumption (3) is violated, where
-            `extend` helps.
+            isolated states only, or more than n are needed; or Assumption (3) is violated.
         ModelError, InconsistentStateError: The system has no structure, see `find_structure`, or it
             has a `control_metric`.
     """
-    _refuse_metric(system)
-    nominal = _by_control(system, "nominal_control", nominal_control or {})
-    chain = _Chain(system, nominal, spread)
+    if system.control_metric is not None:
+        raise ModelError(
+            f"{system.name}: control_metric compares controls, not their derivatives; leave it "
+            "out, and give the extended system one"
+        )
+    given, names = nominal_control or {}, [signal.name for signal in system.control_signals]
+    unknown = [name for name in given if name not in names]
+    if unknown:
+        raise ModelError(
+            f"{system.name}: nominal_control names {', '.join(unknown)}, but the controls are "
+            f"{', '.join(names) or 'none'}"
+        )
+    values = [given.get(name, 0.0) for name in names]
+    held = vector(f"{system.name}: nominal_control", values, len(names))
+    spreads = spread_of(system, spread)
+    bases = [(signal, 0) for signal in system.control_signals]
+    extended, integrators = system, dict[str, int]()
+    offset, matrix = ca.SX(system.num_controls, 1), ca.SX.eye(system.num_controls)
     while True:
-        structure, _ = examine_structure(chain.near_nominal(), spread=chain.spread)
+        # Beside the nominal state, where rows of B(x) may vanish accidentally, as sin(heading) does
+        # at heading 0.
+        step = 0.1 * spreads * np.random.default_rng(0).standard_normal(extended.num_states)
+        near = replace(
+            extended, nominal_state=extended.nominal_state + step, state_scale=extended.scale
+        )
+        structure, _ = examine_structure(near, spread=spreads)
         choice = _controls_to_integrate(structure)
         if choice is None:
             break
-        chain.integrate(*choice)
-        if sum(chain.integrators.values()) > system.num_states:
+        columns, mixing = choice
+        others, nominal = [j for j in range(len(names)) if j not in columns], held[columns]
+        if mixing is not None:
+            function = extended.trace("mixing", {"mixing": mixing}, often=False)
+            here = function(extended.nominal_state, extended.parameter_values)[0]
+            nominal = nominal + here.reshape(mixing.shape) @ held[others]
+            for i in columns:
+                control = extended.control_signals[i]
+                bases[i] = (Signal(f"{control.name}*", control.unit), 0)
+        added = [bases[i][0].derivative(bases[i][1]) for i in columns]
+        following = [bases[i][0].derivative(bases[i][1] + 1) for i in columns]
+        for i in columns:
+            bases[i] = (bases[i][0], bases[i][1] + 1)
+            integrators[names[i]] = integrators.get(names[i], 0) + 1
+        count = extended.num_states
+        extended = _integrated(extended, columns, added, following, nominal, mixing)
+        # u_i = x_i - sum_j b_ij u_j, with the new state x_i.
+        offset += ca.mtimes(matrix[:, columns], extended.state[count:])
+        if mixing is not None:
+            matrix[:, others] -= ca.mtimes(matrix[:, columns], mixing)
+        matrix[:, columns] = 0.0
+        held[columns] = 0.0
+        # B(x) is often singular at zero, so a nonzero value is kept away from zero.
+        spreads = np.concatenate([spreads, 0.1 * positive(np.abs(nominal))])
+        so_far = ", ".join(f"{count} before {name}" for name, count in integrators.items())
+        if sum(integrators.values()) > system.num_states:
             raise AssumptionError(
                 f"more than {system.num_states} integrators are needed for a regular B(x) of "
-                f"(16), so far {chain.count}. Choose other outputs",
+                f"(16), so far {so_far}. Choose other outputs",
                 5,
             )
     try:
-        structure = find_structure(chain.system, spread=chain.spread)
+        structure = find_structure(extended, spread=spreads)
     except AssumptionError as error:
         if error.state is None:
             raise
         remedy = "Keep away from this state"
-        if chain.integrators:
-            entries = ", ".join(f'"{name}": 1.0' for name in chain.integrators)
+        if integrators:
+            entries = ", ".join(f'"{name}": 1.0' for name in integrators)
             remedy += (
                 f", or give another nominal_control, for example nominal_control={{{entries}}}; "
-                f"integrators: {chain.count}"
+                f"integrators: {so_far}"
             )
         raise AssumptionError(
             f"B(x) of (16) is regular around x = {show(error.state)}, but not there: it is "
@@ -183,64 +183,7 @@ def dynamic_extension(
             error.assumption,
             error.state,
         ) from error
-    return Extension(system, chain.system, structure, chain.integrators, chain.offset, chain.matrix)
-
-
-class _Chain:
-    """A system between the original and the extended one, with the integrators added so far."""
-
-    def __init__(self, system: DaeSystem, nominal: FloatArray, spread: ArrayLike | None) -> None:
-        self.system = system
-        self.spread = spread_of(system, spread)
-        self.integrators: dict[str, int] = {}
-        self.offset = ca.SX(system.num_controls, 1)
-        self.matrix = ca.SX.eye(system.num_controls)
-        self._nominal = nominal
-        self._names = [signal.name for signal in system.control_signals]
-        self._bases = [(signal, 0) for signal in system.control_signals]
-
-    @property
-    def count(self) -> str:
-        return ", ".join(f"{count} before {name}" for name, count in self.integrators.items())
-
-    def near_nominal(self) -> DaeSystem:
-        """The system with a nominal state at which no sine is accidentally zero.
-
-        Rows of B(x) may vanish accidentally there, as sin(heading) does at heading 0.
-        """
-        random = np.random.default_rng(0)
-        step = 0.1 * self.spread * random.standard_normal(self.system.num_states)
-        nominal = self.system.nominal_state + step
-        return replace(self.system, nominal_state=nominal, state_scale=self.system.scale)
-
-    def integrate(self, columns: list[int], mixing: ca.SX | None = None) -> None:
-        """Puts one integrator before each of some controls."""
-        system = self.system
-        others = [j for j in range(system.num_controls) if j not in columns]
-        nominal = self._nominal[columns]
-        if mixing is not None:
-            function = system.trace("mixing", {"mixing": mixing}, often=False)
-            here = function(system.nominal_state, system.parameter_values)[0]
-            nominal = nominal + here.reshape(mixing.shape) @ self._nominal[others]
-            for i in columns:
-                control = system.control_signals[i]
-                self._bases[i] = (Signal(f"{control.name}*", control.unit), 0)
-        added = [self._bases[i][0].derivative(self._bases[i][1]) for i in columns]
-        for i in columns:
-            self._bases[i] = (self._bases[i][0], self._bases[i][1] + 1)
-            self.integrators[self._names[i]] = self.integrators.get(self._names[i], 0) + 1
-        following = [self._bases[i][0].derivative(self._bases[i][1]) for i in columns]
-        self.system = _integrated(system, columns, added, following, nominal, mixing)
-        # u_i = x_i - sum_j b_ij u_j, with the new state x_i.
-        new = self.system.state[system.num_states :]
-        self.offset += ca.mtimes(self.matrix[:, columns], new)
-        if mixing is not None:
-            self.matrix[:, others] -= ca.mtimes(self.matrix[:, columns], mixing)
-        self.matrix[:, columns] = 0.0
-        self._nominal[columns] = 0.0
-        # B(x) is often singular at zero, so a nonzero value is kept away from zero.
-        size = np.where(nominal == 0.0, 1.0, np.abs(nominal))
-        self.spread = np.concatenate([self.spread, 0.1 * size])
+    return Extension(system, extended, structure, integrators, offset, matrix)
 
 
 def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | None] | None:
@@ -303,14 +246,6 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     return columns, mixing
 
 
-def _refuse_metric(system: DaeSystem) -> None:
-    if system.control_metric is not None:
-        raise ModelError(
-            f"{system.name}: control_metric compares controls, not their derivatives; leave it "
-            "out, and give the extended system one"
-        )
-
-
 def _integrated(
     system: DaeSystem,
     columns: list[int],
@@ -346,15 +281,3 @@ def _integrated(
         mass_matrix=ca.diagcat(system.mass_matrix, ca.SX.eye(q)),
         implicit=None,  # The derivatives of the constraints may differ.
     )
-
-
-def _by_control(system: DaeSystem, what: str, values: Mapping[str, float]) -> FloatArray:
-    """Numbers by the names of controls as an array, shape (p,); 0 for others."""
-    names = [signal.name for signal in system.control_signals]
-    unknown = [name for name in values if name not in names]
-    if unknown:
-        raise ModelError(
-            f"{system.name}: {what} names {', '.join(unknown)}, but the controls are "
-            f"{', '.join(names) or 'none'}"
-        )
-    return vector(f"{system.name}: {what}", [values.get(n, 0.0) for n in names], len(names))

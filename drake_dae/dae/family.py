@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from drake_dae.arrays import Booleans, FloatArray
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import fields_at
 from drake_dae.errors import InconsistentStateError
@@ -66,7 +66,7 @@ class Family:
         # One of many may be round-off of a nearly singular matrix.
         if 2 * len(hits) <= len(self._members):
             return None
-        state, values = hits[0]
+        (state, values), every = hits[0], self._places
         defaults = self._system.parameter_values
 
         def acts_with(places: list[int], others: FloatArray, those: FloatArray) -> bool:
@@ -75,7 +75,6 @@ class Family:
             member = self._consistent(state, mixed)
             return member is not None and bool(acts(*member))
 
-        every = self._places
         chosen = [n for n in every if acts_with(every[n], others=defaults, those=values)]
         # No parameter alone decides: those without which it does not act.
         chosen = chosen or [
@@ -91,17 +90,14 @@ class Family:
         """Returns parameters within their bounds where a margin is not above the least, or None.
 
         The margin is tried at corners and random places of the box of bounds, and then minimized
-        from the lowest, as far as its gradient leads.
+        from the lowest, by steps to the zero of the linearized margin.
         """
         system, defaults = self._system, self._system.parameter_values
-        names, places = list[str](), list[int]()
-        for p in system.parameters:
-            if p.bounds is not None:
-                first = system.parameter_slice(p.name).start
-                names += [signal.name for signal in p.signals]
-                places += range(first, first + p.value.size)
+        bounded = [p for p in system.parameters if p.bounds is not None]
+        names = [signal.name for p in bounded for signal in p.signals]
+        places = np.concatenate([np.r_[system.parameter_slice(p.name)] for p in bounded])
         low, high = (bound[places] for bound in system.parameter_box)
-        count, width, random = len(places), high - low, np.random.default_rng(0)
+        width, random = high - low, np.random.default_rng(0)
         default = (defaults[places] - low) / np.where(width > 0.0, width, 1.0)
 
         def at(box: FloatArray) -> float:
@@ -110,12 +106,31 @@ class Family:
             member = self._consistent(self._states[0], values)
             return np.inf if member is None else margin(*member)
 
-        alone = [np.where(row > 0, end, default) for row in np.eye(count) for end in (0, 1)]
-        corners = random.integers(0, 2, (CORNERS, count))
-        tried = [*alone, *np.unique(corners, axis=0), *random.uniform(size=(CORNERS, count))]
+        alone = [np.where(row > 0, end, default) for row in np.eye(places.size) for end in (0, 1)]
+        corners = random.integers(0, 2, (CORNERS, places.size))
+        inside = random.uniform(size=(CORNERS, places.size))
+        tried = [*alone, *np.unique(corners, axis=0), *inside]
         lowest = sorted((at(box), k) for k, box in enumerate(tried))
         for value, k in lowest[:STARTS]:
-            box, value = _lowest(at, np.array(tried[k], dtype=float), value, least, width > 0.0)
+            box = np.array(tried[k], dtype=float)
+            for _ in range(DESCENTS):
+                if not value > least:
+                    break
+                slope = np.zeros(box.size)
+                for i in np.flatnonzero(width > 0.0):
+                    other = box.copy()
+                    other[i] += STEP if box[i] < 0.5 else -STEP
+                    slope[i] = (at(other) - value) / (other[i] - box[i])
+                square = float(slope @ slope)
+                if not 0.0 < square < np.inf:
+                    break
+                # To the zero of the linearized margin, or as far as the margin falls.
+                steps = (c * value / square * slope for c in (1.0, 0.25, 0.06))
+                trials = (np.clip(box - step, 0.0, 1.0) for step in steps)
+                lower = next(((t, v) for t in trials if (v := at(t)) < value), None)
+                if lower is None:
+                    break
+                box, value = lower
             if not value > least:
                 moved = np.abs(box - default)
                 rows = zip(names, low + width * box, defaults[places], moved, strict=True)
@@ -128,12 +143,12 @@ class Family:
     @cached_property
     def _places(self) -> dict[str, list[int]]:
         """The parameters and derivatives of signals to draw, with their indices."""
-        system, places, rates = self._system, dict[str, list[int]](), dict[str, list[int]]()
-        for p in system.parameters:
+        exogenous, places, rates = self._system.exogenous, dict[str, list[int]](), {}
+        for p in self._system.parameters:
             free = np.flatnonzero(p.low < p.high)
-            places[p.name] = (system.parameter_slice(p.name).start + free).tolist()
+            places[p.name] = (exogenous.slices[p.name].start + free).tolist()
             for order in range(len(p.derivatives)):
-                first = system.exogenous.rates()[p.name].start + order * p.value.size
+                first = exogenous.rates[p.name].start + order * p.value.size
                 rates[p.name + "'" * (order + 1)] = (first + free).tolist()
         return {name: drawn for name, drawn in (places | rates).items() if drawn}
 
@@ -141,9 +156,8 @@ class Family:
     def _members(self) -> list[tuple[FloatArray, FloatArray]]:
         if not self._places:
             return []
-        system, random = self._system, np.random.default_rng(0)
-        low, high = system.parameter_box
-        defaults, members = system.parameter_values, []
+        random, (low, high) = np.random.default_rng(0), self._system.parameter_box
+        defaults, members = self._system.parameter_values, []
         for number in range(MEMBERS):
             away = random.uniform(low, high) - defaults
             state = self._states[number % len(self._states)]
@@ -166,27 +180,3 @@ class Family:
         fields = fields_at(self._system, consistent, parameters)
         is_finite = all(np.all(np.isfinite(field)) for field in fields.values())
         return (consistent, parameters) if is_finite else None
-
-
-def _lowest(
-    at: Callable[[FloatArray], float], box: FloatArray, value: float, least: float, free: Booleans
-) -> tuple[FloatArray, float]:
-    """Descends in the unit box to the zeros of a linearized margin, until it is low enough."""
-    for _ in range(DESCENTS):
-        if not value > least:
-            break
-        slope = np.zeros(box.size)
-        for i in np.flatnonzero(free):
-            other = box.copy()
-            other[i] += STEP if box[i] < 0.5 else -STEP
-            slope[i] = (at(other) - value) / (other[i] - box[i])
-        square = float(slope @ slope)
-        if not 0.0 < square < np.inf:
-            break
-        # To the zero of the linearized margin, or as far as the margin falls.
-        trials = (np.clip(box - c * value / square * slope, 0.0, 1.0) for c in (1.0, 0.25, 0.06))
-        lower = next(((t, v) for t in trials if (v := at(t)) < value), None)
-        if lower is None:
-            break
-        box, value = lower
-    return box, value

@@ -4,7 +4,6 @@ CasADi's own messages do not say which function of (1)-(3) is wrong, or how to c
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from inspect import signature
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arrays import brief, number, numbers, unknown_name, vector
 from drake_dae.dae.contacts import UnilateralInput
-from drake_dae.dae.signals import Parameter, Signal, is_symbol, parameter_slice, parameter_symbol
+from drake_dae.dae.signals import Parameter, Signal, is_symbol, parameter_symbol
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import check_choice
 from drake_dae.trace.expressions import find_flaw
@@ -32,12 +31,11 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         )
     state = ca.vec(state)
     check_choice(name, given["compiled"])
-    for key in ("least_margin", "negligible"):
-        if not 1e-15 <= number(f"{name}: {key}", given[key]) < 1.0:
-            raise ModelError(
-                f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
-                f"{brief(given[key])}"
-            )
+    if not 1e-15 <= number(f"{name}: least_margin", given["least_margin"]) < 1.0:
+        raise ModelError(
+            f"{name}: least_margin must be from 1e-15, which is round-off, to below 1, got "
+            f"{brief(given['least_margin'])}"
+        )
     for key, kind in (("contacts", UnilateralInput), ("parameters", Parameter)):
         items = given[key]
         if not isinstance(items, (list, tuple)) or not all(isinstance(i, kind) for i in items):
@@ -45,16 +43,15 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
                 f"{name}: {key} must be a list of {kind.__name__}s, got {brief(items)}"
             )
     parameters = tuple(given["parameters"])
-    _check_unique(name, "parameter", [p.name for p in parameters])
+    known = [p.name for p in parameters]
+    _check_unique(name, "parameter", known)
     for contact in given["contacts"]:
-        if contact.friction is not None:
-            parameter_slice(name, parameters, contact.friction)
-    functions = {key: given[key] for key in ("f", "g", "h", "k", "l", "m", "mass_matrix")}
-    if functions["mass_matrix"] is None:
-        functions["mass_matrix"] = ca.SX.eye(state.numel())
+        if contact.friction not in (None, *known):
+            raise ModelError(f"{name}: {unknown_name('parameter', contact.friction, known)}")
     metric, free = given["control_metric"], given["free_control"]
-    functions |= {} if metric is None else {"control_metric": metric}
-    functions |= {} if free is None else {"free_control": free}
+    optional = ("mass_matrix", "control_metric", "free_control")
+    functions = {key: given[key] for key in (*"fghklm", *optional) if given[key] is not None}
+    functions.setdefault("mass_matrix", ca.SX.eye(state.numel()))
     expressions = _expressions(name, functions, state, parameter_symbol(parameters))
     fields = {"state": state, "parameters": parameters, **expressions}
     n, m = state.numel(), expressions["k"].numel()
@@ -72,14 +69,13 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
             raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
         _check_unique(name, key, [signal.name for signal in signals])
     nominal, scale = given["nominal_state"], given["state_scale"]
-    start = np.zeros(n) if nominal is None else nominal
-    fields["nominal_state"] = vector(f"{name}: nominal_state", start, n)
-    fields["nominal_state"].setflags(write=False)
-    if scale is not None:
-        fields["state_scale"] = vector(f"{name}: state_scale", scale, n)
-        fields["state_scale"].setflags(write=False)
-        if not np.all(fields["state_scale"] > 0.0):
-            raise ModelError(f"{name}: state_scale must be positive, got {brief(scale)}")
+    nominal = np.zeros(n) if nominal is None else nominal
+    for key, value in (("nominal_state", nominal), ("state_scale", scale)):
+        if value is not None:
+            fields[key] = vector(f"{name}: {key}", value, n)
+            fields[key].setflags(write=False)
+    if scale is not None and not np.all(fields["state_scale"] > 0.0):
+        raise ModelError(f"{name}: state_scale must be positive, got {brief(scale)}")
     if free is not None and metric is None:
         raise ModelError(
             f"{name}: free_control needs a control_metric, which measures the distance from it"
@@ -99,15 +95,9 @@ def fields_of_functions(
     functions: Mapping[str, Any],
     parameters: Mapping[str, ArrayLike],
     labels: Mapping[str, Any],
-    fields: Sequence[str],
 ) -> dict[str, Any]:
     """Returns the fields of a `DaeSystem` from Python functions; see `from_functions`."""
     owner = labels.get("name", "system")
-    fixed = {"state", "parameters", "state_signals", *"fghklm"}
-    allowed = [item for item in fields if item not in fixed]
-    for label in labels:
-        if label not in allowed:
-            raise ModelError(f"{owner}: {unknown_name('field', label, allowed)}")
     bad = [name for name in parameters if not name.isidentifier()]
     if bad:
         raise ModelError(
@@ -218,31 +208,13 @@ def _called(
     try:
         value = function(*arguments)
     except Exception as error:
+        given = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
         raise ModelError(
             f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
-            f"states: {_explained(error, function, arguments)}"
+            f"states: {error}. It is called with {given}; use CasADi's own functions (casadi.sin) "
+            "or plain operators. A condition, as in if, max or min, is not smooth: write the "
+            "branch in which the state remains"
         ) from error
     if value is None:
         raise ModelError(f"{owner}: function {letter} returned nothing")
     return as_expression(owner, letter, value)
-
-
-def _explained(error: Exception, function: Callable[..., Any], arguments: Sequence[Any]) -> str:
-    """Explains an error in a user's function."""
-    text = str(error)
-    try:
-        signature(function).bind(*arguments)
-    except TypeError:
-        called = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
-        return f"{text}. It is called with {called}"
-    except ValueError:
-        pass  # Built-in functions have no signature.
-    if "truth value" in text:
-        return (
-            "it asks whether a condition on the state is true, as in if, max or min. Conditions "
-            "are not smooth, and the theory differentiates: write the branch in which the state "
-            "remains, or a smooth function"
-        )
-    if isinstance(error, AttributeError) and isinstance(error.obj, SimpleNamespace):
-        return f"no parameter '{error.name}'; there are {', '.join(vars(error.obj))}"
-    return f"{text}. Use CasADi's own functions (casadi.sin, casadi.vertcat) or plain operators"

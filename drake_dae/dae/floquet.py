@@ -6,6 +6,7 @@ spaces a period of a periodic motion takes T c to T M c; the eigenvalues of M ar
 """
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -13,13 +14,11 @@ import numpy as np
 import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
-from drake_dae.arrays import FloatArray, vector
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.equilibria import ComplexArray, Verdict, eigenvalues_of
 from drake_dae.dae.manifold import tangent
-from drake_dae.dae.pinned_motion import GROWN, PinnedMotion, TimeFunction
-from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedSet
+from drake_dae.dae.pinned_motion import GROWN, PinnedMotion, PinnedSet
 from drake_dae.errors import ModelError
-from drake_dae.trace.expressions import result_of
 
 ACCURACY = 1e-9
 """The error of an integration step, relative to the scale of the states."""
@@ -59,24 +58,17 @@ class _MotionLost(Exception):
 
 
 class PeriodicMotions:
-    """The motions on Z(R(t)) with the period of R, and their multipliers."""
+    """The motions on Z(R(t)), given by `at`, with the period of R, and their multipliers."""
 
-    def __init__(
-        self,
-        pinned: PinnedOutputs,
-        reference: TimeFunction,
-        parameters: TimeFunction,
-        scale: FloatArray,
-        period: float,
-    ) -> None:
-        self._pinned, self._parameters, self._scale = pinned, parameters, scale
-        self._reference, self._period = reference, period
+    def __init__(self, at: Callable[[float], PinnedSet], scale: FloatArray, period: float) -> None:
+        self._at, self._scale, self._period = at, scale, period
 
     def judge(self, motion: PinnedMotion) -> StabilityAlong:
         """Judges the periodic motion found near a motion."""
         if not motion.times.size:
             return StabilityAlong(Verdict.UNDECIDED, str(motion.ending), self._period)
         self._check_period(motion.times)
+        over = f"over {self._period:.6g} s"
         # Late, when decaying disturbances are gone; or early, when growing ones are still small.
         late = int(np.count_nonzero(motion.times <= motion.times[-1] - self._period)) - 1
         for first in dict.fromkeys((max(late, 0), 0)):
@@ -87,50 +79,39 @@ class PeriodicMotions:
             noise = CARRIED * max(1.0, float(np.linalg.norm(matrix, 2)))
             values, errors = eigenvalues_of(matrix, np.full(matrix.shape, noise))
             order = np.argsort(-np.abs(values), kind="stable")
-            return self._by_multipliers(state, values[order], errors[order])
+            values, errors = values[order], errors[order]
+            sizes = np.abs(values)
+            reason = f"the largest Floquet multiplier is {sizes[0]:.4g} {over}"
+            if np.any(sizes > 1.0 + errors):
+                verdict = Verdict.UNSTABLE
+                reason = f"small disturbances of the motion grow: {reason}"
+            elif np.all(sizes < 1.0 - errors):
+                verdict = Verdict.STABLE
+            else:
+                verdict, count = Verdict.UNDECIDED, np.count_nonzero(np.abs(sizes - 1.0) <= errors)
+                reason = (
+                    f"{count} of {sizes.size} Floquet multipliers are on the unit circle, up to "
+                    f"the error of integration, {over}"
+                )
+            return StabilityAlong(verdict, reason, self._period, values, state)
         reason = f"no motion with the period {self._period:.6g} s of the reference is found"
         if motion.ending is not None:
             reason += f"; the motion ends: {motion.ending}"
         return StabilityAlong(Verdict.UNDECIDED, reason, self._period)
-
-    def _by_multipliers(
-        self, state: FloatArray, values: ComplexArray, errors: FloatArray
-    ) -> StabilityAlong:
-        sizes, over = np.abs(values), f"over {self._period:.6g} s"
-        reason = f"the largest Floquet multiplier is {sizes[0]:.4g} {over}"
-        if np.any(sizes > 1.0 + errors):
-            verdict, reason = Verdict.UNSTABLE, f"small disturbances of the motion grow: {reason}"
-        elif np.all(sizes < 1.0 - errors):
-            verdict = Verdict.STABLE
-        else:
-            verdict, count = Verdict.UNDECIDED, np.count_nonzero(np.abs(sizes - 1.0) <= errors)
-            reason = (
-                f"{count} of {sizes.size} Floquet multipliers are on the unit circle, up to the "
-                f"error of integration, {over}"
-            )
-        return StabilityAlong(verdict, reason, self._period, values, state)
 
     def _check_period(self, times: FloatArray) -> None:
         """Raises ModelError if the signals do not repeat, at a few times."""
         begin = float(times[0])
         last = max(float(times[-1]) - self._period, begin)
         for time in np.linspace(begin, last, 4).tolist():
-            for signals in (self._goal, self._parameters):
-                now, later = signals(time), signals(time + self._period)
-                allowed = REPEATED * max(1.0, float(np.max(np.abs(now), initial=0.0)))
-                if np.any(np.abs(later - now) > allowed):
+            now, later = self._at(time), self._at(time + self._period)
+            for a, b in ((now.reference, later.reference), (now.parameters, later.parameters)):
+                allowed = REPEATED * max(1.0, float(np.max(np.abs(a), initial=0.0)))
+                if np.any(np.abs(b - a) > allowed):
                     raise ModelError(
-                        f"{self._pinned.system.name}: the reference does not have the period "
+                        f"{now.outputs.system.name}: the reference does not have the period "
                         f"{self._period:g} s: it differs at {time:g} s and a period later"
                     )
-
-    def _goal(self, time: float) -> FloatArray:
-        """R at a time, shape (sum (mu_i + 1),)."""
-        goal = np.ravel(result_of("reference", self._reference, time))
-        return vector(f"reference({time:g})", goal, self._pinned.layout.reference_size)
-
-    def _at(self, time: float) -> PinnedSet:
-        return self._pinned.at(self._goal(time), self._parameters(time))
 
     def _onto(self, state: FloatArray, time: float) -> FloatArray:
         """Projects a state onto Z(R(t)), which must be near."""
@@ -147,7 +128,10 @@ class PeriodicMotions:
         """
         for _ in range(NEWTON_STEPS):
             basis = tangent(self._at(begin).gradients(state), self._scale)
-            later, columns = self._carry(state, basis, begin)
+            later, columns, left = state, basis, MOST_STEPS
+            for start, stop in pairwise(np.linspace(begin, begin + self._period, SECTIONS + 1)):
+                later, columns, steps = self._section(later, columns, start, stop, left)
+                later, left = self._onto(later, stop), left - steps
             scaled = (basis / self._scale[:, None]).T
             matrix = scaled @ (columns / self._scale[:, None])
             if not np.all(np.isfinite(matrix)):
@@ -162,21 +146,10 @@ class PeriodicMotions:
             state = self._onto(state + change, begin)
         raise _MotionLost
 
-    def _carry(
-        self, state: FloatArray, columns: FloatArray, begin: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Integrates a state and directions in its tangent space, as columns, over a period."""
-        left = MOST_STEPS
-        for start, stop in pairwise(np.linspace(begin, begin + self._period, SECTIONS + 1)):
-            state, columns, steps = self._section(state, columns, start, stop, left)
-            left -= steps
-            state = self._onto(state, stop)
-        return state, columns
-
     def _section(
         self, state: FloatArray, columns: FloatArray, begin: float, end: float, most: int
     ) -> tuple[FloatArray, FloatArray, int]:
-        """Integrates over a part of a period; also returns the number of steps."""
+        """Integrates a state and tangent columns; also returns the number of steps."""
         n, unit = state.size, self._scale[:, None]
 
         def split(both: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -188,7 +161,7 @@ class PeriodicMotions:
 
         def rate(time: float, both: FloatArray) -> FloatArray:
             (x, along), pinned = split(both), self._at(time)
-            moved = joined(pinned.rate(x), pinned.slopes_along(x, along))
+            moved = joined(pinned.rate(x), pinned.slopes(x, along))
             if not np.all(np.isfinite(moved)):
                 raise _MotionLost
             return moved

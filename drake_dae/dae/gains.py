@@ -9,32 +9,16 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, show, vector
+from drake_dae.arrays import FloatArray, brief, numbers, show, vector
 from drake_dae.dae.signals import DerivativeLayout
 from drake_dae.errors import GainError
+from drake_dae.trace.expressions import result_of
 
 
 @checked(GainError)
 @dataclass(frozen=True, eq=False)
 class FeedbackGains:
-    """The feedback gains of the law (28), which determine the error dynamics (30).
-
-    With the error coordinates e = (e_1, e_1', ..., e_1^(mu_1 - 1), ..., e_p^(mu_p - 1)), shape
-    (N,), N = sum mu_i, the law sets
-
-        (e_1^(mu_1), ..., e_p^(mu_p)) = -K e.
-
-    A row of K may contain the errors of other outputs, as the full matrices Lambda_1, Lambda_2, ...
-    of (60), (72) and (82) do.
-
-    Attributes:
-        names: Names of the p outputs, in their order.
-        degrees: mu_1, ..., mu_p; 0 for an output with e = 0 at all times (31).
-        matrix: K, shape (p, N); rows of outputs with degree 0 are zero.
-
-    Raises:
-        GainError: The shape is wrong, or the error dynamics are not Hurwitz (32).
-    """
+    """The feedback gains of the law (28), which determine the error dynamics (30)."""
 
     names: tuple[str, ...]
     degrees: tuple[int, ...]
@@ -84,12 +68,7 @@ class FeedbackGains:
 
     @checked(GainError)
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
-        """Returns the exact tracking error exp(E t) e(0) of (30), (31), shape (k, p).
-
-        Args:
-            times: Times in s after the start, shape (k,).
-            initial: Error coordinates at the start, shape (N,).
-        """
+        """Returns the exact tracking error exp(E t) e(0) of (30), (31), shape (k, p)."""
         moments = vector("times", np.atleast_1d(times), None, GainError)
         coordinates = numbers("initial", initial, GainError)
         matrix = self.error_matrix
@@ -155,11 +134,7 @@ def poles(values: Poles | Mapping[str, Poles]) -> GainDesign:
 def gain_coefficients(
     values: Sequence[float] | Mapping[str, float | Sequence[float]],
 ) -> GainDesign:
-    """Designs the gains K_i1, ..., K_i mu_i of (32) from numbers, lowest derivative first.
-
-    Args:
-        values: mu_i numbers for every output, or these per output name, "*" for all others.
-    """
+    """Designs the gains K_i1, ..., K_i mu_i of (32) from numbers, lowest derivative first."""
 
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
         matrix = np.zeros((len(names), sum(degrees)))
@@ -181,13 +156,7 @@ def gain_coefficients(
 
 
 def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
-    """Designs gains from full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ... of (72)-(73).
-
-    Args:
-        groups: For each degree mu >= 1 that occurs among the outputs, highest first, the mu
-            matrices (lowest derivative first) that couple the outputs of this degree, in the
-            outputs' order. Rigid joints: `gain_matrices([Lambda_1, Lambda_2])`.
-    """
+    """Designs gains from full matrices: Lambda_1, Lambda_2 of (60), Lambda_1, ... of (72)-(73)."""
     blocks = [
         [numbers(f"gain_matrices: groups[{k}]", block, GainError) for block in group]
         for k, group in enumerate(groups)
@@ -221,6 +190,23 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
         return FeedbackGains(tuple(names), tuple(degrees), matrix)
 
     return design
+
+
+def designed(
+    what: str, design: GainDesign | FeedbackGains, names: tuple[str, ...], degrees: tuple[int, ...]
+) -> FeedbackGains:
+    """Returns finished gains, or designs them; raises GainError if they are for other signals."""
+    gains = design
+    if not isinstance(gains, FeedbackGains):
+        gains = result_of(what, gains, names, degrees, error=GainError)
+    if not isinstance(gains, FeedbackGains):
+        raise GainError(f"{what} must be a design such as poles(-4.0), got {brief(gains)}")
+    if (gains.names, gains.degrees) != (names, degrees):
+        raise GainError(
+            f"{what} must be for {', '.join(names) or 'none'} with {degrees} poles, and is for "
+            f"{', '.join(gains.names)} with {gains.degrees}"
+        )
+    return gains
 
 
 def _per_output(

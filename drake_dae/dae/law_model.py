@@ -1,18 +1,21 @@
-"""What the model of a law is for compliant contacts and sampled controls: damped, and late."""
+"""What a law has besides (28): damped and late models, measured forces, integrals, deflection."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
+from drake_dae.arrays import FloatArray, numbers, positive, unknown_name
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import eliminate
-from drake_dae.dae.gains import FeedbackGains, GainDesign
-from drake_dae.dae.signals import DerivativeLayout
+from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
+from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
-from drake_dae.trace.expressions import result_of
+from drake_dae.trace.factorization import Factorization
 
 
 def damped(
@@ -26,12 +29,9 @@ def damped(
     force. On N* all y_i^(j) vanish, so that nothing changes there: alpha (13) becomes alpha - A^-1
     (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay.
 
-    If a force is an output of degree mu >= 1 (flexible joints, motors), the law differentiates
-    alpha and takes the added term as constant: a compliant contact does not move as the model
-    demands, so that the derivatives of the model would destabilize it (with force poles at -p and a
-    contact of frequency w = sqrt(A k), for c > p already at mu = 1). Then for mu = 1 the contact is
-    damped for all p; for mu = 2 and c from w to 2 w it is damped from about p = 2.5 w on, best near
-    5 w. The force poles must be faster than the contact.
+    If a force is an output of degree mu >= 1, the law differentiates alpha and takes the added term
+    as constant: a compliant contact does not move as the model demands, so that the derivatives of
+    the model would destabilize it. The force poles must be faster than the contact.
     """
     system = acting_late(structure.system, latency)
     if damping is None and system is structure.system:
@@ -40,35 +40,13 @@ def damped(
     residual = structure.manifold.residual_expression
     force = ca.SX.zeros(len(structure.constraint_degrees))
     if damping is not None:
-        gains = damping_gains(structure, damping)
         rates = residual[np.flatnonzero(layout.orders).tolist(), :]
-        force = ca.mtimes(ca.sparsify(ca.DM(gains.matrix)), rates)
+        force = ca.mtimes(ca.sparsify(ca.DM(damping_gains(structure, damping).matrix)), rates)
     derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
-    return _along(replace(structure, derivatives=derivatives), derivatives)
-
-
-def damping_gains(structure: Structure, damping: GainDesign | FeedbackGains) -> FeedbackGains:
-    """Returns the coefficients c of `damped`."""
-    system = structure.system
-    names = tuple(signal.name for signal in system.constraint_output_signals)
-    degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
-    gains = damping
-    if not isinstance(gains, FeedbackGains):
-        gains = result_of("constraint_damping", gains, names, degrees, error=GainError)
-    if not isinstance(gains, FeedbackGains) or (gains.names, gains.degrees) != (names, degrees):
-        raise GainError(
-            f"constraint_damping must be a design such as poles(-200.0) for the constraints "
-            f"{', '.join(names) or 'none'} with r_i - 1 = {degrees} poles each"
-        )
-    return gains
-
-
-def _along(structure: Structure, derivatives: Derivatives) -> Structure:
-    """The output chains of known degrees along other derivatives."""
-    system, degrees = structure.system, structure.output_degrees
+    # The output chains of the same degrees along these derivatives.
+    degrees = structure.output_degrees
     chains: list[list[ca.SX]] = [[] for _ in degrees]
-    highest = ca.SX(len(degrees), 1)
-    rows = list(range(len(degrees)))
+    highest, rows = ca.SX(len(degrees), 1), list(range(len(degrees)))
     moving = system.outputs(derivatives.constraint_input)
     for order in range(max(degrees, default=0) + 1):
         values, _ = derivatives.by_control(moving)
@@ -82,29 +60,36 @@ def _along(structure: Structure, derivatives: Derivatives) -> Structure:
         if rows:
             moving = derivatives.derivative(moving[remaining])
     drift, control_matrix = derivatives.by_control(highest)
-    elimination = eliminate(derivatives)
     return replace(
         structure,
-        elimination=replace(elimination, n_star=structure.elimination.n_star),
-        output_chains=tuple(tuple(chain) for chain in chains),
+        derivatives=derivatives,
+        elimination=replace(eliminate(derivatives), n_star=structure.elimination.n_star),
+        output_chains=tuple(map(tuple, chains)),
         highest_derivatives=highest,
         drift=drift,
         control_matrix=control_matrix,
     )
 
 
+def damping_gains(structure: Structure, damping: GainDesign | FeedbackGains) -> FeedbackGains:
+    """Returns the coefficients c of `damped`: r_i - 1 poles for each constraint."""
+    names = tuple(signal.name for signal in structure.system.constraint_output_signals)
+    degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
+    return designed("constraint_damping", damping, names, degrees)
+
+
 def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
     """The system as a sampled law sees it: its damping by the speed at which the control acts.
 
-    A law compensates the damping -D v of its model with the measured v. A sampled control acts
-    on average by the latency T later, delay + period / 2, when the speed is v + T v'. Hence
+    A sampled control acts on average by the latency T later, delay + period / 2, when the speed is
+    v + T v'. Hence the damping -D v of the model, which a law compensates with the measured v, is
 
-        M v' + D (v + T v') = u,    or    (M + T D) v' + D v = u,
+        M v' + D (v + T v') = u,    or    (M + T D) v' + D v = u.
 
-    and the inertia M + T D takes the place of M. With M alone the joint moves as if it had M + T D
-    while gains and integrals are computed for M: a light joint with T D / M = 30, as in the wrists
-    of some arms, has errors that decay 30 times as slowly. Drake's discrete MultibodyPlant has the
-    same matrix, with its step h in place of T, since its damping is implicit: it adds h / 2 to T.
+    With M alone the joint moves as if it had M + T D while gains and integrals are computed for M:
+    a light joint with T D / M = 30, as in the wrists of some arms, has errors that decay 30 times
+    as slowly. Drake's discrete MultibodyPlant has the same matrix, with its step h in place of T,
+    since its damping is implicit: it adds h / 2 to T.
 
     D is -df / dv without Coulomb friction at the nominal speeds, usually rest, and at any position:
     a contact with viscous friction damps several joints by one matrix J^T d J. v are the states
@@ -113,10 +98,24 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
     """
     if latency < 0.0:
         raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")
-    damping = _viscous_damping(system) if latency else None
-    if damping is None:
+    if not latency:
         return system
-    added, inner = latency * damping, system.implicit
+    n, state = system.num_states, system.state
+    driven = ca.horzcat(system.g, system.h, system.mass_matrix - ca.SX.eye(n))
+    rows = [i for i in range(n) if ca.sparsify(driven[i, :]).nnz()]
+    slopes = -ca.jacobian(system.f[rows, :], state[rows, :])
+    dry = [parameter.symbol for parameter in system.parameters if parameter.name in system.dry]
+    constants = ca.vertcat(state[rows, :], *dry)
+    values = ca.vertcat(ca.DM(system.nominal_state[rows]), ca.DM.zeros(len(dry)))
+    slopes = ca.sparsify(ca.substitute(slopes, constants, values))
+    function = ca.Function("damping", [state, system.parameter_symbol], [ca.diag(slopes)])
+    found = function(system.nominal_state, system.parameter_values).full().ravel()
+    kept = np.flatnonzero(np.isfinite(found) & (found > 0.0)).tolist()
+    if not kept:
+        return system
+    damping, places = ca.SX(n, n), [rows[i] for i in kept]
+    damping[places, places] = slopes[kept, kept]
+    added, inner = latency * ca.sparsify(damping), system.implicit
 
     def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
         assert inner is not None
@@ -131,21 +130,219 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
     )
 
 
-def _viscous_damping(system: DaeSystem) -> ca.SX | None:
-    """D of `acting_late`, shape (n, n); None if it is 0."""
-    n, state, symbols = system.num_states, system.state, system.parameter_symbol
-    driven = ca.horzcat(system.g, system.h, system.mass_matrix - ca.SX.eye(n))
-    rows = [i for i in range(n) if ca.sparsify(driven[i, :]).nnz()]
-    slopes = -ca.jacobian(system.f[rows, :], state[rows, :])
-    dry = [parameter.symbol for parameter in system.parameters if parameter.name in system.dry]
-    constants = ca.vertcat(state[rows, :], *dry)
-    values = ca.vertcat(ca.DM(system.nominal_state[rows]), ca.DM.zeros(len(dry)))
-    slopes = ca.sparsify(ca.substitute(slopes, constants, values))
-    function = ca.Function("damping", [state, symbols], [ca.diag(slopes)])
-    found = function(system.nominal_state, system.parameter_values).full().ravel()
-    kept = np.flatnonzero(np.isfinite(found) & (found > 0.0)).tolist()
-    if not kept:
-        return None
-    damping, places = ca.SX(n, n), [rows[i] for i in kept]
-    damping[places, places] = slopes[kept, kept]
-    return ca.sparsify(damping)
+@dataclass(frozen=True, eq=False)
+class ForceMeasurement:
+    """The measurement of v in the law (28), for the outputs z_i = v_j:
+
+        mu_i = 0:  ubar_i = r_i - Gbar_j (v - r), the term J^T Gbar (lambda - r_2) of (59). The
+            force error of a wrong model shrinks to 1 / (1 + Gbar).
+        mu_i >= 1: v_j takes the place of the model's l*_i, as (71) and (81) allow.
+
+    Outputs that are combinations of constraint inputs, z_i = m_i(x) v, take m_i v in place of v_j;
+    then Gbar is a multiple of the identity.
+    """
+
+    layout: DerivativeLayout
+    rows: dict[int, ca.SX]
+    inputs: dict[int, int]
+    gain: FloatArray
+    symbol: ca.SX
+
+    @classmethod
+    def of(cls, system: DaeSystem, layout: DerivativeLayout, gain: ArrayLike) -> "ForceMeasurement":
+        if system.sharing is not None:
+            raise ModelError(
+                f"{system.name}: measured_force is not supported for redundant constraints that "
+                "share their forces; leave them out with `drop_constraints`, or use the law's "
+                "own force"
+            )
+        rows, inputs = _force_outputs(system)
+        size, matrix = system.num_constraints, numbers("force_gain", gain, GainError)
+        if matrix.ndim == 0:
+            matrix = matrix * np.eye(size)
+        if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)):
+            raise GainError(f"force_gain must be a number or shape ({size}, {size}), got {gain!r}")
+        smallest = float(np.min(np.linalg.eigvalsh((matrix + matrix.T) / 2.0), initial=0.0))
+        if smallest < -1e-12:
+            raise GainError(
+                "force_gain, Gbar of (59), must be positive semidefinite: a negative one feeds the "
+                f"force error back with the wrong sign. Smallest eigenvalue {smallest:.3g}"
+            )
+        for i in rows:
+            name = system.output_signals[i].name
+            if i not in inputs and np.any(matrix != matrix[0, 0] * np.eye(size)):
+                raise GainError(
+                    f"force_gain must be one number, since '{name}' is a combination of forces"
+                )
+            if layout.degrees[i] and matrix[inputs.get(i, 0)].any():
+                raise GainError(
+                    f"force_gain is for outputs of degree 0; '{name}' has degree "
+                    f"{layout.degrees[i]} and takes the measured force itself. Leave it 0"
+                )
+        return cls(layout, rows, inputs, matrix, ca.SX.sym("v", size))
+
+    def value(self, output: int) -> ca.SX:
+        """Returns the measured value of an output, m_i v."""
+        return ca.mtimes(self.rows[output], self.symbol)
+
+    def chain(self, chain: ca.SX) -> ca.SX:
+        """Returns the output chains with the measurement in place of the model's l*_i."""
+        result = ca.SX(chain)
+        for head, output in zip(self.layout.heads, self.layout.dynamic, strict=True):
+            if output in self.rows:
+                result[int(head)] = self.value(int(output))  # (71), (81)
+        return result
+
+    def highest(self, highest: ca.SX, values: ca.SX) -> ca.SX:
+        """Returns the highest derivatives of the reference, less Gbar (v - r) where mu_i = 0."""
+        excess = ca.SX(self.symbol.numel(), 1)
+        for i, j in self.inputs.items():
+            excess[j] = self.symbol[j] - values[i]
+        result = ca.SX(highest)
+        for i in map(int, self.layout.direct):
+            if i in self.inputs:
+                result[i] -= ca.mtimes(ca.DM(self.gain[self.inputs[i]]).T, excess)  # (59)
+            elif i in self.rows:
+                result[i] -= self.gain[0, 0] * (self.value(i) - values[i])
+        return result
+
+
+def _force_outputs(system: DaeSystem) -> tuple[dict[int, ca.SX], dict[int, int]]:
+    """The outputs z_i = m_i v, as i -> m_i; and those that are one input, z_i = v_j, as i -> j."""
+    rows = {
+        i: ca.sparsify(system.m[i, :])
+        for i in range(system.num_outputs)
+        if system.l[i].is_zero() and not system.m[i, :].is_zero()
+    }
+    if not rows:
+        raise ModelError(
+            f"{system.name}: measured_force needs an output that is a constraint input or a "
+            "combination of some"
+        )
+    columns = {i: row.sparsity().get_triplet()[1] for i, row in rows.items()}
+    single = {i: j[0] for i, j in columns.items() if len(j) == 1 and rows[i][j[0]].is_one()}
+    return rows, single
+
+
+@dataclass(frozen=True, eq=False)
+class IntegralAction:
+    """The integrals sigma_i' = z_i - r_i of some outputs, which extend (30) to
+
+        e_i^(mu_i) = -K_i0 sigma_i - K_i1 e_i - ... - K_i mu_i e_i^(mu_i - 1),
+
+    so that an output has mu_i + 1 poles in place of mu_i. If mu_i = 0 it is the integral of a
+    measured force: ubar_i = r_i - K_i0 int (z_i - r_i) dt. With a constant model error, e_i tends
+    to zero.
+    """
+
+    outputs: tuple[int, ...]
+    degrees: tuple[int, ...]
+    signals: tuple[Signal, ...]
+    symbol: ca.SX
+
+    @classmethod
+    def of(
+        cls,
+        system: DaeSystem,
+        degrees: Sequence[int],
+        names: Sequence[str],
+        measured: ForceMeasurement | None,
+    ) -> "IntegralAction":
+        known, integrated = [signal.name for signal in system.output_signals], list[int]()
+        for name in names:
+            if name not in known:
+                raise GainError(f"integral: {unknown_name('output', name, known)}")
+            i = known.index(name)
+            if i in integrated:
+                raise GainError(f"integral: '{name}' occurs twice")
+            if degrees[i] == 0 and (measured is None or i not in measured.rows):
+                raise GainError(
+                    f"integral: by the model the law attains '{name}' without delay, so there is "
+                    "no error to integrate; make the law with measured_force=True, and integrate "
+                    "a constraint input or a combination of some"
+                )
+            integrated.append(i)
+        chosen = tuple(sorted(integrated))
+        of = [system.output_signals[i] for i in chosen]
+        signals = tuple(Signal(f"integral of {s.name}", f"{s.unit or '1'} s") for s in of)
+        return cls(chosen, tuple(degrees), signals, ca.SX.sym("integral", len(chosen)))
+
+    @property
+    def all_degrees(self) -> tuple[int, ...]:
+        """The number of poles of each output."""
+        return tuple(degree + (i in self.outputs) for i, degree in enumerate(self.degrees))
+
+    def coordinates(self, errors: ca.SX) -> ca.SX:
+        """Returns the error coordinates, with the integrals among them."""
+        starts, rows = DerivativeLayout(self.degrees).starts.tolist(), []
+        for i, degree in enumerate(self.degrees):
+            if i in self.outputs:
+                rows.append(self.symbol[self.outputs.index(i)])
+            rows.append(errors[starts[i] : starts[i] + degree, :])
+        return ca.vertcat(ca.SX(0, 1), *rows)
+
+    def rate(self, chain: ca.SX, values: ca.SX, measured: ForceMeasurement | None) -> ca.SX:
+        """Returns sigma' = z - r of these outputs, shape (k, 1)."""
+        starts, rows = DerivativeLayout(self.degrees).starts.tolist(), [ca.SX(0, 1)]
+        for i in self.outputs:
+            if self.degrees[i]:
+                rows.append(chain[starts[i]] - values[i])
+            elif measured is not None:
+                rows.append(measured.value(i) - values[i])
+        return ca.vertcat(*rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Deflection:
+    """The motion of compliant contacts, lambda = -k phi, that a wanted force lambda_d needs.
+
+    A law that keeps phi'' + c phi' = 0 leaves phi'' + c phi' = A (lambda - lambda_d) there: a step
+    of lambda_d makes the contact oscillate with sqrt(A k). With phi_d = -lambda_d / k and
+
+        phi'' - phi_d'' + c (phi' - phi_d') = 0,    so    u for lambda_d + A^-1 (c lambda_d' +
+                                                          lambda_d'') / k,
+
+    the error e = phi - phi_d obeys e'' + c e' + A k e = 0 for any reference that is twice
+    differentiable. A stiffness that is wrong by a factor s leaves |1 - s| of the oscillation.
+    """
+
+    stiffness: float
+    damping: ca.DM
+    inputs: dict[int, int]
+    matrix: ca.SX
+
+    @classmethod
+    def of(
+        cls, structure: Structure, stiffness: float, damping: GainDesign | FeedbackGains | None
+    ) -> "Deflection":
+        system, size = structure.system, structure.system.num_constraints
+        inputs = _force_outputs(system)[1]
+        degrees = [structure.output_degrees[i] for i in inputs]
+        if sorted(inputs.values()) != list(range(size)) or any(degrees) or not size:
+            raise ModelError(
+                f"{system.name}: a contact_stiffness is for robots with rigid joints whose "
+                "constraint forces are all outputs; leave it out"
+            )
+        if any(degree != 2 for degree in structure.constraint_degrees):
+            raise ModelError(
+                f"{system.name}: a contact_stiffness is for contacts, and a constraint is on "
+                "velocities; leave it out"
+            )
+        c = np.zeros((size, size))
+        if damping is not None:
+            c = damping_gains(structure, damping).matrix
+        matrix = structure.elimination.constraint_matrix
+        return cls(positive("contact_stiffness", stiffness), ca.DM(c), inputs, matrix)
+
+    def force(self, reference: ca.SX, layout: DerivativeLayout) -> ca.SX:
+        """A^-1 (c lambda_d' + lambda_d'') / k of each output, shape (p, 1)."""
+        rates = [ca.SX.zeros(len(self.inputs)) for _ in range(2)]
+        for i, j in self.inputs.items():
+            for order, rate in enumerate(rates, 1):
+                rate[j] = reference[int(layout.lowest[i]) + order]
+        push = ca.mtimes(self.damping, rates[0]) + rates[1]
+        forces = Factorization(self.matrix).solve(push) / self.stiffness
+        result = ca.SX.zeros(len(layout.degrees))
+        for i, j in self.inputs.items():
+            result[i] = forces[j]
+        return result

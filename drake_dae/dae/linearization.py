@@ -49,16 +49,7 @@ class LinearModel:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """The linear models of one system at one state and input.
-
-    Attributes:
-        descriptor: In x and v, with the constraints as rows of E without a derivative.
-        minimal: In the n - sum r_i states that are coordinates of N*.
-        index: The index of the DAE.
-        coordinates: The indices of these states.
-        basis: The derivatives of all states by them, shape (n, n - sum r_i).
-        state, rate, control, constraint_input: x, x', u and v where it is linearized.
-    """
+    """The linear models of one system at one state and input."""
 
     descriptor: LinearModel
     minimal: LinearModel
@@ -111,23 +102,7 @@ def linearize_loop(
     *,
     parameters: ArrayLike | None = None,
 ) -> Linearization:
-    """Linearizes a plant under the law (28), from R to the controlled outputs z.
-
-    All entries of R = (r_1, r_1', ..., r_1^(mu_1), r_2, ...) are inputs of their own. With r_i^(j)
-    = s^j r_i the transfer matrix is the identity if the plant is the model of the law.
-
-    Args:
-        law: The law.
-        reference: R, shape (sum (mu_i + 1),).
-        state: x on N*, shape (n,); the nominal consistent state if None.
-        parameters: Values of the plant's parameters; the defaults if None. The law has its own,
-            the defaults.
-
-    Raises:
-        InconsistentStateError: The state is not on N*.
-        ModelError: A shape is wrong, a number is not finite, or A(x) or B(x) is singular at the
-            state; or the force that the law measures is not determined.
-    """
+    """Linearizes a plant under the law (28), from R to the controlled outputs z."""
     if law.integral.outputs:
         raise ModelError(
             f"{law.system.name}: a law with integral action has a state, which this function does "
@@ -209,39 +184,20 @@ class _PlantModel:
         rate, force = moved[:n], moved[n:]
         v, u, r = ca.SX.sym("v", m), ca.SX.sym("u", p), ca.SX.sym("r", n)
         balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
-        balance -= ca.mtimes(system.mass_matrix, r)
-        outputs = {
-            "mass": system.mass_matrix,
-            "g": system.g,
-            "h": system.h,
-            "balance": ca.jacobian(balance, x),
-            "k": ca.jacobian(system.k, x),
-            "z": ca.jacobian(system.outputs(v), x),
-            "m": system.m,
-        }
-        dense = {name: ca.densify(value) for name, value in outputs.items()}
-        function = system.trace("linearization", dense, {"r": r, "v": v, "u": u}, often=False)
-        values = function(self.state, rate, force, control, self.parameters)
-        shapes = [value.shape for value in outputs.values()]
-        mass, g, h, slope, k_slope, z_slope, z_force = (
-            value.reshape(shape) for value, shape in zip(values, shapes, strict=True)
-        )
+        rows = ca.vertcat(balance - ca.mtimes(system.mass_matrix, r), system.k, system.outputs(v))
+        slopes = ca.jacobian(rows, ca.vertcat(x, v, u))
+        outputs = {"mass": ca.densify(system.mass_matrix), "slopes": ca.densify(slopes)}
+        function = system.trace("linearization", outputs, {"r": r, "v": v, "u": u}, often=False)
+        mass, whole = function(self.state, rate, force, control, self.parameters)
+        whole = whole.reshape(slopes.shape)
+        A, B, C = whole[: n + m, : n + m], whole[: n + m, n + m :], whole[n + m :, : n + m]
         # In descriptor form, in (x, v).
-        E = np.block([[mass, np.zeros((n, m))], [np.zeros((m, n + m))]])
-        A = np.block([[slope, g], [k_slope, np.zeros((m, m))]])
-        B = np.vstack([h, np.zeros((m, p))])
+        E = np.zeros((n + m, n + m))
+        E[:n, :n] = mass.reshape(n, n)
         unknowns = (*system.state_signals, *system.constraint_input_signals)
         signals = (tuple(inputs), system.output_signals)
-        no_feedthrough = np.zeros((system.num_outputs, forward.shape[1]))
-        descriptor = LinearModel(
-            E,
-            A + B @ feedback,
-            B @ forward,
-            np.hstack([z_slope, z_force]),
-            no_feedthrough,
-            unknowns,
-            *signals,
-        )
+        none = np.zeros((system.num_outputs, forward.shape[1]))
+        descriptor = LinearModel(E, A + B @ feedback, B @ forward, C, none, unknowns, *signals)
         # On N*: (dx', dv) = by_state dx + by_control du, and dv out of du.
         of_x, of_v = feedback[:, :n], feedback[:, n:]
         around = np.eye(p) - of_v @ by_control[n:]
@@ -253,8 +209,8 @@ class _PlantModel:
             np.eye(free.size),
             (by_state[:n] @ basis)[free],
             by_input[free],
-            (z_slope + z_force @ by_state[n:]) @ basis,
-            z_force @ by_input[n:],
+            (C[:, :n] + C[:, n:] @ by_state[n:]) @ basis,
+            C[:, n:] @ by_input[n:],
             tuple(system.state_signals[i] for i in free),
             *signals,
         )

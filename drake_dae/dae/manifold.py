@@ -1,6 +1,6 @@
 """The manifold N* of consistent states, and the projection onto it.                 (4)"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from math import isfinite
 
@@ -25,18 +25,6 @@ from drake_dae.trace.newton import (
     shortest_steps,
 )
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
-
-NEWTON_STEPS = 6
-"""The number of Newton steps in one function. One or two lead from the end of a simulation step to
-N*, the others reduce the error to round-off. One projection in a thousand takes more."""
-
-STAYS, FOUND, NOT_FOUND = 0.0, 1.0, 2.0
-"""The outcome of these steps: the state is already consistent, they converged to a consistent
-state, or they did not converge."""
-
-DOUBT = 0.03
-"""Gradients are checked for near dependence if the part of one that is orthogonal to those before
-it is shorter than usual by this factor."""
 
 POLE = 1e-3
 """A larger residual, over its usual change by the scale of the states, is no round-off."""
@@ -71,7 +59,6 @@ class Manifold:
         usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
         # Of the residuals: how much they change while the states change by their scale.
         self._usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
-        self._first_steps = self._trace_first_steps()
         self._settling = Settling(system, self.layout, self.gradient, self.gradients, self.residual)
 
     @property
@@ -90,11 +77,7 @@ class Manifold:
 
     @cached_property
     def short_gradient(self) -> ca.SX:
-        """`gradient`, in fewer operations where constraint forces are along the gradients.
-
-        Where q' = v, the forces g' are dk/dq, and the gradient of k' = (dk/dq) v is the derivative
-        of dk/dq along v beside dk/dq.
-        """
+        """`gradient`, in fewer operations where constraint forces are along the gradients."""
         system = self.system
         if set(self.layout.degrees) != {2}:
             return self.gradient
@@ -117,39 +100,25 @@ class Manifold:
         """The Newton step of least norm from a state, divided by the scale of the states.
 
         A function of the state, a second state at which the gradients are taken, and parameters.
+        With C the gradients and S the scale it is -(C S)' N^-1 residual, N = C S (C S)', each row
+        by its largest entry: the squares of entries may be too large for a number. An error of N^-1
+        grows with the square of the condition of C, and only makes Newton's method slower.
         """
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(self.short_gradient, state, other)
-        step = _shortest_step(gradient, ca.SX(self.scale))[0](self.residual_expression)
+        step = ca.SX(gradient.shape[1], 1)
+        if gradient.shape[0]:
+            scaled = ca.mtimes(gradient, ca.diag(ca.SX(self.scale)))
+            largest = [ca.norm_inf(row) for row in ca.vertsplit(scaled)]
+            sizes = ca.vertcat(*[ca.if_else(size > 0, size, 1) for size in largest])
+            scaled = ca.sparsify(scaled / ca.repmat(sizes, 1, scaled.shape[1]))
+            normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
+            # CasADi lets the infinities of constant gradients cancel each other.
+            regular = ca.if_else(normal.pivot > 0, 0, ca.SX.nan())
+            solved = normal.solve(self.residual_expression / sizes)
+            step = regular - ca.mtimes(scaled.T, solved)
         inputs = {"other": other}
         return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
-
-    def _trace_first_steps(self) -> TracedFunction:
-        """Traces the first Newton steps from a state, all with the gradients at that state.
-
-        The outputs are the outcome of `_followed` and the lengths of the steps (in states over
-        their scale), the state that they reach, and the first step. The result is not valid where
-        gradients are nearly dependent, by their usual lengths.
-        """
-        system = self.system
-        start, p, scale = system.state, system.parameter_symbol, ca.SX(self.scale)
-        # The steps hold them often: common subexpressions are removed once here, not from the
-        # whole.
-        expression, gradient = ca.cse([self.residual_expression, self.short_gradient])
-        function = ca.Function("residual", [start, p], [expression], {"cse": False})
-        (step_for, pivots), steps, state = _shortest_step(gradient, scale), list[ca.SX](), start
-        for _ in range(NEWTON_STEPS):
-            steps.append(scale * step_for(function(state, p)))
-            state = state + steps[-1]
-        unit = ca.fmax(scale, ca.fabs(start))
-        lengths = [ca.norm_2(step / scale) for step in steps]
-        sizes = [ca.norm_2(step / unit) for step in steps[:2]]
-        moved, outcome = _followed(start, steps, lengths, *sizes)
-        outputs = {"sizes": ca.vertcat(outcome, *lengths), "found": moved, "step": steps[0]}
-        # A cheap test in place of the sines, which are computed only where this one fails.
-        heads = [ca.fabs(pivots[i]) / self._usual[i] for i in self.layout.heads.tolist()]
-        doubt = ca.mmin(ca.vertcat(1, *heads)) - DOUBT
-        return system.trace("projection onto the manifold", outputs, doubt=doubt, lean=True)
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
     def _relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
@@ -160,12 +129,22 @@ class Manifold:
         length = np.linalg.norm(self.gradients(state, parameters) * self.scale, axis=1)
         return norm(residual / positive(length))
 
+    @np.errstate(all="ignore")
+    def _step(self, state: FloatArray, p: FloatArray) -> FloatArray | None:
+        """The Newton step in scaled states; None where the gradients are dependent or infinite."""
+        gradients = self.gradients(state, p) * self.scale
+        steps = shortest_steps(gradients, lambda z: self.residual_function.evaluate(state, p)[0])
+        if steps is None or not steps.is_regular:
+            return None
+        step = steps.step(state)
+        return step if isfinite(norm(step)) else None
+
     def is_consistent(self, state: ArrayLike, parameters: ArrayLike | None = None) -> bool:
         """Returns whether a state is on N* up to round-off: whether Newton's step is short."""
         x, p = self._state(state), self.system.parameter_vector(parameters)
-        reach = float(self._first_steps.evaluate(x, p)[0][1])
-        if isfinite(reach) and reach > 0.0:
-            is_near = reach <= CONSISTENT * norm(x / self.scale) + FLOOR
+        step = self._step(x, p)
+        if step is not None and norm(step) > 0.0:
+            is_near = norm(step) <= CONSISTENT * norm(x / self.scale) + FLOOR
             return is_near and not self._is_at_pole(x, p)
         # Dependent gradients, a residual of zero, or one that no state changes.
         return self._relative_size(x, p) <= CONSISTENT and not self._is_at_pole(x, p)
@@ -176,10 +155,10 @@ class Manifold:
         Raises:
             InconsistentStateError: Newton's method does not reach N*.
         """
-        start, p = self._state(state), self.system.parameter_vector(parameters)
-        found = self.projected(start, p)
+        p = self.system.parameter_vector(parameters)
+        found = self.projected(self._state(state), p)
         if self._is_at_pole(found, p):
-            left = self.residual_function(found, p)[0]
+            left = self.residual(found, p)
             worst = int(np.argmax(np.abs(left)))
             raise InconsistentStateError(
                 f"{self.system.name}: {self.residual_signals[worst].name} = {left[worst]:.3g} is "
@@ -188,6 +167,53 @@ class Manifold:
                 left,
             )
         return found
+
+    @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
+    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
+        """Acts as `project`, without checks; returns the start itself if it is consistent."""
+        scale, step_from = self.scale, self.newton_step.evaluate
+        step = step_from(start, start, p)[0]
+        length = norm(step)
+        if length <= ROUNDING and (length > 0.0 or not self.residual(start, p).any()):
+            return start
+        moved = start + scale * step
+        step = step_from(moved, start, p)[0]
+        left = norm(step)
+        if left * left <= PRECISION * length:  # The test of `newton`, without its overhead.
+            while ROUNDING < left < 0.5 * length:
+                moved, length = moved + scale * step, left
+                step = step_from(moved, start, p)[0]
+                left = norm(step)
+            return moved
+
+        def linearize(z: FloatArray) -> NewtonModel:
+            x = scale * z
+            return NewtonModel(lambda z: step_from(scale * z, x, p)[0].copy(), True)
+
+        first = start / scale
+        z, converged = newton(first, linearize)
+        if not converged:
+            # Gradients are dependent or steps diverge: least squares with decreasing residual.
+            z, converged = newton(first, lambda z: self._downhill(scale * z, p))
+        found: FloatArray = start + scale * (z - first)
+        # Otherwise the residual is round-off in coarse units, or no state changes it.
+        if not converged and not self._relative_size(found, p) <= CONSISTENT:
+            residual = self.residual(found, p)
+            raise InconsistentStateError(self._why(found, p, residual), residual)
+        return found
+
+    def _downhill(self, state: FloatArray, p: FloatArray) -> NewtonModel | None:
+        """Least-squares steps that decrease the residual; its rows are scaled to length one."""
+        gradients = self.gradients(state, p) * self.scale
+        length = positive(np.linalg.norm(gradients, axis=1))
+
+        def residual(z: FloatArray) -> FloatArray:
+            return self.residual_function(self.scale * z, p)[0]
+
+        steps = shortest_steps(gradients, residual)
+        if steps is None:
+            return None
+        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
 
     @np.errstate(all="ignore")  # Of a state that grew without bound.
     def _is_at_pole(self, x: FloatArray, p: FloatArray) -> bool:
@@ -202,52 +228,6 @@ class Manifold:
             for state in (x, x + NEAR_POLE[0] * away, x + NEAR_POLE[1] * away)
         )
         return not left <= POLE or bool(near > 1.0 and near > far)
-
-    def projected(self, start: FloatArray, p: FloatArray) -> FloatArray:
-        """Acts as `project`, without checks of arguments; returns the start if it is consistent."""
-        function, scale = self._first_steps, self.scale
-        sizes, moved, _ = function.evaluate(start, p)
-        outcome, first = sizes.item(0), sizes.item(1)
-        if outcome == STAYS and function.is_finite:
-            return start
-        if outcome == FOUND and function.is_finite:
-            return moved.copy()
-        if function.is_finite and first == 0.0 and not self.residual(start, p).any():
-            return start
-
-        def linearize(z: FloatArray) -> NewtonModel:
-            x = scale * z
-            step = self.newton_step
-            return NewtonModel(lambda z: step.evaluate(scale * z, x, p)[0].copy(), True)
-
-        z, converged = newton(start / scale, linearize)
-        if not converged:
-            # Gradients are dependent or steps diverge: least squares with decreasing residual.
-            z, converged = newton(start / scale, lambda z: self._downhill(scale * z, p))
-        state = scale * z
-        if converged and not np.array_equal(state, start):
-            return state
-        # Otherwise the residual is round-off in coarse units, or no state changes it.
-        if self._relative_size(state, p) <= CONSISTENT:
-            return state
-        residual = self.residual(state, p)
-        if converged and function.evaluate(state, p)[1].any():
-            return state
-        raise InconsistentStateError(self._why(state, p, residual), residual)
-
-    def _downhill(self, state: FloatArray, parameters: FloatArray) -> NewtonModel | None:
-        """Least-squares steps that decrease the residual; its rows are scaled to length one."""
-        scale = self.scale
-        gradients = self.gradients(state, parameters) * scale
-        length = positive(np.linalg.norm(gradients, axis=1))
-
-        def residual(z: FloatArray) -> FloatArray:
-            return self.residual_function(scale * z, parameters)[0]
-
-        steps = shortest_steps(gradients, residual)
-        if steps is None:
-            return None
-        return steps._replace(measure=lambda z: float(np.linalg.norm(residual(z) / length)))
 
     def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
         """Returns in words why a Newton iteration that ended at a state failed."""
@@ -278,23 +258,7 @@ class Manifold:
         parameters: ArrayLike | None = None,
         fixed: Sequence[str] = (),
     ) -> FloatArray:
-        """Returns the consistent state next to a user's start, computed level by level.
-
-        The constraints are met first, by the states that they depend on; then their derivatives, by
-        the states that are new in them, and so on: positions first, then velocities, so that no
-        velocity moves a position. Velocities that are not zero are kept where the constraints allow
-        it, and the others follow. If Newton's method does not reach N*, it starts again from random
-        states, at first near the given one.
-
-        Args:
-            state: A state near N*, shape (n,).
-            parameters: Values of all parameters; the defaults if None.
-            fixed: Names of states that keep their values.
-
-        Raises:
-            InconsistentStateError: N* is not reached, or not with these states fixed.
-            ModelError: There is no such state, or a shape is wrong.
-        """
+        """Returns the consistent state next to a user's start, computed level by level."""
         start, p = self._state(state), self.system.parameter_vector(parameters)
         names = [signal.name for signal in self.system.state_signals]
         for name in fixed:
@@ -303,8 +267,8 @@ class Manifold:
         residual = self.residual(start, p)
         if not residual.any():
             return start
-        outcome, first = self._first_steps.evaluate(start, p)[0][:2]
-        is_there = self._first_steps.is_finite and outcome != NOT_FOUND and 0.0 < first <= FLOOR
+        step = self._step(start, p)
+        is_there = step is not None and 0.0 < norm(step) <= FLOOR
         if is_there and not self._is_at_pole(start, p):
             return self.project(start, p)  # It was there up to round-off, which no level moves.
         chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
@@ -348,51 +312,6 @@ class Manifold:
         return x
 
 
-def _followed(
-    start: ca.SX, steps: Sequence[ca.SX], lengths: Sequence[ca.SX], size: ca.SX, left: ca.SX
-) -> tuple[ca.SX, ca.SX]:
-    """The state that `newton` reaches by these first steps, and the outcome."""
-    # Newton's method ends at the start, or after its first step; then it is polished.
-    at_start = size <= ROUNDING
-    after_one = ca.logic_and(ca.logic_not(at_start), left * left <= PRECISION * size)
-    goes_on = ca.logic_and(at_start, lengths[0] > 0)
-    moved = start + ca.if_else(ca.logic_or(after_one, goes_on), steps[0], 0)
-    for number in range(1, len(steps)):
-        shorter = ca.logic_and(goes_on, lengths[number] < 0.5 * lengths[number - 1])
-        goes_on = shorter if number > 1 else ca.logic_or(after_one, shorter)
-        goes_on = ca.logic_and(goes_on, lengths[number] > 0)
-        moved += ca.if_else(goes_on, steps[number], 0)
-    ends = ca.logic_and(ca.logic_or(at_start, after_one), ca.logic_not(goes_on))
-    # A first step of length zero does not tell whether the start is consistent.
-    moves = ca.logic_or(after_one, lengths[0] > 0)
-    outcome = ca.if_else(ca.logic_and(ends, moves), FOUND, NOT_FOUND)
-    stays = ca.logic_and(lengths[0] > 0, lengths[0] <= ROUNDING)
-    return moved, ca.if_else(stays, STAYS, outcome)
-
-
-def _shortest_step(
-    gradient: ca.SX, scale: ca.SX
-) -> tuple[Callable[[ca.SX], ca.SX], Sequence[ca.SX]]:
-    """residual -> the shortest dz with C S dz = -residual, where dx = S dz and S is the scale.
-
-    It is -(C S)' N^-1 residual with N = C S (C S)', each row by its largest entry. An error of N^-1
-    grows with the square of the condition of C, and only makes Newton's method slower. The lengths
-    of the parts of the gradients that are orthogonal to those before are returned as well.
-    """
-    if not gradient.shape[0]:
-        return (lambda residual: ca.SX(gradient.shape[1], 1)), ()
-    scaled = ca.mtimes(gradient, ca.diag(scale))
-    # By their largest entries: the squares of entries may be too large for a number.
-    largest = [ca.norm_inf(row) for row in ca.vertsplit(scaled)]
-    sizes = ca.vertcat(*[ca.if_else(size > 0, size, 1) for size in largest])
-    scaled = ca.sparsify(scaled / ca.repmat(sizes, 1, scaled.shape[1]))
-    normal = PositiveDefiniteFactorization(ca.mtimes(scaled, scaled.T))
-    lengths = [size * length for size, length in zip(largest, normal.lengths, strict=True)]
-    # CasADi lets the infinities of constant gradients cancel each other.
-    regular = ca.if_else(normal.pivot > 0, 0, ca.SX.nan())
-    return lambda residual: regular - ca.mtimes(scaled.T, normal.solve(residual / sizes)), lengths
-
-
 def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
     """Returns a basis T of the tangent space, orthonormal in scaled states, shape (n, n - k)."""
     rows = unit_rows(gradients * scale)
@@ -400,10 +319,7 @@ def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:
 
 
 def coordinates(gradients: FloatArray, scale: FloatArray) -> tuple[Indices, FloatArray]:
-    """Returns n - k states that are coordinates, and the derivatives of all states by them.
-
-    Unlike an orthonormal basis this one leaves a triangular system triangular.
-    """
+    """Returns n - k states that are coordinates, and the derivatives of all states by them."""
     basis = tangent(gradients, scale) / scale[:, None]
     count = basis.shape[1]
     free = np.sort(scipy.linalg.qr(basis.T, mode="r", pivoting=True)[1][:count])

@@ -1,19 +1,17 @@
 """Margins: how far a matrix of the state is from losing its rank, and friction from the paradox."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.contacts import critical_factor
-from drake_dae.dae.samples import ConsistentRegion, Samples
+from drake_dae.dae.samples import Samples
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError
-from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import SINGULAR, equilibration, smallest_singular_value
+from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
 MEANINGLESS = 1e6
 """Critical coefficients above this are meaningless: they occur where sliding is only round-off."""
@@ -22,29 +20,25 @@ CLOSER = (0.9, 0.99)
 """The fractions of the lowest critical friction so far for which a paradoxical state is sought."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RankMargin:
-    """The distance of a matrix from losing its rank.
+    """The distance of a matrix from losing its rank."""
 
-    Attributes:
-        singular_value: The smallest singular value at the examined states.
-        relative: The same of the matrix with rows and columns scaled to about length one.
-        state: The state where `relative` is, shape (n,).
-        matrix: The matrix there.
-        vanishing_row: The row that vanishes there, if one does.
-        least: The value of `relative` below which the matrix counts as singular.
-    """
-
-    singular_value: float
-    relative: float
-    state: FloatArray
-    matrix: FloatArray = field(compare=False, repr=False)
-    vanishing_row: int | None = None
-    least: float = SINGULAR
+    singular_value: float  # The smallest one at the examined states.
+    relative: float  # The same of the matrix with rows and columns scaled to about length one.
+    state: FloatArray  # Where `relative` is, shape (n,).
+    matrix: FloatArray  # There.
+    vanishing_row: int | None  # The row that vanishes there, if one does.
+    least: float  # The value of `relative` below which the matrix counts as singular.
+    at_samples: float  # The least `relative` at the samples themselves.
 
     @property
     def is_singular(self) -> bool:
         return self.relative < self.least
+
+    @property
+    def is_regular_at_samples(self) -> bool:
+        return self.at_samples >= self.least
 
 
 def find_margin(
@@ -55,120 +49,93 @@ def find_margin(
     If the determinant of a square matrix changes its sign on the way from the first state, it is
     zero on that way, unless N* is not connected or the determinant is infinite.
     """
-    scaled = _ScaledMatrix(samples, matrix, round_off)
+    system, whole = samples.system, ca.SX(matrix)
+    for i, j in np.argwhere(round_off) if round_off is not None else ():
+        whole[int(i), int(j)] = 0.0
+    whole = ca.sparsify(whole)
+    function = system.trace("margin", {"matrix": whole}, often=False)
+    sizes = np.mean([np.abs(value) for (value,) in samples.values(matrix=whole)], axis=0)
+    rows, columns = equilibration(sizes)
+
+    def plain(state: FloatArray) -> FloatArray:
+        return function(state, system.parameter_values)[0].reshape(matrix.shape)
+
+    def scaled(state: FloatArray) -> FloatArray:
+        return plain(state) / rows[:, None] / columns
+
+    def distance(state: FloatArray) -> float:
+        value = scaled(state)
+        return smallest_singular_value(value) if np.all(np.isfinite(value)) else np.inf
+
     candidates = list(samples.states)
     if matrix.is_square():
         crossings = (_crossing(samples, scaled, there) for there in samples.states[1:])
         candidates += [state for state in crossings if state is not None]
-    distances = [scaled.distance(state) for state in candidates]
+    distances = [distance(state) for state in candidates]
     if search:
+        a, b = ca.SX.sym("a", matrix.shape[0]), ca.SX.sym("b", matrix.shape[1])
+        outputs = {"gradient": ca.gradient(ca.bilin(whole, a, b), system.state)}
+        gradient = system.trace("slope of a margin", outputs, {"a": a, "b": b}, often=False)
+
+        def slope(state: FloatArray) -> tuple[float, FloatArray]:
+            """The smallest singular value s and its gradient d(a' M b)/dx, where M b = s a."""
+            value = scaled(state)
+            if not np.all(np.isfinite(value)):
+                return np.inf, np.zeros(state.size)
+            left, values, right = np.linalg.svd(value, full_matrices=False)
+            pair = left[:, -1] / rows, right[-1] / columns
+            along = gradient(state, *pair, system.parameter_values)[0]
+            return float(values[-1]), np.where(np.isfinite(along), along, 0.0)
+
         box = samples.surroundings()
         starts = np.argsort(distances, kind="stable")[:3]
-        lowest = [box.descend(scaled.slope, candidates[start]) for start in starts]
+        lowest = [box.descend(samples.manifold, slope, candidates[start]) for start in starts]
         candidates += lowest
-        distances += [scaled.distance(state) for state in lowest]
-    relative = min(distances)
-    state = candidates[distances.index(relative)]
-    length = np.linalg.norm(scaled(state), axis=1)
-    least = samples.system.least_margin
+        distances += [distance(state) for state in lowest]
+    state = candidates[int(np.argmin(distances))]
+    length, least = np.linalg.norm(scaled(state), axis=1), system.least_margin
     return RankMargin(
-        singular_value=min(smallest_singular_value(scaled.plain(x)) for x in candidates),
-        relative=relative,
+        singular_value=min(smallest_singular_value(plain(x)) for x in candidates),
+        relative=min(distances),
         state=state,
-        matrix=scaled.plain(state),
+        matrix=plain(state),
         vanishing_row=int(np.argmin(length)) if length.min() < least else None,
         least=least,
+        at_samples=min(distances[: len(samples.states)]),
     )
 
 
-def is_regular(samples: Samples, matrix: ca.SX, round_off: Booleans | None = None) -> bool:
-    """Returns whether a square matrix is regular at every sampled state."""
-    scaled, least = _ScaledMatrix(samples, matrix, round_off), samples.system.least_margin
-    return all(scaled.distance(state) >= least for state in samples.states)
-
-
-def _crossing(samples: Samples, matrix: "_ScaledMatrix", there: FloatArray) -> FloatArray | None:
+def _crossing(
+    samples: Samples, matrix: Callable[[FloatArray], FloatArray], there: FloatArray
+) -> FloatArray | None:
     """A state where the determinant changes its sign on the way from the first state."""
     here = samples.states[0]
-    start = matrix.sign(here)
-    if matrix.sign(there) == start:
+    start = np.linalg.slogdet(matrix(here))[0]
+    if np.linalg.slogdet(matrix(there))[0] == start:
         return None
     for _ in range(60):
         try:
             middle = samples.manifold.project((here + there) / 2.0)
         except InconsistentStateError:
             return None
-        if not np.all(np.isfinite(matrix(middle))):
+        value = matrix(middle)
+        if not np.all(np.isfinite(value)):
             return None
-        if matrix.sign(middle) == start:
+        if np.linalg.slogdet(value)[0] == start:
             here = middle
         else:
             there = middle
     return here
 
 
-class _ScaledMatrix:
-    """A matrix of the state, rows and columns scaled to about length one over all samples."""
-
-    def __init__(self, samples: Samples, matrix: ca.SX, round_off: Booleans | None) -> None:
-        self._system, whole = samples.system, ca.SX(matrix)
-        for i, j in np.argwhere(round_off) if round_off is not None else ():
-            whole[int(i), int(j)] = 0.0
-        self._matrix = matrix = ca.sparsify(whole)
-        self._function = samples.system.trace("margin", {"matrix": matrix}, often=False)
-        sizes = np.mean([np.abs(value) for (value,) in samples.values(matrix=matrix)], axis=0)
-        self._rows, self._columns = equilibration(sizes)
-
-    def plain(self, state: FloatArray) -> FloatArray:
-        value = self._function(state, self._system.parameter_values)[0]
-        return value.reshape(self._matrix.shape)
-
-    def __call__(self, state: FloatArray) -> FloatArray:
-        return self.plain(state) / self._rows[:, None] / self._columns
-
-    def sign(self, state: FloatArray) -> float:
-        """The sign of the determinant."""
-        return float(np.linalg.slogdet(self(state))[0])
-
-    def distance(self, state: FloatArray) -> float:
-        """The smallest singular value; infinite where the matrix is not finite."""
-        value = self(state)
-        return smallest_singular_value(value) if np.all(np.isfinite(value)) else np.inf
-
-    def slope(self, state: FloatArray) -> tuple[float, FloatArray]:
-        """The smallest singular value s and its gradient d(a' M b)/dx, where M b = s a."""
-        value = self(state)
-        if not np.all(np.isfinite(value)):
-            return np.inf, np.zeros(state.size)
-        left, values, right = np.linalg.svd(value, full_matrices=False)
-        a, b = left[:, -1] / self._rows, right[-1] / self._columns
-        gradient = self._gradient(state, a, b, self._system.parameter_values)[0]
-        return float(values[-1]), np.where(np.isfinite(gradient), gradient, 0.0)
-
-    @cached_property
-    def _gradient(self) -> TracedFunction:
-        rows, columns = self._matrix.shape
-        a, b = ca.SX.sym("a", rows), ca.SX.sym("b", columns)
-        product = ca.gradient(ca.bilin(self._matrix, a, b), self._system.state)
-        outputs, inputs = {"gradient": product}, {"a": a, "b": b}
-        return self._system.trace("slope of a margin", outputs, inputs, often=False)
-
-
 @dataclass(frozen=True, eq=False)
 class ContactMargin:
-    """The distance of frictional contacts from the Painleve paradox, over some states.
+    """The distance of frictional contacts from the Painleve paradox, over some states."""
 
-    Attributes:
-        reserve: The smallest principal minor of A(x), relative to its value without friction.
-        critical_friction: Name of a coefficient -> the lowest value with the paradox.
-        state: The state where, shape (n,).
-        time: The time in s, along a motion.
-    """
-
-    reserve: float
-    critical_friction: dict[str, float]
-    state: FloatArray
-    time: float | None = None
+    reserve: float  # The smallest principal minor of A(x), relative to that without friction.
+    critical_friction: dict[str, float]  # Coefficient -> the lowest value with the paradox.
+    state: FloatArray  # Where, shape (n,).
+    time: float | None = None  # In s, along a motion.
 
     @property
     def is_paradoxical(self) -> bool:
@@ -198,7 +165,7 @@ class ContactMargins:
         self, state: FloatArray, parameters: FloatArray, time: float | None = None
     ) -> ContactMargin:
         """Returns the margin at one state, for values of all parameters."""
-        unit, size = self._direction(parameters), len(self._system.constraint_input_signals)
+        unit, size = self._direction(parameters), self._system.num_constraints
         reserve = self._values(state, parameters)[1]
         A_0, A_1 = (
             self._values(state, self._with_friction(parameters, s * unit))[0].reshape(size, size)
@@ -214,10 +181,8 @@ class ContactMargins:
         """Returns the smallest margin at samples and, downhill from the worst, between them."""
         p = self._system.parameter_values
         margins = sorted((self.at(state, p) for state in samples.states), key=_lowest)
-        if search:
-            box = samples.surroundings()
-            margins += [m for start in margins[:3] for m in self._downhill(box, start, p)]
-        return min(margins, key=_lowest)
+        starts = margins[:3] if search else []
+        return min([margins[0], *(self._downhill(samples, m, p) for m in starts)], key=_lowest)
 
     def along(self, times: FloatArray, states: FloatArray, parameters: FloatArray) -> ContactMargin:
         """Returns the smallest margin along a motion of at least one state."""
@@ -225,26 +190,28 @@ class ContactMargins:
         return min((self.at(*row) for row in rows), key=_lowest)
 
     def _downhill(
-        self, box: ConsistentRegion, start: ContactMargin, parameters: FloatArray
-    ) -> Iterator[ContactMargin]:
-        """States in the Painleve paradox with decreasing friction."""
-        unit, best = self._direction(parameters), start
+        self, samples: Samples, best: ContactMargin, parameters: FloatArray
+    ) -> ContactMargin:
+        """The margin at a state in the Painleve paradox with as little friction as can be found."""
+        box, unit = samples.surroundings(), self._direction(parameters)
+
+        def reserve(state: FloatArray) -> tuple[float, FloatArray]:
+            """The margin as far as it is positive, and its gradient."""
+            margin, gradient = self._slope(state, values)
+            if not self._slope.is_finite:
+                return np.inf, np.zeros(state.size)
+            return max(float(margin.item()), 0.0), gradient
+
         for part in CLOSER:
             for _ in range(20):
                 size = part * best.lowest if np.isfinite(best.lowest) else 1e3
                 values = self._with_friction(parameters, size * unit / max(unit))
-                lower = self.at(box.descend(partial(self._reserve, values), best.state), parameters)
+                state = box.descend(samples.manifold, reserve, best.state)
+                lower = self.at(state, parameters)
                 if not lower.lowest < best.lowest:
                     break
                 best = lower
-                yield best
-
-    def _reserve(self, parameters: FloatArray, state: FloatArray) -> tuple[float, FloatArray]:
-        """The margin as far as it is positive, and its gradient."""
-        margin, gradient = self._slope(state, parameters)
-        if not self._slope.is_finite:
-            return np.inf, np.zeros(state.size)
-        return max(float(margin.item()), 0.0), gradient
+        return best
 
     def _direction(self, parameters: FloatArray) -> FloatArray:
         """The coefficients of friction, or ones if all are zero."""

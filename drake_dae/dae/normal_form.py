@@ -1,18 +1,15 @@
 """The normal form: constraint chains, output chains, and their completion.          (20)-(24)"""
 
-from collections.abc import Callable, Iterator, Sequence
-
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg.lapack import dgetrf, dgetrs
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, show, vector
 from drake_dae.dae.margins import RankMargin, find_margin
 from drake_dae.dae.samples import Samples
 from drake_dae.dae.signals import Signal
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.expressions import find_flaw
@@ -47,20 +44,19 @@ class NormalForm:
         system: The system (1)-(3).
         completion: xi as expressions of the state (and parameters), shape (d, 1) with
             d = n - sum r_i - sum mu_i. Chosen if None: states that complete the chains well at
-            all of `structure.states`; if none do, linear combinations of states.
+            all of `structure.states`.
         structure: The structure of the system; found if None.
 
     Attributes:
         structure: The structure of the system.
         completion: xi, shape (d, 1).
-        completion_signals: Names and units of xi. A chosen one is its own name: "x3", or
-            "x0 - 0.5 x1".
+        completion_signals: Names and units of xi.
         coordinate_signals: Names and units of (y, zeta, xi), n in all.
         margin: The margin of the Jacobian of Phi over `structure.states`.
 
     Raises:
         ModelError: The completion does not fit, or its differentials are not independent of each
-            other and of the chains; or B(x) is singular.
+            other and of the chains; no states complete them; or B(x) is singular.
     """
 
     def __init__(
@@ -70,7 +66,7 @@ class NormalForm:
         *,
         structure: Structure | None = None,
     ) -> None:
-        structure = structure_of("NormalForm", system, structure)
+        structure = structure_of("NormalForm", system, structure, find_structure)
         self.structure = structure
         self.system = system
         residual = structure.manifold.residual_expression
@@ -93,11 +89,8 @@ class NormalForm:
             *self.completion_signals,
         )
         coordinates = ca.vertcat(chains, self.completion)  # (20)
-        self._coordinates = system.trace("normal form", {"coordinates": coordinates})
-        self._map = system.trace(
-            "normal form and Jacobian",
-            {"coordinates": coordinates, "jacobian": ca.jacobian(coordinates, system.state)},
-        )
+        outputs = {"y": coordinates, "jacobian": ca.jacobian(coordinates, system.state)}
+        self._map = system.trace("normal form and Jacobian", outputs)
         # Not the scale of `samples`, in which a state that is zero on N* is round-off.
         self._scale = structure.scale
 
@@ -107,8 +100,8 @@ class NormalForm:
 
     def coordinates(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns Phi(x) = (y, zeta, xi) of (20)-(22), for x on N* or not."""
-        x = self.system.state_vector(state)
-        return self._coordinates(x, self.system.parameter_vector(parameters))[0]
+        x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
+        return self._at(x, p)[0]
 
     def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns dPhi/dx, shape (n, n); it is singular where Phi is no change of coordinates."""
@@ -197,14 +190,21 @@ class NormalForm:
         # Powers of 2, so that nothing is rounded.
         scale = np.exp2(np.ceil(np.log2(np.maximum(self._scale, np.abs(state)))))
 
-        def distance(z: FloatArray) -> FloatArray:
-            return target - self._coordinates.evaluate(scale * z, parameters)[0]
-
         def linearize(z: FloatArray) -> NewtonModel | None:
-            solve = _solver(self._at(scale * z, parameters)[1] * scale)
-            if solve is None:
+            matrix = self._at(scale * z, parameters)[1] * scale
+            rows = np.abs(matrix).max(axis=1)
+            if not (rows.min() > 0.0 and rows.max() < np.inf):
                 return None
-            return NewtonModel(lambda z: solve(distance(z)), True)
+            try:
+                inverse = np.linalg.inv(matrix / rows[:, None])
+            except np.linalg.LinAlgError:
+                return None
+
+            def step(z: FloatArray) -> FloatArray:
+                missing = target - self._map.evaluate(scale * z, parameters)[0]
+                return np.asarray(inverse @ (missing / rows))
+
+            return NewtonModel(step, True)
 
         solution, converged = newton(state / scale, linearize)
         return scale * solution if converged else None
@@ -213,15 +213,6 @@ class NormalForm:
         """Phi and its Jacobian at a state."""
         values, jacobian = self._map(state, parameters)
         return values, jacobian.reshape(values.size, -1)
-
-
-def _solver(matrix: FloatArray) -> Callable[[FloatArray], FloatArray] | None:
-    """b -> M^-1 b; None if M is singular, or not finite."""
-    rows = np.abs(matrix).max(axis=1)
-    if not (rows.min() > 0.0 and rows.max() < np.inf):
-        return None
-    factors, pivots, info = dgetrf(matrix / rows[:, None])
-    return None if info else lambda right: dgetrs(factors, pivots, right / rows)[0]
 
 
 def _checked_completion(
@@ -245,7 +236,11 @@ def _checked_completion(
     flaw = find_flaw(xi, system.state, system.parameter_symbol, "the state")
     if flaw:
         raise ModelError(f"{system.name}: the completion {flaw}")
-    signals = tuple(_signal_of(entry, f"xi{i}", system) for i, entry in enumerate(ca.vertsplit(xi)))
+    states = dict(zip(system.state_signals, ca.vertsplit(system.state), strict=True))
+    signals = tuple(
+        next((s for s, state in states.items() if ca.is_equal(entry, state)), Signal(f"xi{i}"))
+        for i, entry in enumerate(ca.vertsplit(xi))
+    )
     gradient = ca.jacobian(ca.vertcat(chains, xi), system.state)
     margin = find_margin(samples, gradient)
     if not margin.is_singular:
@@ -256,12 +251,9 @@ def _checked_completion(
             f"{show(margin.state)}: A(x) of Assumption (2) or B(x) of (16) is close to singular "
             "there"
         )
-    # A row that vanishes at a state has no direction there; else by the distance of each
-    # differential from the span of those before it.
-    worst = -1 if margin.vanishing_row is None else margin.vanishing_row - chains.numel()
-    if worst < 0:
-        rows = unit_rows(margin.matrix * samples.scale)
-        worst = int(np.argmin(np.abs(np.diag(np.linalg.qr(rows.T)[1]))[-count:]))
+    # By the distance of each differential from the span of those before it.
+    distances = np.abs(np.diag(np.linalg.qr((margin.matrix * samples.scale).T)[1]))
+    worst = int(np.argmin(distances[-count:]))
     raise ModelError(
         f"{system.name}: the completion '{signals[worst].name}' = "
         f"{str(xi[worst])[:60]} is not independent of the chains and of the rest of the "
@@ -270,70 +262,29 @@ def _checked_completion(
     )
 
 
-def _signal_of(expression: ca.SX, name: str, system: DaeSystem) -> Signal:
-    """The signal of the state that an expression is, or one of a given name."""
-    for signal, state in zip(system.state_signals, ca.vertsplit(system.state), strict=True):
-        if ca.is_equal(expression, state):
-            return signal
-    return Signal(name)
-
-
 def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
-    """Single states whose differentials complete those of the chains, or else linear combinations.
+    """States whose differentials complete those of the chains well at all samples.
 
-    They complete them if they are regular on the null spaces of the chains' differentials. The
-    arguments are those of `_checked_completion`.
+    They are regular on the null spaces of the chains' differentials: one QR with pivoting for all.
     """
     system, count = structure.system, structure.zero_dynamics_dimension
-    if not count:
-        return _checked_completion(structure, chains, samples, ca.SX(0, 1))
     gradients = samples.values(gradient=ca.jacobian(chains, system.state))
     spaces = np.array(
-        [np.linalg.svd(unit_rows(g * samples.scale))[2][-count:].T for (g,) in gradients]
+        [
+            np.linalg.svd(unit_rows(g * samples.scale))[2][system.num_states - count :].T
+            for (g,) in gradients
+        ]
     )
-    for matrix in _candidates(spaces):
-        matrix = matrix / samples.scale
+    rest, chosen = spaces.copy(), list[int]()
+    for _ in range(count):
         # Rounded, so that ties go to the first state on every machine.
-        largest = np.argmax(np.round(unit_rows(np.abs(matrix)), 6), axis=1)
-        leading = matrix[np.arange(count), largest]
-        factors = np.vectorize(lambda c: float(f"{c:.3g}"))(matrix / leading[:, None])
-        xi = ca.mtimes(ca.sparsify(ca.SX(factors)), system.state)
-        margin = find_margin(samples, ca.jacobian(ca.vertcat(chains, xi), system.state))
-        if not margin.is_singular:
-            return xi, tuple(_combination(row, system.state_signals) for row in factors), margin
-    raise ModelError(
-        f"{system.name}: no linear combinations of states complete the chains (20) at all states "
-        f"around the nominal one; give a completion of {count} expressions"
-    )
-
-
-def _candidates(spaces: FloatArray) -> Iterator[FloatArray]:
-    """Combinations of states, shape (d, n), that are regular on all spaces, shape (k, n, d)."""
-    count = spaces.shape[2]
-    single = _pivots(spaces)
-    if np.linalg.svd(spaces[:, single], compute_uv=False).min() > TRANSVERSAL:
-        yield np.eye(spaces.shape[1])[single]
-    # The space that is nearest to all of them, in the basis that is the identity on its pivots.
-    mean = np.linalg.eigh(np.einsum("kid,kjd->ij", spaces, spaces))[1][:, -count:]
-    basis = np.linalg.solve(mean[_pivots(mean[None])].T, mean.T)
-    yield np.where(np.abs(basis) > 0.02, basis, 0.0)
-
-
-def _pivots(spaces: FloatArray) -> list[int]:
-    """States whose rows are far from dependent in all spaces: one QR with pivoting for all."""
-    rest, chosen = spaces.copy(), []
-    for _ in range(spaces.shape[2]):
-        # Rounded, as above.
         chosen.append(int(np.argmax(np.round(np.linalg.norm(rest, axis=2).min(axis=0), 6))))
         direction = unit_rows(rest[:, chosen[-1]])
         rest -= np.einsum("kid,kd,ke->kie", rest, direction, direction)
-    return sorted(chosen)
-
-
-def _combination(factors: FloatArray, signals: Sequence[Signal]) -> Signal:
-    """A signal named like the combination, such as "x0 - 0.5 x1"."""
-    terms = [(c, signal) for c, signal in zip(factors, signals, strict=True) if c]
-    units = {signal.unit for _, signal in terms}
-    sign = {1.0: "", -1.0: "-"}
-    name = " + ".join(sign.get(c, f"{c:.3g} ") + signal.name for c, signal in terms)
-    return Signal(name.replace("+ -", "- "), units.pop() if len(units) == 1 else "")
+    sines = np.linalg.svd(spaces[:, sorted(chosen)], compute_uv=False)
+    if sines.min(initial=1.0) <= TRANSVERSAL:
+        raise ModelError(
+            f"{system.name}: no states complete the chains (20) at all states around the nominal "
+            f"one; give a completion of {count} expressions"
+        )
+    return _checked_completion(structure, chains, samples, system.state[sorted(chosen), :])

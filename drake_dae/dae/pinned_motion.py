@@ -1,16 +1,33 @@
-"""The motion with the outputs on a reference, and why it ends, as values.          (35)-(36)"""
+"""States whose outputs are on a reference, their motion, and why it ends.      (28), (35)-(36)
+
+Pinned outputs leave the states
+
+    Z(R) = {x in N*: L_f*^j l*_i(x) = r_i^(j), j = 0, ..., mu_i - 1},
+
+and the control u = B^-1 (-a + r^(mu)), which is (28) without an error; with more controls than
+outputs, the system's metric chooses u. On Z(R) the state moves by x' = f* + h* u.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
+import casadi as ca
 import numpy as np
 import scipy  # SciPy loads its large parts when they are used.
 
 from drake_dae.arrays import FloatArray, numbers, show
-from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedPoint, PinnedSet
+from drake_dae.dae.settling import CONSISTENT
+from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.expressions import result_of
+from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
+from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
+
+VANISHED = 1e-9
+"""A or B counts as singular below this fraction of its usual margin, also if it is a single
+number."""
 
 TOLERANCE = 1e-6
 """The tolerance of an integration step; the method overestimates its error by two orders."""
@@ -34,6 +51,216 @@ TimeFunction = Callable[[float], FloatArray]
 """t -> R(t) = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), or t -> values of all parameters."""
 
 
+@dataclass(frozen=True, eq=False)
+class PinnedPoint:
+    """A state on Z(R) with x', u, v, A of Assumption (2) and B of (5), which may be infinite."""
+
+    state: FloatArray
+    rate: FloatArray
+    control: FloatArray
+    constraint_input: FloatArray
+    A: FloatArray
+    B: FloatArray
+    pivot: FloatArray  # 0 exactly where A or B is singular.
+    unrest: FloatArray  # |E x'| relative to its terms.
+
+    @cached_property
+    def margins(self) -> tuple[float, float]:
+        """The smallest singular values of A and B; infinite without constraints."""
+
+        def margin(matrix: FloatArray) -> float:
+            if matrix.size == 1:  # A(x) of one contact; LAPACK takes twenty times as long.
+                return abs(matrix.item())
+            values = np.linalg.svd(matrix, compute_uv=False)
+            return float(np.min(values, initial=np.inf))
+
+        return margin(self.A), margin(self.B)
+
+    @cached_property
+    def signs(self) -> tuple[float, ...]:
+        """The signs of det A and det B; a matrix that is not square has none."""
+        matrices = [matrix for matrix in (self.A, self.B) if len(matrix) == matrix.shape[1]]
+        return tuple(float(np.linalg.slogdet(matrix)[0]) for matrix in matrices)
+
+
+class PinnedOutputs:
+    """Z(R) and the motion on it, for all R; `at` is that for one."""
+
+    def __init__(self, structure: Structure) -> None:
+        self.structure = structure
+        self.system = system = structure.system
+        self.layout = layout = structure.layout
+        self._R = goal = ca.SX.sym("R", layout.reference_size)
+        self.residual_signals = (
+            *structure.manifold.residual_signals,
+            *layout.chain_signals(system.output_signals),
+        )
+        errors = structure.chain - goal[layout.chained.tolist(), :]
+        residual = ca.vertcat(structure.manifold.residual_expression, errors)  # (36)
+        derivatives, highest = structure.derivatives, goal[layout.highest.tolist(), :]
+        control, pivot = structure.control_by_matrix(highest)
+        self._rate, constraint_input = (  # (35)
+            ca.substitute(derivatives.expand(unknown), derivatives.control, control)
+            for unknown in (derivatives.rate, derivatives.constraint_input)
+        )
+        inputs = {"reference": goal}
+        self.residual = system.trace("pinned outputs", {"residual": residual}, inputs)
+        self.gradient = system.trace(
+            "gradient of the pinned outputs",
+            {"gradient": ca.jacobian(ca.cse(residual), system.state)},
+            often=False,  # Common subexpressions are removed already.
+        )
+        # E x' = f + g v + h u, and the sizes of its terms, which cancel at rest.
+        mass, g, h = (ca.fabs(e) for e in (system.mass_matrix, system.g, system.h))
+        states = ca.fmax(ca.DM(system.scale), ca.fabs(system.state))
+        sizes = ca.mtimes(mass, states) + ca.fabs(system.f)
+        sizes += ca.mtimes(g, ca.fabs(constraint_input)) + ca.mtimes(h, ca.fabs(control))
+        motion = {
+            "rate": self._rate,
+            "control": control,
+            "constraint_input": constraint_input,
+            "constraint_matrix": structure.elimination.constraint_matrix,
+            "control_matrix": structure.control_matrix,
+            "pivot": ca.fmin(pivot, structure.elimination.pivot),
+            "unrest": ca.fabs(ca.mtimes(system.mass_matrix, self._rate)) / sizes,
+        }
+        self.motion = system.trace("pinned motion", motion, inputs)
+
+    def at(self, reference: FloatArray, parameters: FloatArray) -> "PinnedSet":
+        """Returns Z(R) for one R and values of all parameters."""
+        return PinnedSet(self, reference, parameters)
+
+    def at_time(
+        self, reference: TimeFunction, parameters: TimeFunction, time: float
+    ) -> "PinnedSet":
+        """Returns Z(R(t)); raises NonFiniteError where R(t) is not finite."""
+        value = result_of("reference", reference, time)
+        goal = numbers(f"reference({time:g})", value).reshape(-1)
+        if goal.size != self.layout.reference_size:
+            raise ModelError(
+                f"{self.system.name}: the reference must have size {self.layout.reference_size} "
+                f"(each output and its derivatives up to its degree {self.layout.degrees}), got "
+                f"{goal.size}"
+            )
+        if not np.all(np.isfinite(goal)):
+            text = f"{self.system.name}: the reference is not finite at t = {time:.6g} s"
+            raise NonFiniteError(text, time, goal)
+        return self.at(goal, parameters(time))
+
+    @cached_property
+    def slope(self) -> TracedFunction:
+        """The derivative of x' along a direction of state and reference."""
+        system, dr = self.system, ca.SX.sym("dR", self.layout.reference_size)
+        dx = ca.SX.sym("dx", system.num_states)
+        at, along = ca.vertcat(system.state, self._R), ca.vertcat(dx, dr)
+        slopes = {"rate": ca.jtimes(ca.cse(self._rate), at, along)}
+        inputs = {"reference": self._R, "dx": dx, "dR": dr}
+        return system.trace("slope of the pinned motion", slopes, inputs, often=False)
+
+    @cached_property
+    def usual_margins(self) -> tuple[float, float]:
+        """The largest margins of A and B at the states of the structure."""
+        still = self.at(np.zeros(self.layout.reference_size), self.system.parameter_values)
+        margins = [still.point(state).margins for state in self.structure.states]
+        return max(a for a, _ in margins), max(b for _, b in margins)
+
+
+@dataclass(frozen=True, eq=False)
+class PinnedSet:
+    """Z(R) for one R and values of all parameters."""
+
+    outputs: PinnedOutputs
+    reference: FloatArray
+    parameters: FloatArray
+
+    def state(self, guess: FloatArray) -> FloatArray:
+        """Returns a state near a guess, to round-off, or raises InconsistentStateError."""
+        system = self.outputs.system
+        state, converged = self.project(guess)
+        if converged:
+            return state
+        residual = self.residual(state)
+        length = np.linalg.norm(self.gradients(state) * system.scale, axis=1)
+        missed = np.abs(residual) / np.where(length > 0.0, length, 1.0)
+        worst = int(np.argmax(missed))
+        if not np.all(np.isfinite(residual)):
+            why = "have no value near the given state; start inside the domain of the system"
+        elif missed[worst] <= CONSISTENT:
+            why = f"lead to x = {show(state)}, where A(x) or B(x) is singular"
+        else:
+            why = (
+                f"are not reached near the given state: {self.outputs.residual_signals[worst].name}"
+                f" stays off by {residual[worst]:.3g}. Request outputs within reach, or start "
+                "closer to a state with these outputs"
+            )
+        raise InconsistentStateError(f"{system.name}: {self.describe()} {why}", residual)
+
+    def project(self, start: FloatArray) -> tuple[FloatArray, bool]:
+        """Returns the closest state to a start, and whether Newton's method converged."""
+        scale, trace = self.outputs.system.scale, self.outputs.residual
+
+        def residual(z: FloatArray) -> FloatArray:
+            return trace.evaluate(scale * z, self.reference, self.parameters)[0]
+
+        def linearize(z: FloatArray) -> NewtonModel | None:
+            return shortest_steps(self.gradients(scale * z) * scale, residual)
+
+        z, converged = newton(start / scale, linearize)
+        return scale * z, converged
+
+    def describe(self) -> str:
+        """Returns the outputs as text."""
+        values = self.outputs.layout.values(self.reference)
+        pairs = zip(self.outputs.system.output_signals, values, strict=True)
+        return "the outputs " + ", ".join(f"{signal.name} = {v:.6g}" for signal, v in pairs)
+
+    def residual(self, state: FloatArray) -> FloatArray:
+        """Returns the residual, named by `residual_signals`, shape (k,)."""
+        return self.outputs.residual.evaluate(state, self.reference, self.parameters)[0].copy()
+
+    def gradients(self, state: FloatArray) -> FloatArray:
+        """Returns the gradients C of the residual, shape (k, n)."""
+        return self.outputs.gradient.evaluate(state, self.parameters)[0].reshape(-1, state.size)
+
+    def point(self, state: FloatArray) -> PinnedPoint:
+        """Evaluates rate, inputs and matrices at a state."""
+        values = self.outputs.motion.evaluate(state, self.reference, self.parameters)
+        rate, u, v, A, B, pivot, unrest = (value.copy() for value in values)
+        A, B = A.reshape(v.size, v.size), B.reshape(self.outputs.system.num_outputs, u.size)
+        return PinnedPoint(state, rate, u, v, A, B, pivot, unrest)
+
+    def flaw(self, point: PinnedPoint) -> str:
+        """Returns why the motion is not determined at a point; empty if it is."""
+        if not (np.isfinite(point.A).all() and np.isfinite(point.B).all()):
+            return "A(x) or B(x) is not finite"
+        pairs = zip(point.margins, self.outputs.usual_margins, strict=True)
+        vanished = any(now < VANISHED * usual for now, usual in pairs)
+        if vanished or not point.pivot[0] > SINGULAR_PIVOT:
+            return "A(x) or B(x) is singular"
+        moving = np.concatenate([point.rate, point.control, point.constraint_input])
+        return "" if np.isfinite(moving).all() else "x' is not finite"
+
+    def rate(self, state: FloatArray) -> FloatArray:
+        """Returns x' = f* + h* u, shape (n,)."""
+        return self.outputs.motion.evaluate(state, self.reference, self.parameters)[0].copy()
+
+    def slopes(
+        self,
+        state: FloatArray,
+        directions: FloatArray | None = None,
+        by: FloatArray | None = None,
+    ) -> FloatArray:
+        """Returns the derivatives of x' along columns of dx, all if None, and of dR if given."""
+        columns = np.eye(state.size) if directions is None else directions
+        moved = np.zeros((self.reference.size, columns.shape[1])) if by is None else by
+        slope = self.outputs.slope
+        slopes = [
+            slope.evaluate(state, self.reference, dx, dr, self.parameters)[0].copy()
+            for dx, dr in zip(columns.T, moved.T, strict=True)
+        ]
+        return np.array(slopes).reshape(len(slopes), -1).T
+
+
 class EndCause(Enum):
     """The causes for the end of a motion with pinned outputs; the enum value is a description."""
 
@@ -52,16 +279,13 @@ class EndCause(Enum):
 
 @dataclass(frozen=True, eq=False)
 class MotionEnd:
-    """The end of a motion with pinned outputs: its cause, time in s, text and last state.
-
-    `matrix` is the matrix that loses its rank, "A" or "B"; empty if none does.
-    """
+    """The end of a motion with pinned outputs."""
 
     cause: EndCause
     time: float
     text: str
-    state: FloatArray | None = None
-    matrix: str = ""
+    state: FloatArray | None = None  # The last one.
+    matrix: str = ""  # The matrix that loses its rank, "A" or "B"; empty if none does.
 
     def __str__(self) -> str:
         return self.text
@@ -69,33 +293,24 @@ class MotionEnd:
 
 @dataclass(frozen=True, eq=False)
 class PinnedMotion:
-    """The motion with the outputs on a reference, until the last time or until it ends.
+    """The motion with the outputs on a reference, until the last time or until it ends."""
 
-    Attributes:
-        times: The times in s, shape (k,).
-        states, controls, constraint_inputs, parameters: x, u, v and the values of all parameters,
-            shapes (k, n), (k, p), (k, m), ...
-        constraint_margins, control_margins: The smallest singular values of A(x) and B(x), shape
-            (k,).
-        ending: Why it ends before the last time; None if it does not.
-    """
-
-    times: FloatArray
-    states: FloatArray
-    controls: FloatArray
-    constraint_inputs: FloatArray
-    parameters: FloatArray
-    constraint_margins: FloatArray
-    control_margins: FloatArray
-    ending: MotionEnd | None
+    times: FloatArray  # In s, shape (k,).
+    states: FloatArray  # x, shape (k, n),
+    controls: FloatArray  # u,
+    constraint_inputs: FloatArray  # v,
+    parameters: FloatArray  # and values of all parameters.
+    constraint_margins: FloatArray  # The smallest singular values of A(x), shape (k,),
+    control_margins: FloatArray  # and of B(x).
+    ending: MotionEnd | None  # Why it ends before the last time; None if it does not.
 
 
 class _Ended(Exception):
     """Raised where a motion ends."""
 
-    def __init__(self, *values: object) -> None:
-        self.ending = MotionEnd(*values)  # type: ignore[arg-type]
-        super().__init__(self.ending.text)
+    def __init__(self, ending: MotionEnd) -> None:
+        self.ending = ending
+        super().__init__(ending.text)
 
 
 def follow(
@@ -115,18 +330,18 @@ def follow(
                 points.append(point)
     except _Ended as end:
         ending = end.ending
-    system, count = pinned.system, len(points)
-    margins = np.array([point.margins for point in points]).reshape(count, 2)
+    system, moments = pinned.system, times[: len(points)]
 
     def rows(values: list[FloatArray], width: int) -> FloatArray:
-        return np.array(values).reshape(count, width)
+        return np.array(values).reshape(len(points), width)
 
+    margins = rows([np.array(point.margins) for point in points], 2)
     return PinnedMotion(
-        times[:count],
+        moments,
         rows([point.state for point in points], system.num_states),
         rows([point.control for point in points], system.num_controls),
         rows([point.constraint_input for point in points], system.num_constraints),
-        rows([parameters(time) for time in times[:count]], system.parameter_symbol.numel()),
+        rows([parameters(time) for time in moments], system.parameter_symbol.numel()),
         margins[:, 0],
         margins[:, 1],
         ending,
@@ -151,7 +366,8 @@ class _Follower:
         try:
             start = first.state(guess)
         except InconsistentStateError as error:
-            raise _Ended(EndCause.NO_START, self._time, f"{error} ({when})") from error
+            text = f"{error} ({when})"
+            raise _Ended(MotionEnd(EndCause.NO_START, self._time, text)) from error
         self._last = first.point(start)
         if first.flaw(self._last):
             text = f"at the start, {when}, x = {show(start)}: {EndCause.SINGULAR_START.value}"
@@ -231,20 +447,11 @@ class _Follower:
 
     def _at(self, time: float) -> PinnedSet:
         """Z(R) at a time; the motion ends where R is not finite."""
-        layout, cause = self._pinned.layout, EndCause.REFERENCE_NOT_FINITE
         try:
-            value = result_of("reference", self._reference, time)
-            goal = numbers(f"reference({time:g})", value).reshape(-1)
+            return self._pinned.at_time(self._reference, self._parameters, time)
         except NonFiniteError as error:
-            raise _Ended(cause, time, str(error)) from error
-        if goal.size != layout.reference_size:
-            raise ModelError(
-                f"{self._system.name}: the reference must have size {layout.reference_size} (each "
-                f"output and its derivatives up to its degree {layout.degrees}), got {goal.size}"
-            )
-        if not np.all(np.isfinite(goal)):
-            raise _Ended(cause, time, f"{self._system.name}: {cause.value} at t = {time:.6g} s")
-        return self._pinned.at(goal, self._parameters(time))
+            ending = MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, str(error))
+            raise _Ended(ending) from error
 
     def _reach(self, time: float, state: FloatArray) -> bool:
         """Moves to the projected state, unless it is on another branch; returns whether it did."""
@@ -255,9 +462,8 @@ class _Follower:
             raise self._stop(EndCause.TOO_FAST, text)
         pinned = self._at(time)
         projected, converged = pinned.project(state)
-        near = JUMP * np.maximum(self._system.scale, np.abs(last.state)) + np.abs(
-            state - last.state
-        )
+        near = JUMP * np.maximum(self._system.scale, np.abs(last.state))
+        near += np.abs(state - last.state)
         if not converged or np.any(np.abs(projected - state) > near):
             return False
         point = pinned.point(projected)
@@ -295,15 +501,16 @@ class _Follower:
         ahead = min(ahead, self._times[-1] - self._time)
         pinned = self._at(self._time + ahead)
         guesses = last.state, last.state + ahead * last.rate
-        beyond = any(pinned.project(guess)[1] for guess in guesses)
         matrix, margin = "AB"[which], f"{last.margins[which]:.2g}"
         singular = f"{matrix}(x) becomes singular, smallest singular value {margin}"
-        if beyond:
-            text = f"{when} {singular}: {EndCause.SINGULAR.value}"
-            return self._stop(EndCause.SINGULAR, text, matrix)
-        text = f"{EndCause.OUT_OF_REACH.value} {when}: {singular}"
-        return self._stop(EndCause.OUT_OF_REACH, text, matrix)
+        if any(pinned.project(guess)[1] for guess in guesses):
+            cause, text = EndCause.SINGULAR, f"{when} {singular}: {EndCause.SINGULAR.value}"
+        else:
+            cause = EndCause.OUT_OF_REACH
+            text = f"{EndCause.OUT_OF_REACH.value} {when}: {singular}"
+        return self._stop(cause, text, matrix)
 
     def _stop(self, cause: EndCause, text: str, matrix: str = "") -> _Ended:
         """The end of the motion at the last point."""
-        return _Ended(cause, self._time, f"{self._system.name}: {text}", self._last.state, matrix)
+        name, state = self._system.name, self._last.state
+        return _Ended(MotionEnd(cause, self._time, f"{name}: {text}", state, matrix))

@@ -146,10 +146,7 @@ def share_forces(
 
 
 def manifold_of_left_out(system: DaeSystem) -> Manifold | None:
-    """Returns the states at which the removed redundant constraints hold; None without any.
-
-    It contains N*, and possibly states of another assembly mode.
-    """
+    """Returns the states at which the removed redundant constraints hold; None without any."""
     sharing = system.sharing
     if sharing is None:
         return None
@@ -173,13 +170,7 @@ def all_constraints_hold(system: DaeSystem) -> Samples:
 
 
 class _Redundant(Manifold):
-    """The states at which all constraints k_i hold, including redundant ones.
-
-    Near these states the gradients of redundant constraints are nearly dependent, so that Newton
-    steps become very long or lead to a singular configuration. Levenberg-Marquardt steps with a
-    damping as large as the residual stay short and still converge quadratically (Yamashita and
-    Fukushima 2001).
-    """
+    """The states at which all constraints k_i hold, including redundant ones."""
 
     def __init__(self, system: DaeSystem) -> None:
         super().__init__(system, [[row] for row in ca.vertsplit(system.k)])

@@ -7,25 +7,20 @@ there must be zero with all other numbers.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray, show
-from drake_dae.dae.assumptions import (
-    Violation,
-    ViolationKind,
-    following_outputs,
-    redundant_constraints,
-)
+from drake_dae.dae.assumptions import Violation, ViolationKind, redundant_constraints
 from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
-from drake_dae.dae.family import VISIBLE, Deciding, Family
+from drake_dae.dae.family import VISIBLE, Family
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Region, Samples, as_matrix, fields_at
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import ModelError
+from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.round_off import Sized, multiply
 
@@ -44,7 +39,7 @@ def constraint_chains(
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
     chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
-    undecided, others = list(range(system.num_constraints)), _OtherNumbers()
+    undecided, others = list(range(system.num_constraints)), dict[int, Violation]()
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, explicit.g, x)
@@ -57,7 +52,7 @@ def constraint_chains(
         for row, i in enumerate(undecided):
             order, name = len(chains[i]), (names[i],)
             if force_acts[row].all():
-                others.refuse(i)
+                _refuse(others, i)
                 continue
             if force_acts[row].any():
                 state = samples.states[int(np.argmin(force_acts[row]))]
@@ -68,7 +63,7 @@ def constraint_chains(
             for key, rows, assumption in (("g", by_force, 1), ("h", by_control, 3)):
                 if rows[row, :].nnz():
                     violation = Violation(assumption, ViolationKind.NUMBERS, name, order)
-                    others.examine(i, violation, samples, actions.along(chains[i][-1], key))
+                    _examine(others, i, violation, samples, actions.along(chains[i][-1], key))
             following.append(i)
             if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
@@ -79,9 +74,7 @@ def constraint_chains(
         if sum(len(chain) for chain in chains) + len(following) > system.num_states:
             stuck = following
         if stuck:
-            those, dependent = tuple(names[i] for i in stuck), redundant_constraints(samples)
-            violation = Violation(2, ViolationKind.NO_FORCE, those, combinations=dependent)
-            raise replace(violation, deciding=others.deciding(stuck)).error()
+            raise _never(2, ViolationKind.NO_FORCE, stuck, names, samples, others)
         for i in following:
             derivative = lie_derivative(chains[i][-1], f, x)
             if system.exogenous:
@@ -91,21 +84,10 @@ def constraint_chains(
     return chains, Samples(Manifold(system, chains), guesses, region)
 
 
-class OutputChains(NamedTuple):
-    """The result of Assumption (4) for the outputs; see `Structure` for the fields."""
-
-    output_chains: tuple[tuple[ca.SX, ...], ...]
-    drift: ca.SX
-    control_matrix: ca.SX
-    highest_derivatives: ca.SX
-    chains_need_force: bool
-    round_off: Booleans
-
-
 def output_chains(
     derivatives: Derivatives, elimination: Elimination, samples: Samples
-) -> OutputChains:
-    """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and the rows of B(x)."""
+) -> dict[str, Any]:
+    """l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output, and more fields of `Structure`."""
     system = derivatives.system
     x, f_star, h_star = system.state, elimination.f_star, elimination.h_star
     names, count = [s.name for s in system.output_signals], system.num_outputs
@@ -113,7 +95,7 @@ def output_chains(
     drift, control_matrix, highest = ca.SX(count, 1), ca.SX(*shape), ca.SX(count, 1)
     round_off, need_force = np.zeros(shape, dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
-    others, actions = _OtherNumbers(), InputActions(samples, elimination)
+    others, actions = dict[int, Violation](), InputActions(samples, elimination)
     slopes = actions.numbers(actions.feedthrough)
     moving = system.outputs(derivatives.constraint_input)
     following, rows = elimination.l_star, elimination.n_star
@@ -123,7 +105,7 @@ def output_chains(
         for row, i in enumerate(undecided):
             order, name = len(chains[i]), (names[i],)
             if acts[row].all():
-                others.refuse(i)
+                _refuse(others, i)
                 drift[i], highest[i] = following[row], moving[row]
                 control_matrix[i, :] = rows[row, :]  # (16)
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
@@ -133,7 +115,7 @@ def output_chains(
             else:
                 if not chains[i] and rows[row, :].nnz():
                     violation = Violation(4, ViolationKind.NUMBERS, name, 0)
-                    others.examine(i, violation, samples, actions.feedthrough, i)
+                    _examine(others, i, violation, samples, actions.feedthrough, i)
                 still.append(i)
                 chains[i].append(following[row])
                 need_force = need_force or derivatives.has_unknowns(moving[row])
@@ -151,7 +133,7 @@ def output_chains(
                 continue
             if rows[row, :].nnz():
                 violation = Violation(4, ViolationKind.NUMBERS, (names[i],), len(chains[i]))
-                others.examine(i, violation, samples, actions.along(chains[i][-1], "h*"))
+                _examine(others, i, violation, samples, actions.along(chains[i][-1], "h*"))
             # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
             # where nothing acts although the structure allows it.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
@@ -159,13 +141,16 @@ def output_chains(
             if is_full or (rows[row, :].nnz() and samples.dependent(used)):
                 stuck.append(i)
         if stuck:
-            those = tuple(names[i] for i in stuck)
-            dependent = tuple(following_outputs(samples, those))
-            violation = Violation(5, ViolationKind.NO_CONTROL, those, combinations=dependent)
-            raise replace(violation, deciding=others.deciding(stuck)).error()
+            raise _never(5, ViolationKind.NO_CONTROL, stuck, names, samples, others)
         undecided = still
-    every = tuple(map(tuple, chains))
-    return OutputChains(every, drift, control_matrix, highest, need_force, round_off)
+    return {
+        "output_chains": tuple(map(tuple, chains)),
+        "highest_derivatives": highest,
+        "drift": drift,
+        "control_matrix": control_matrix,
+        "chains_need_force": need_force,
+        "round_off": round_off,
+    }
 
 
 class InputActions:
@@ -194,7 +179,7 @@ class InputActions:
             if not np.all(np.isfinite(gradients)):
                 nowhere = np.full((len(gradients), field[0].shape[1]), np.nan)
                 return nowhere, nowhere
-            return multiply(gradients, field, self._scale, system.negligible)
+            return multiply(gradients, field, self._scale)
 
         return row
 
@@ -226,42 +211,52 @@ class InputActions:
         fields = fields_at(self._system, state, parameters)
         gradient, matrix = map(as_matrix, self._factors(state, parameters))
         try:
-            return eliminate_numbers(fields, gradient, matrix, self._scale, self._system.negligible)
+            return eliminate_numbers(fields, gradient, matrix, self._scale)
         except np.linalg.LinAlgError:
             h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
             return (h_star, h_star), (n_star * np.nan, n_star)
 
 
-class _OtherNumbers:
-    """Constraints and outputs whose row is zero at the default parameters, but not at others."""
+def _examine(
+    others: dict[int, Violation],
+    index: int,
+    violation: Violation,
+    samples: Samples,
+    row: Row,
+    of: int = 0,
+) -> None:
+    """Records the violation by a row that is zero at the default parameters, but not at others."""
 
-    def __init__(self) -> None:
-        self._violations: dict[int, Violation] = {}
+    @np.errstate(all="ignore")  # Values that are not finite decide nothing.
+    def acts(state: FloatArray, parameters: FloatArray) -> bool:
+        value, size = (each[of] for each in row(state, parameters))
+        return bool(np.any(np.abs(value) > VISIBLE * size))
 
-    def examine(
-        self, index: int, violation: Violation, samples: Samples, row: Row, of: int = 0
-    ) -> None:
-        """Evaluates a row, or one of several, that is zero at the default parameters at others."""
+    if index not in others:
+        deciding = Family(samples.manifold, samples.states).deciding(acts)
+        if deciding:
+            others[index] = replace(violation, deciding=deciding)
 
-        @np.errstate(all="ignore")  # Values that are not finite decide nothing.
-        def acts(state: FloatArray, parameters: FloatArray) -> bool:
-            value, size = (each[of] for each in row(state, parameters))
-            return bool(np.any(np.abs(value) > VISIBLE * size))
 
-        if index not in self._violations:
-            deciding = Family(samples.manifold, samples.states).deciding(acts)
-            if deciding:
-                self._violations[index] = replace(violation, deciding=deciding)
+def _refuse(others: dict[int, Violation], index: int) -> None:
+    """Raises AssumptionError if a degree is another one for other parameters."""
+    if index in others:
+        raise others[index].error()
 
-    def refuse(self, index: int) -> None:
-        """Raises AssumptionError if a degree is another one for other parameters."""
-        if index in self._violations:
-            raise self._violations[index].error()
 
-    def deciding(self, indices: Sequence[int]) -> Deciding | None:
-        """Returns the parameters for which an input acts on one of some constraints or outputs."""
-        violations = (self._violations[i] for i in indices if i in self._violations)
-        return next((violation.deciding for violation in violations), None)
+def _never(
+    assumption: int,
+    kind: ViolationKind,
+    stuck: Sequence[int],
+    names: Sequence[str],
+    samples: Samples,
+    others: dict[int, Violation],
+) -> AssumptionError:
+    """The error of constraints or outputs on which no input ever acts."""
+    dependent = redundant_constraints(samples) if kind is ViolationKind.NO_FORCE else ()
+    deciding = next((others[i].deciding for i in stuck if i in others), None)
+    those = tuple(names[i] for i in stuck)
+    return Violation(assumption, kind, those, combinations=dependent, deciding=deciding).error()
 
 
 def _reached(fields: ca.SX, drift: ca.SX, expressions: ca.SX, state: ca.SX) -> Booleans:

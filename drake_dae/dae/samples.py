@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -23,7 +24,7 @@ FLAT = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """The states x with low <= x <= high."""
+    """The states x with low <= x <= high; those on N* are found for the default parameters."""
 
     low: FloatArray
     high: FloatArray
@@ -34,67 +35,61 @@ class Region:
         slack = SLACK * np.maximum(np.abs(bounds).max(axis=0), bounds[1] - bounds[0])
         return bool(np.all((state >= self.low - slack) & (state <= self.high + slack)))
 
-
-class ConsistentRegion:
-    """The consistent states in a region, with the default parameters."""
-
-    def __init__(self, manifold: Manifold, region: Region) -> None:
-        self.manifold, self.region = manifold, region
-
-    def project(self, guess: FloatArray) -> FloatArray:
+    def project(self, manifold: Manifold, guess: FloatArray) -> FloatArray:
         """Returns a consistent state in the region, near a guess."""
         try:
-            state = self.manifold.project(guess)
-            if self.region.holds(state):
+            state = manifold.project(guess)
+            if self.holds(state):
                 return state
         except InconsistentStateError:
             pass
-        state = self.manifold.project(self._newton(self.region, guess))
-        if not self.region.holds(state):
+        state = manifold.project(self._newton(manifold, guess))
+        if not self.holds(state):
             raise InconsistentStateError(
-                f"{self.manifold.system.name}: no consistent state found in the region",
-                self.manifold.residual(np.clip(state, self.region.low, self.region.high)),
+                f"{manifold.system.name}: no consistent state found in the region",
+                manifold.residual(np.clip(state, self.low, self.high)),
             )
         return state
 
-    def draw(self, guess: FloatArray) -> FloatArray:
+    def draw(self, manifold: Manifold, guess: FloatArray) -> FloatArray:
         """Returns a consistent state with the bounded states of a guess, if there is one.
 
         So random values cover the region, although the projection changes other states.
         """
-        bounded = np.isfinite(self.region.low)
+        bounded = np.isfinite(self.low)
         pinned = Region(np.where(bounded, guess, -np.inf), np.where(bounded, guess, np.inf))
         try:
-            state = self.manifold.project(self._newton(pinned, guess))
+            state = manifold.project(pinned._newton(manifold, guess))
         except InconsistentStateError:
-            return self.project(guess)
-        return state if self.region.holds(state) else self.project(guess)
+            return self.project(manifold, guess)
+        return state if self.holds(state) else self.project(manifold, guess)
 
     def descend(
-        self, function: Callable[[FloatArray], tuple[float, FloatArray]], start: FloatArray
+        self,
+        manifold: Manifold,
+        function: Callable[[FloatArray], tuple[float, FloatArray]],
+        start: FloatArray,
     ) -> FloatArray:
-        """Minimizes a nonnegative function along N* inside the region.
+        """Minimizes a nonnegative function along N*, by steps to the zero of the linearized one.
 
-        Each step leads to the zero of the linearized function, so that zeros are found in a few
-        steps. A positive minimum is only approached.
+        Zeros are found in a few steps. A positive minimum is only approached.
         """
-        region, size = self.region, self.region.high - self.region.low
-        width = np.where(np.isfinite(size), size, self.manifold.system.scale)
+        width = np.where(np.isfinite(self.high - self.low), self.high - self.low, manifold.scale)
         state, (value, gradient) = start, function(start)
         for _ in range(40):
-            direction = self._downhill(state, gradient, width)
+            direction = self._downhill(manifold.gradients(state) * width, state, gradient, width)
             slope = float(direction @ direction)
             # In units of the box: the state moves by the width times this.
             if not value > 0.0 or not np.sqrt(slope) > FLAT * value:
                 break
             step = width * direction
-            edge, moving = np.where(step < 0.0, region.low, region.high), step != 0.0
+            edge, moving = np.where(step < 0.0, self.low, self.high), step != 0.0
             with np.errstate(over="ignore"):
                 room = np.min((edge - state)[moving] / step[moving], initial=np.inf)
             length = min(value / slope, float(room))
             for _ in range(6):
                 try:
-                    trial = self.project(state + length * step)
+                    trial = self.project(manifold, state + length * step)
                     trial_value, trial_gradient = function(trial)
                     if trial_value < value:
                         break
@@ -106,33 +101,34 @@ class ConsistentRegion:
             state, value, gradient = trial, trial_value, trial_gradient
         return state
 
-    def _downhill(self, state: FloatArray, gradient: FloatArray, width: FloatArray) -> FloatArray:
+    def _downhill(
+        self, rows: FloatArray, state: FloatArray, gradient: FloatArray, width: FloatArray
+    ) -> FloatArray:
         """The descent direction along N* that stays in the box, in units of the box."""
-        rows, slope = self.manifold.gradients(state) * width, gradient * width
-        fixed = np.zeros(state.size, dtype=bool)
+        slope, fixed = gradient * width, np.zeros(state.size, dtype=bool)
         while True:
             normal = np.vstack([rows, np.eye(state.size)[fixed]])
             length = np.linalg.norm(normal, axis=1)
             normal = normal[length > 0.0] / length[length > 0.0, None]
             direction = normal.T @ np.linalg.lstsq(normal.T, slope)[0] - slope
-            blocked = (direction < 0.0) & (state <= self.region.low + SLACK * width)
-            blocked |= (direction > 0.0) & (state >= self.region.high - SLACK * width)
+            blocked = (direction < 0.0) & (state <= self.low + SLACK * width)
+            blocked |= (direction > 0.0) & (state >= self.high - SLACK * width)
             if not np.any(blocked & ~fixed):
                 return np.where(fixed, 0.0, direction)
             fixed |= blocked
 
-    def _newton(self, region: Region, guess: FloatArray) -> FloatArray:
-        """The result of Newton's method for the constraints, with steps inside a box."""
-        scale = self.manifold.system.scale
-        low, high = region.low / scale, region.high / scale
+    def _newton(self, manifold: Manifold, guess: FloatArray) -> FloatArray:
+        """The result of Newton's method for the constraints, with steps inside the box."""
+        scale = manifold.scale
+        low, high = self.low / scale, self.high / scale
 
         def linearize(z: FloatArray) -> NewtonModel | None:
-            gradient = self.manifold.gradients(scale * z) * scale
+            gradient = manifold.gradients(scale * z) * scale
             if not np.all(np.isfinite(gradient)):
                 return None
 
             def step(z: FloatArray) -> FloatArray:
-                residual = self.manifold.residual(scale * z)
+                residual = manifold.residual(scale * z)
                 return _bounded_step(gradient, residual, low - z, high - z)
 
             return NewtonModel(step, True)
@@ -157,16 +153,13 @@ def _bounded_step(
 
 
 class Samples:
-    """Consistent states near guesses, with the default parameters.
-
-    States that cannot be projected onto N*, or are outside the domain of (1)-(3), are left out.
-    """
+    """Consistent states near guesses, with the default parameters."""
 
     def __init__(
         self, manifold: Manifold, guesses: FloatArray, region: Region | None = None
     ) -> None:
         self.manifold, self.system, self.region = manifold, manifold.system, region
-        draw = manifold.project if region is None else ConsistentRegion(manifold, region).draw
+        draw = manifold.project if region is None else partial(region.draw, manifold)
         self.fields: list[dict[str, FloatArray]] = []
         states: list[FloatArray] = []
         failure = None
@@ -212,7 +205,7 @@ class Samples:
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
         return all(are_dependent(significant(gradient * self.scale)) for (gradient,) in gradients)
 
-    def surroundings(self) -> ConsistentRegion:
+    def surroundings(self) -> Region:
         """The box that the states span, within the region from which they were drawn."""
         low, high = self.states.min(axis=0), self.states.max(axis=0)
         if self.region is not None:
@@ -220,7 +213,7 @@ class Samples:
             more = 0.5 * (high - low)
             low = np.where(np.isfinite(self.region.low), self.region.low, low - more)
             high = np.where(np.isfinite(self.region.high), self.region.high, high + more)
-        return ConsistentRegion(self.manifold, Region(low, high))
+        return Region(low, high)
 
 
 def fields_at(
@@ -234,11 +227,9 @@ def fields_at(
 
 def draw(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
     """Draws states around the nominal state, which comes first; they are not yet consistent."""
-    random = np.random.default_rng(seed)
-    normal = np.vstack(
-        [np.zeros(system.num_states), random.standard_normal((count, system.num_states))]
-    )
-    return system.nominal_state + spread_of(system, spread) * normal
+    normal = np.random.default_rng(seed).standard_normal((count, system.num_states))
+    away = spread_of(system, spread) * np.vstack([np.zeros(system.num_states), normal])
+    return system.nominal_state + away
 
 
 def spread_of(system: DaeSystem, spread: ArrayLike | None) -> FloatArray:

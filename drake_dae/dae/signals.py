@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -196,16 +197,6 @@ def parameter_symbol(parameters: Sequence[Parameter]) -> ca.SX:
     return ca.vertcat(ca.SX(0, 1), *[p.symbol for p in parameters], *rates)
 
 
-def parameter_slice(owner: str, parameters: Sequence[Parameter], name: str) -> slice:
-    """Returns the slice of a parameter in the parameter vector."""
-    start = 0
-    for parameter in parameters:
-        if parameter.name == name:
-            return slice(start, start + parameter.value.size)
-        start += parameter.value.size
-    raise ModelError(f"{owner}: {unknown_name('parameter', name, [p.name for p in parameters])}")
-
-
 @dataclass(frozen=True, eq=False)
 class Exogenous:
     """The exogenous parameters w of a system, with symbols for their time derivatives."""
@@ -215,7 +206,6 @@ class Exogenous:
 
     @property
     def moving(self) -> tuple[Parameter, ...]:
-        """The exogenous parameters."""
         return tuple(p for p in self.parameters if p.exogenous)
 
     def __bool__(self) -> bool:
@@ -242,13 +232,21 @@ class Exogenous:
     def degrees(self, *expressions: ca.SX) -> tuple[int, ...]:
         """Returns the number of derivatives of each entry of w on which expressions depend."""
         every = ca.veccat(*expressions)
-        degrees: list[int] = []
-        for p in self.moving:
-            for i in range(p.value.size):
-                orders = [k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i])]
-                degrees.append(max(orders, default=0))
-        return tuple(degrees)
+        return tuple(
+            max(
+                (k for k, d in enumerate(p.derivatives, 1) if ca.depends_on(every, d[i])), default=0
+            )
+            for p in self.moving
+            for i in range(p.value.size)
+        )
 
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Name of a parameter -> its place in the parameter vector."""
+        ends = np.cumsum([0, *(p.value.size for p in self.parameters)]).tolist()
+        return {p.name: slice(*ends[i : i + 2]) for i, p in enumerate(self.parameters)}
+
+    @cached_property
     def rates(self) -> dict[str, slice]:
         """Name of an exogenous parameter -> the place of w', w'', ... in the parameter vector."""
         first, rates = sum(p.value.size for p in self.parameters), dict[str, slice]()
@@ -259,12 +257,11 @@ class Exogenous:
 
     def places(self, degrees: Sequence[int]) -> list[int]:
         """Returns the indices of w_1, w_1', ..., w_1^(d_1), w_2, ... among the parameters."""
-        rates, places, degree = self.rates(), list[int](), iter(degrees)
+        places, degree = list[int](), iter(degrees)
         for p in self.moving:
-            start = parameter_slice(self.owner, self.parameters, p.name).start
-            for i in range(p.value.size):
-                following = range(rates[p.name].start + i, rates[p.name].stop, p.value.size)
-                places += [start + i, *following[: next(degree)]]
+            start, rates, size = self.slices[p.name].start, self.rates[p.name], p.value.size
+            for i in range(size):
+                places += [start + i, *range(rates.start + i, rates.stop, size)[: next(degree)]]
         return places
 
 

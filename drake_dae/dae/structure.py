@@ -43,31 +43,16 @@ PART = 0.1
 @checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class ConstraintStructure:
-    """The structure of the constraints of a system, by Assumptions (1)-(3).
-
-    It is enough for simulation. Controls and controlled outputs are not needed.
-
-    Attributes:
-        system: The system.
-        constraint_degrees: r_1, ..., r_m.
-        manifold: N* (4).
-        derivatives: The time derivatives along the motion on N*.
-        elimination: Equations (9)-(14) as expressions; not finite where A(x) is singular.
-        states: The consistent states at which numbers were decided, shape (samples, n).
-        scale: The size of each state over them and the guesses from which they were found, shape
-            (n,).
-        constraint_margin: The margin of A(x), Assumption (2), without friction; None without
-            constraints.
-    """
+    """The structure of the constraints of a system, by Assumptions (1)-(3)."""
 
     system: DaeSystem
-    constraint_degrees: tuple[int, ...]
-    manifold: Manifold
-    derivatives: Derivatives
-    elimination: Elimination
-    states: FloatArray
-    scale: FloatArray
-    constraint_margin: RankMargin | None
+    constraint_degrees: tuple[int, ...]  # r_1, ..., r_m
+    manifold: Manifold  # N* (4)
+    derivatives: Derivatives  # Along the motion on N*.
+    elimination: Elimination  # (9)-(14)
+    states: FloatArray  # The consistent states at which numbers were decided, (samples, n).
+    scale: FloatArray  # The size of each state over them and their guesses, (n,).
+    constraint_margin: RankMargin | None  # Of A(x) without friction, Assumption (2).
 
     def __repr__(self) -> str:
         degrees = f"r={self.constraint_degrees}, index={self.index}"
@@ -93,10 +78,7 @@ class ConstraintStructure:
         return lambda x, p: function(x, p)[0].reshape(matrix.shape)
 
     def dependent_constraints(self, state: FloatArray, parameters: FloatArray) -> tuple[str, ...]:
-        """Returns the names of the constraints that become dependent where A(x) is singular.
-
-        They are the parts of n with n^T A(x) = 0, in units of the usual lengths of the gradients.
-        """
+        """Returns the names of the constraints that become dependent where A(x) is singular."""
         usual = [np.diag(self._matrix(x, parameters)) for x in self.states]
         unit = 1.0 / np.sqrt(positive(np.median(np.abs(usual), axis=0)))
         matrix = self._matrix(state, parameters) * unit * unit[:, None]
@@ -120,30 +102,16 @@ class ConstraintStructure:
 @checked(ModelError)
 @dataclass(frozen=True, eq=False, repr=False)
 class Structure(ConstraintStructure):
-    """The structure of one system by Assumptions (1)-(5): relative degrees, A(x), B(x), margins.
+    """The structure of one system by Assumptions (1)-(5): relative degrees, A(x), B(x), margins."""
 
-    Attributes:
-        output_degrees: mu_1, ..., mu_p in the order of the system's outputs; 0 where the control
-            enters the output at once (the paper's outputs s + 1, ..., p).
-        output_chains: The chain l*_i, L_f* l*_i, ..., L_f*^(mu_i - 1) l*_i of each output.
-        highest_derivatives: z_i^(mu_i) in terms of the unknowns of `derivatives`, shape (p, 1).
-        drift: a(x) of (28), L_f*^mu_i l*_i in the order of the outputs, shape (p, 1).
-        control_matrix: B(x) of (16), rows in the order of the system's outputs, shape (p, p); of a
-            system with a `control_metric` it has more columns than rows.
-        chains_need_force: Whether the output chains hold alpha (13), and so need a regular A(x).
-        round_off: The entries of B(x) that are only round-off at all sampled states, in its shape.
-            A column of such entries would otherwise be scaled up to the size of the others.
-        control_margin: The margin of B(x), Assumption (5).
-    """
-
-    output_degrees: tuple[int, ...]
-    output_chains: tuple[tuple[ca.SX, ...], ...]
-    highest_derivatives: ca.SX
-    drift: ca.SX
-    control_matrix: ca.SX
-    chains_need_force: bool
-    round_off: Booleans
-    control_margin: RankMargin
+    output_degrees: tuple[int, ...]  # mu_i; 0 where the control enters the output at once.
+    output_chains: tuple[tuple[ca.SX, ...], ...]  # l*_i, ..., L_f*^(mu_i - 1) l*_i
+    highest_derivatives: ca.SX  # z_i^(mu_i) in terms of the unknowns of `derivatives`, (p, 1).
+    drift: ca.SX  # a(x) of (28), L_f*^mu_i l*_i, (p, 1).
+    control_matrix: ca.SX  # B(x) of (16), (p, p); wider with a `control_metric`.
+    chains_need_force: bool  # Whether the chains hold alpha (13), so that A(x) must be regular.
+    round_off: Booleans  # The entries of B(x) that are only round-off at all sampled states.
+    control_margin: RankMargin  # Of B(x), Assumption (5).
 
     def __repr__(self) -> str:
         degrees = f"r={self.constraint_degrees}, mu={self.output_degrees}"
@@ -170,12 +138,10 @@ class Structure(ConstraintStructure):
         return ca.vertcat(ca.SX(0, 1), *[e for chain in self.output_chains for e in chain])
 
     def motion_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX] | None:
-        """Returns x' and v under the control of `control_for`, solved together with the control.
+        """Returns x', v and a pivot under the control of `control_for`, solved together with it.
 
-        No forward dynamics is needed: with rigid joints it is kinematics, and M(q) is not factored.
-
-        Returns x', v, and a scalar that is 0 exactly where one of them is not determined; None if
-        the control is not found in this way, or if friction may leave the motion undetermined.
+        None if the control is not found in this way, or if friction may leave the motion
+        undetermined.
         """
         if self.system.control_metric is not None or self.system.frictional_contacts:
             return None
@@ -188,10 +154,9 @@ class Structure(ConstraintStructure):
         return solution[2][:size, :], solution[2][size:, :], solution[1]
 
     def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Returns u = B(x)^-1 (-a(x) + ubar), for which z_i^(mu_i) = ubar_i on N*.
+        """Returns u = B(x)^-1 (-a(x) + ubar) (28), and a scalar that is 0 where it is undetermined.
 
-        If B(x) does not determine u, `DaeSystem.control_metric` chooses it. Also returns a scalar
-        that is 0 exactly where u is not determined.
+        If B(x) does not determine u, `DaeSystem.control_metric` chooses it.
         """
         solution: tuple[ca.SX, ...] | None = None
         if self.system.control_metric is None:
@@ -216,11 +181,7 @@ class Structure(ConstraintStructure):
 def find_constraint_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> ConstraintStructure:
-    """Finds r_1, ..., r_m and A(x), and checks Assumptions (1)-(3).
-
-    The system may have no controls or outputs, and a singular B(x). Arguments and exceptions are
-    those of `find_structure`.
-    """
+    """Finds r_1, ..., r_m and A(x), and checks Assumptions (1)-(3)."""
     structure, samples = examine_constraints(system, guesses(system, spread, count, seed))
     violation = constraint_violation(structure)
     if violation:
@@ -283,17 +244,15 @@ def constraint_structure_of(
     owner: str, system: DaeSystem, structure: ConstraintStructure | None
 ) -> ConstraintStructure:
     """Returns the given structure of a system, or the result of `find_constraint_structure`."""
+    return structure_of(owner, system, structure, find_constraint_structure)
+
+
+def structure_of(
+    owner: str, system: DaeSystem, structure: Kind | None, find: Callable[[DaeSystem], Kind]
+) -> Kind:
+    """Returns the given structure of a system, or the one that is found."""
     if structure is None:
-        return find_constraint_structure(system)
-    return _belonging(owner, system, structure)
-
-
-def structure_of(owner: str, system: DaeSystem, structure: Structure | None) -> Structure:
-    """Returns the given structure of a system, or the result of `find_structure`."""
-    return find_structure(system) if structure is None else _belonging(owner, system, structure)
-
-
-def _belonging(owner: str, system: DaeSystem, structure: Kind) -> Kind:
+        return find(system)
     if structure.system is not system:
         raise ModelError(
             f"{owner}: the structure is that of another system, '{structure.system.name}' and not "
@@ -317,7 +276,7 @@ def why_no_law(system: DaeSystem) -> str:
 
 
 def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """Returns initial guesses of consistent states, shape (count + 1, n)."""
+    """Returns initial guesses of consistent states, shape (count + 1, n), of a sound system."""
     check_system(system)
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
@@ -326,24 +285,32 @@ def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) 
 
 def check_system(system: DaeSystem) -> None:
     """Checks the number of constraints and the mass matrix of a system."""
-    _check_mass_matrix(system, system.nominal_state[None])
+    _check_positive_definite(system, "mass_matrix", system.nominal_state[None])
     if system.num_constraints > system.num_states:
         names = tuple(signal.name for signal in system.constraint_output_signals)
         raise Violation(2, ViolationKind.COUNT, names).error()
 
 
-def _check_mass_matrix(system: DaeSystem, states: FloatArray) -> None:
-    """Checks E of E x' = f + g v + h u, since LDL^T reads only one triangle of it."""
-    function = system.trace("mass matrix", {"mass": ca.densify(system.mass_matrix)}, often=False)
+REMEDIES = {
+    "mass_matrix": (
+        "An equation in which no derivative stands is a constraint 0 = k(x) with a constraint "
+        "input; where it holds an unknown z that has no derivative, lift it: make z a state with "
+        "z' = v, v a new constraint input, and keep the equation as constraint"
+    ),
+    "control_metric": "Give each control a positive weight",
+}
+
+
+def _check_positive_definite(system: DaeSystem, key: str, states: FloatArray) -> None:
+    """Checks E of E x' = f + g v + h u, since LDL^T reads only one triangle of it, or W."""
+    matrix = ca.densify(getattr(system, key))
+    function = system.trace(key, {"matrix": matrix}, often=False)
     for state in states:
-        mass = function(state, system.parameter_values)[0].reshape(state.size, state.size)
-        if not _is_positive_definite(mass):
+        value = function(state, system.parameter_values)[0].reshape(matrix.shape)
+        if not _is_positive_definite(value):
             raise ModelError(
-                f"{system.name}: mass_matrix is not symmetric and positive definite at x = "
-                f"{show(state)}. An equation in which no derivative stands is a constraint 0 = "
-                "k(x) with a constraint input; where it holds an unknown z that has no derivative, "
-                "lift it: make z a state with z' = v, v a new constraint input, and keep the "
-                "equation as constraint"
+                f"{system.name}: {key} is not symmetric and positive definite at x = "
+                f"{show(state)}. {REMEDIES[key]}"
             )
 
 
@@ -367,20 +334,20 @@ def examine_constraints(
         if error.violation is not None:
             raise _as_redundant(system, error.violation).error() from None
         raise
-    _check_mass_matrix(system, samples.states)
+    _check_positive_definite(system, "mass_matrix", samples.states)
     derivatives = Derivatives(system, ca.vertcat(ca.SX(0, 1), *[chain[-1] for chain in chains]))
     elimination = eliminate(derivatives)
     # Friction can change the sign of A(x); the Painleve paradox is tested along motions.
     matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
     structure = ConstraintStructure(
-        system=system,
-        constraint_degrees=tuple(len(chain) for chain in chains),
-        manifold=samples.manifold,
-        derivatives=derivatives,
-        elimination=elimination,
-        states=samples.states,
-        scale=samples.scale,
-        constraint_margin=find_margin(samples, matrix) if chains else None,
+        system,
+        tuple(len(chain) for chain in chains),
+        samples.manifold,
+        derivatives,
+        elimination,
+        samples.states,
+        samples.scale,
+        find_margin(samples, matrix) if chains else None,
     )
     return structure, samples
 
@@ -388,15 +355,10 @@ def examine_constraints(
 def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Structure:
     """Finds mu_1, ..., mu_p and B(x) if A(x) is regular."""
     system, elimination = samples.system, constrained.elimination
-    if (metric := system.control_metric) is not None:
-        for state, (value,) in zip(samples.states, samples.values(metric=metric), strict=True):
-            if not _is_positive_definite(value):
-                raise ModelError(
-                    f"{system.name}: control_metric is not symmetric and positive definite "
-                    f"at x = {show(state)}; give each control a positive weight"
-                )
+    if system.control_metric is not None:
+        _check_positive_definite(system, "control_metric", samples.states)
     outputs = output_chains(constrained.derivatives, elimination, samples)
-    degrees = tuple(len(chain) for chain in outputs.output_chains)
+    degrees = tuple(len(chain) for chain in outputs["output_chains"])
     # Rows of n* that are zero except for round-off are no feedthrough.
     n_star = [
         ca.SX(1, system.num_controls) if degree else elimination.n_star[i, :]
@@ -404,10 +366,8 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
     ]
     attributes = {item.name: getattr(constrained, item.name) for item in fields(constrained)}
     attributes["elimination"] = replace(elimination, n_star=ca.vertcat(*n_star))
-    margin = find_margin(samples, outputs.control_matrix, outputs.round_off)
-    return Structure(
-        **attributes, output_degrees=degrees, control_margin=margin, **outputs._asdict()
-    )
+    margin = find_margin(samples, outputs["control_matrix"], outputs["round_off"])
+    return Structure(**attributes, output_degrees=degrees, control_margin=margin, **outputs)
 
 
 def constraint_violation(structure: ConstraintStructure) -> Violation | None:
@@ -423,15 +383,9 @@ def constraint_violation(structure: ConstraintStructure) -> Violation | None:
     if violation is None or violation.cause is ViolationKind.BOUNDS:
         return violation
     if violation.cause is ViolationKind.CONSTRAINT_RANK:
-        combinations, everywhere, in_gradients = find_dependence(
+        cause, combinations = find_dependence(
             structure.manifold, elimination, structure.states, margin.state
         )
-        cause = {  # By whether it is singular everywhere, and by its gradients.
-            (True, True): ViolationKind.REDUNDANT,
-            (False, True): ViolationKind.SINGULAR_CONFIGURATION,
-            (True, False): ViolationKind.HIDDEN_DEGREE,
-            (False, False): ViolationKind.CONSTRAINT_RANK,
-        }[everywhere, in_gradients]
         violation = replace(violation, cause=cause, combinations=combinations)
     return _as_redundant(system, violation)
 
@@ -492,10 +446,7 @@ def _for_the_family(
 
 
 def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
-    """The actual violation if redundant constraints led to a singular configuration.
-
-    Off N* they are overdetermined, and only singular configurations satisfy them.
-    """
+    """The actual violation if redundant constraints led to a singular configuration."""
     possible = (ViolationKind.CONSTRAINT_DEGREE, ViolationKind.SINGULAR_CONFIGURATION)
     if violation.cause not in possible:
         return violation
@@ -507,6 +458,5 @@ def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
     if not combinations or not all(combination.others for combination in combinations):
         return violation
     names = tuple(signal.name for signal in system.constraint_output_signals)
-    return Violation(
-        2, ViolationKind.REDUNDANT, names, combinations=combinations, deciding=violation.deciding
-    )
+    redundant, deciding = ViolationKind.REDUNDANT, violation.deciding
+    return Violation(2, redundant, names, combinations=combinations, deciding=deciding)

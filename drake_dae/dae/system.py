@@ -11,24 +11,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, vector
+from drake_dae.arrays import FloatArray, numbers, unknown_name, vector
 from drake_dae.dae.contacts import Contacts, UnilateralInput
 from drake_dae.dae.fields import checked_fields, fields_of_functions
-from drake_dae.dae.signals import Exogenous, Parameter, Signal, parameter_slice, parameter_symbol
+from drake_dae.dae.signals import Exogenous, Parameter, Signal, parameter_symbol
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
+from drake_dae.trace.round_off import SINGULAR
 
 
 @dataclass(frozen=True, eq=False)
 class ForceSharing:
-    """The distribution of forces among redundant constraints, some of which are removed.
-
-    The motion determines the sum v = G(x) v_all alone. Among all v_all with that sum the one with
-    the least sum of c_i v_i^2 is shown, v_all = T(x) v: G T = 1. See `share_forces`.
-    """
+    """The distribution of forces among redundant constraints, some of which are removed."""
 
     split: ca.SX
     gather: ca.SX
@@ -70,7 +66,6 @@ class DaeSystem:
             terms of u^T W u comparable, as by 1 / limit^2.
         compiled: Machine code from the first call (True), never, or when it pays ("auto").
         least_margin: A(x) or B(x) is singular where its smallest singular value, scaled, is below.
-        negligible: Entries below this, relative to their row or column, are zero in degrees.
         contacts: Constraint inputs that only push, if one has friction: see `contacts`.
         dry: The names of parameters that are coefficients of Coulomb friction in f.
 
@@ -103,7 +98,6 @@ class DaeSystem:
     compiled: Compiled = "auto"
     contacts: tuple[UnilateralInput, ...] = ()
     least_margin: float = SINGULAR
-    negligible: float = NEGLIGIBLE
     dry: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -112,8 +106,8 @@ class DaeSystem:
             object.__setattr__(self, key, value)
 
     def __repr__(self) -> str:
-        counts = (self.num_states, self.num_constraints, self.num_controls)
-        return f"DaeSystem('{self.name}', n={counts[0]}, m={counts[1]}, p={counts[2]})"
+        counts = f"n={self.num_states}, m={self.num_constraints}, p={self.num_controls}"
+        return f"DaeSystem('{self.name}', {counts})"
 
     @classmethod
     @checked(ModelError)
@@ -152,8 +146,7 @@ class DaeSystem:
             ModelError: A function fails, or the functions do not form a system; see the class.
         """
         functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
-        names = [item.name for item in fields(cls)]
-        system = cls(**fields_of_functions(state, functions, parameters or {}, labels, names))
+        system = cls(**fields_of_functions(state, functions, parameters or {}, labels))
         system = system.with_exogenous(exogenous) if exogenous else system
         return system.with_bounds(bounds) if bounds else system
 
@@ -225,10 +218,9 @@ class DaeSystem:
     @property
     def parameter_signals(self) -> list[Signal]:
         """Names and units of the entries of `parameter_symbol`."""
-        moving = self.exogenous.moving
         rates = [
             signal.derivative(order)
-            for p in moving
+            for p in self.exogenous.moving
             for order in range(1, len(p.derivatives) + 1)
             for signal in p.signals
         ]
@@ -257,7 +249,7 @@ class DaeSystem:
     @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
         """Returns the same system with some parameters as exogenous signals."""
-        return self._with_parameters({name: {"exogenous": True} for name in names})
+        return self._with_parameters("exogenous", dict.fromkeys(names, True))
 
     @checked(ModelError)
     def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
@@ -271,22 +263,20 @@ class DaeSystem:
             bounds: Name -> (low, high), each a number or one for each entry; the default lies
                 between them. Equal bounds fix the parameter; as an exogenous signal it is constant.
         """
-        return self._with_parameters({name: {"bounds": each} for name, each in bounds.items()})
+        return self._with_parameters("bounds", bounds)
 
     @checked(ModelError)
     def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
         """Returns the same system with other defaults of some parameters."""
-        return self._with_parameters({name: {"value": value} for name, value in values.items()})
+        sized = {p.name: p.entries(values[p.name]) for p in self.parameters if p.name in values}
+        return self._with_parameters("value", {**values, **sized})
 
-    def _with_parameters(self, changes: Mapping[str, dict[str, Any]]) -> "DaeSystem":
-        for name in changes:
+    def _with_parameters(self, key: str, values: Mapping[str, Any]) -> "DaeSystem":
+        for name in values:
             self.parameter_slice(name)
-        parameters = []
-        for p in self.parameters:
-            change = dict(changes.get(p.name, {}))
-            if "value" in change:
-                change["value"] = p.entries(change["value"])
-            parameters.append(replace(p, **change) if change else p)
+        parameters = [
+            replace(p, **{key: values[p.name]}) if p.name in values else p for p in self.parameters
+        ]
         return replace(self, parameters=tuple(parameters))
 
     @property
@@ -329,17 +319,14 @@ class DaeSystem:
         pivot: ca.SX | None = None,
         regular: str = "a matrix",
         often: bool = True,
-        doubt: ca.SX | None = None,
-        lean: bool = False,
     ) -> TracedFunction:
         """Compiles expressions to a function of the state, of other inputs and of the parameters.
 
         Further inputs stand between these; the other arguments are those of `TracedFunction`.
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
-        return TracedFunction(
-            f"{self.name} {name}", every, outputs, pivot, regular, often, self.compiled, doubt, lean
-        )
+        whole = f"{self.name} {name}"
+        return TracedFunction(whole, every, outputs, pivot, regular, often, self.compiled)
 
     def agree(self, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
         """Returns whether two expressions agree at random states around the nominal state.
@@ -393,14 +380,14 @@ class DaeSystem:
             )
         parameters = np.empty((*values.shape[:-1], self._defaults.size))
         parameters[...] = self._defaults
-        sizes, rates = {p.name: p.value.size for p in other.parameters}, other.exogenous.rates()
+        sizes = {p.name: p.value.size for p in other.parameters}
+        own, others = self.exogenous, other.exogenous
         for p in self.parameters:
             if sizes.get(p.name) != p.value.size:
                 continue
-            place = self.parameter_slice(p.name)
-            parameters[..., place] = values[..., other.parameter_slice(p.name)]
-            if p.exogenous and p.name in rates:
-                to, source = self.exogenous.rates()[p.name], rates[p.name]
+            parameters[..., own.slices[p.name]] = values[..., others.slices[p.name]]
+            if p.name in own.rates and p.name in others.rates:
+                to, source = own.rates[p.name], others.rates[p.name]
                 count = min(to.stop - to.start, source.stop - source.start)
                 moved = values[..., source.start : source.start + count]
                 parameters[..., to.start : to.start + count] = moved
@@ -412,4 +399,7 @@ class DaeSystem:
 
     def parameter_slice(self, name: str) -> slice:
         """Returns the place of a parameter in the parameter vector."""
-        return parameter_slice(self.name, self.parameters, name)
+        if name not in self.exogenous.slices:
+            known = [p.name for p in self.parameters]
+            raise ModelError(f"{self.name}: {unknown_name('parameter', name, known)}")
+        return self.exogenous.slices[name]

@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, brief, listed, numbers, vector
-from drake_dae.dae.gains import FeedbackGains, GainDesign
-from drake_dae.dae.law_model import damped
-from drake_dae.dae.law_terms import Deflection, ForceMeasurement, IntegralAction
+from drake_dae.arrays import FloatArray, listed, numbers, vector
+from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
+from drake_dae.dae.law_model import Deflection, ForceMeasurement, IntegralAction, damped
 from drake_dae.dae.signals import DerivativeLayout, Signal
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
-from drake_dae.trace.expressions import result_of
 from drake_dae.trace.functions import TracedFunction
 
 
@@ -76,13 +74,13 @@ class TrackingLaw:
         contact_stiffness: float | None = None,
         latency: float = 0.0,
     ) -> None:
-        self.structure = structure_of("TrackingLaw", system, structure)
+        self.structure = structure_of("TrackingLaw", system, structure, find_structure)
         self.damped_structure = damped(self.structure, constraint_damping, latency)
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:
             self.deflection = Deflection.of(self.structure, contact_stiffness, constraint_damping)
-            more = self.deflection.more
+            more = tuple(2 * (i in self.deflection.inputs) for i in range(system.num_outputs))
         self.layout = DerivativeLayout(self.structure.output_degrees, more)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
         if not measured_force and numbers("force_gain", force_gain, GainError).any():
@@ -92,7 +90,6 @@ class TrackingLaw:
         )
         self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
         self.gains = self.design(gains)
-        self._last_gains: tuple[FeedbackGains | None, FloatArray] = None, np.empty(0)
         self.function = self._trace()
 
     def __repr__(self) -> str:
@@ -141,20 +138,14 @@ class TrackingLaw:
             {"reference": reference, "integral": self.integral.symbol},
             often=False,
         )
-        numbers = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
+        parameters = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         self._ubar, self.outputs, self.pivot = ubar, outputs, pivot
-        self._inputs = {"state": self.system.state, **inputs, "parameters": numbers}
+        self._inputs = {"state": self.system.state, **inputs, "parameters": parameters}
         self.regular = (
             f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}"
         )
-        return TracedFunction(
-            f"{self.system.name} tracking law",
-            self._inputs,
-            outputs,
-            pivot,
-            self.regular,
-            compiled=self.system.compiled,
-        )
+        name, compiled = f"{self.system.name} tracking law", self.system.compiled
+        return TracedFunction(name, self._inputs, outputs, pivot, self.regular, compiled=compiled)
 
     @property
     def inputs(self) -> dict[str, ca.SX]:
@@ -179,17 +170,7 @@ class TrackingLaw:
     def design(self, gains: GainDesign | FeedbackGains) -> FeedbackGains:
         """Checks gains, or designs them, for the outputs of this law."""
         names = tuple(signal.name for signal in self.system.output_signals)
-        degrees, designed = self.integral.all_degrees, gains
-        if not isinstance(designed, FeedbackGains):
-            designed = result_of("gains", designed, names, degrees, error=GainError)
-        if not isinstance(designed, FeedbackGains):
-            raise GainError(f"gains must be a design such as poles(-4.0), got {brief(designed)}")
-        if (designed.names, designed.degrees) != (names, degrees):
-            raise GainError(
-                f"the gains are for the outputs {', '.join(designed.names)} with degrees "
-                f"{designed.degrees}, the system has {', '.join(names)} with {degrees}"
-            )
-        return designed
+        return designed("gains", gains, names, self.integral.all_degrees)
 
     def all_parameters(
         self, parameters: ArrayLike | None = None, gains: GainDesign | FeedbackGains | None = None
@@ -199,8 +180,6 @@ class TrackingLaw:
         The gains are the law's own if None; others must be zero where the law's own are.
         """
         values = self.system.parameter_vector(parameters)
-        if gains is not None and gains is self._last_gains[0]:  # As in most runs of a study.
-            return np.concatenate([values, self._last_gains[1]])
         chosen = self.gains if gains is None else self.design(gains)
         has = self.gains.matrix != 0.0
         if np.any(chosen.matrix[~has]):
@@ -210,10 +189,7 @@ class TrackingLaw:
                 f"the law has no gain from the error of {signals[j].name} to "
                 f"{self.system.output_signals[i].name}; make a new law with such a gain"
             )
-        entries = chosen.matrix.T[has.T]
-        if chosen is gains:
-            self._last_gains = chosen, entries
-        return np.concatenate([values, entries])
+        return np.concatenate([values, chosen.matrix.T[has.T]])
 
     @property
     def parameter_signals(self) -> list[Signal]:

@@ -1,11 +1,12 @@
 """What the system does while its outputs follow a reference: Assumption 2.2.        (35)-(36)
 
-On Z(R), see `pinned_outputs`, the state moves by x' = f* + h* u. Its dimension is that of xi; where
+On Z(R), see `pinned_motion`, the state moves by x' = f* + h* u. Its dimension is that of xi; where
 that is 0, the reference alone determines the motion. All is done in the state x: nothing depends
 on the choice of xi in (22).
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Protocol
 
@@ -26,9 +27,14 @@ from drake_dae.dae.equilibria import (
     without_dynamics,
 )
 from drake_dae.dae.floquet import PeriodicMotions, StabilityAlong
-from drake_dae.dae.pinned_motion import PinnedMotion, TimeFunction, follow
-from drake_dae.dae.pinned_outputs import PinnedOutputs, PinnedSet
-from drake_dae.dae.structure import Structure, structure_of
+from drake_dae.dae.pinned_motion import (
+    PinnedMotion,
+    PinnedOutputs,
+    PinnedSet,
+    TimeFunction,
+    follow,
+)
+from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 
@@ -60,7 +66,7 @@ class ZeroDynamics:
     """
 
     def __init__(self, system: DaeSystem, *, structure: Structure | None = None) -> None:
-        self.structure = structure = structure_of("ZeroDynamics", system, structure)
+        self.structure = structure = structure_of("ZeroDynamics", system, structure, find_structure)
         self.system = system
         self.dimension = structure.zero_dynamics_dimension
         self._pinned = PinnedOutputs(structure)
@@ -135,7 +141,7 @@ class ZeroDynamics:
                 states, but no equilibrium: `residual` is then x', shape (n,).
         """
         start, p = self._guess(guess), self.system.parameter_vector(parameters)
-        return self._equilibria.find(self._resting(start, outputs, p), start)
+        return self._equilibria.find(self._resting(start, outputs, p), start).state
 
     @checked(ModelError)
     def eigenvalues(
@@ -195,12 +201,9 @@ class ZeroDynamics:
         start = self.structure.manifold.project(self._guess(state), p)
         pinned = self._resting(start, outputs, p)
         try:
-            rest = self._equilibria.search(pinned, start)
+            rest = self._equilibria.find(pinned, start, regular=False)
         except InconsistentStateError as error:
             return Stability(Verdict.UNDECIDED, str(error))
-        if rest.unrest:
-            reason = self._equilibria.none(pinned, rest.state, rest.unrest)
-            return Stability(Verdict.UNDECIDED, reason)
         values, errors = linearized_eigenvalues(pinned, self._equilibria.sizes, rest.state)
         where = "at rest" if rest.degenerate else "at the equilibrium"
         place = f"{where} with {pinned.describe()}"
@@ -233,7 +236,7 @@ class ZeroDynamics:
         distinct = np.zeros((0, self.system.num_states))
         for start in starts:
             try:
-                rest = self._equilibria.find(pinned, start)
+                rest = self._equilibria.find(pinned, start).state
             except InconsistentStateError:
                 continue
             sizes = np.maximum(self._equilibria.sizes, np.abs(rest))
@@ -275,10 +278,8 @@ class ZeroDynamics:
                 f"{self.system.name}: the motion belongs to another system: its states have shape "
                 f"{motion.states.shape}, and not {(motion.times.size, n)}"
             )
-        motions = PeriodicMotions(
-            self._pinned, reference, self._moving(p, exogenous), self._equilibria.sizes, period
-        )
-        return motions.judge(motion)
+        at = partial(self._pinned.at_time, reference, self._moving(p, exogenous))
+        return PeriodicMotions(at, self._equilibria.sizes, period).judge(motion)
 
     def _moving(
         self, parameters: FloatArray, exogenous: Sequence[Exogenous]

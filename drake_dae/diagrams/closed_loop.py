@@ -31,6 +31,10 @@ from drake_dae.systems.sensing.force_sensor import ForceSensor
 class ClosedLoop:
     """A plant under a controller: a Drake diagram with named parts, and the record of its runs.
 
+    With the numbers of a context, `TracedSystem(compile_diagram(loop.diagram, context=context))` is
+    the loop as one block with the same output ports. Drake's contact and sources of noise stay
+    outside, and their outputs are its inputs.
+
     Attributes:
         diagram: The diagram, with the output ports `state`, `constraint_force`,
             `constraint_residual`, `controlled_output`, `control`, further signals of plant,

@@ -22,15 +22,7 @@ from drake_dae.references.reference import Reference
 @checked(ReferenceSignalError)
 @dataclass(frozen=True, eq=False)
 class ReferenceRows(Reference):
-    """A reference that consists of some rows of another one, in any order.
-
-    Attributes:
-        reference: The reference.
-        rows: The chosen rows, shape (k,).
-
-    Raises:
-        ReferenceSignalError: There is no such row, a row occurs twice, or no row is given.
-    """
+    """A reference that consists of some rows of another one, in any order."""
 
     reference: Reference
     rows: tuple[int, ...]
@@ -132,17 +124,7 @@ def in_order(assignments: Sequence[Assignment], outputs: Sequence[str]) -> list[
 def references_by_name(
     references: Mapping[str, Reference | float], outputs: Sequence[str], degrees: Sequence[int]
 ) -> list[Reference]:
-    """Returns references in the order of the outputs.
-
-    Args:
-        references: Name -> reference, or a number for a constant.
-        outputs: The names of all outputs.
-        degrees: The degrees mu_1, ..., mu_p of the outputs, `TrackingLaw.degrees`.
-
-    Raises:
-        ReferenceSignalError: A name has no output, an output has no reference or two, or a
-            reference does not fit or is not smooth enough.
-    """
+    """Returns references in the order of the outputs."""
     outputs = list(outputs)
     if len(degrees) != len(outputs):
         raise ReferenceSignalError(f"{len(outputs)} outputs have {len(degrees)} degrees")

@@ -89,11 +89,7 @@ class Travel:
 
     @staticmethod
     def shortest(length: float, limits: PathLimits, order: int) -> "Travel":
-        """Returns the shortest travel along a straight line within limits.
-
-        With the peaks c1 and c2 of S' and S'' the ramp takes max(c1 v / a, sqrt(c2 v / j)), and the
-        speed v is the largest with which both ramps fit into the length.
-        """
+        """Returns the shortest travel along a straight line within limits."""
         speed, acceleration, jerk = limits.values
         m = order - 1
         scale = factorial(2 * m + 1) / factorial(m) ** 2  # S' = scale (x (1 - x))^m
@@ -115,12 +111,7 @@ def _bernstein(coefficients: FloatArray, x: ca.SX) -> ca.SX:
 
 
 class PathReference(FormulaReference):
-    """A motion along a path, r(t) = p(s(t - start_time)), from rest to rest.
-
-    s is a `Travel` with `order` continuous derivatives, as many as the law needs. If the
-    curve makes acceleration or jerk too large, the whole motion is slowed until both are within
-    limits. A member has p(s) with |dp/ds| <= 1, for 0 <= s <= `length`.
-    """
+    """A motion along a path, r(t) = p(s(t - start_time)), from rest to rest."""
 
     limits: PathLimits | None
     start_time: float

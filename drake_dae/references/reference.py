@@ -154,15 +154,7 @@ def with_degrees(
 def stack_references(
     references: Sequence[Reference], degrees: Sequence[int]
 ) -> Callable[[float], FloatArray]:
-    """Combines references to one function of the time in s; expressions are traced together.
-
-    Args:
-        references: The references, in the order of the outputs.
-        degrees: The degrees mu_1, ..., mu_p of all outputs.
-
-    Raises:
-        ReferenceSignalError: A reference is not smooth enough.
-    """
+    """Combines references to one function of the time in s; expressions are traced together."""
     parts = with_degrees(references, degrees)
     time = ca.SX.sym("t")
     rows = [reference.expression(part, time) for reference, part in parts]

@@ -78,11 +78,7 @@ class KnownForce(Load):
 @checked(ModelError)
 @dataclass(frozen=True)
 class KnownWrench(KnownForce):
-    """A force F on a point of a frame and a moment M on the frame.
-
-    The parameters "<name>.force" and "<name>.moment" are F in N and M in N m, in the world, zero by
-    default: so any point of the body can be pushed.
-    """
+    """A force and a moment "<name>.moment", N m, on a frame: so any point of it can be pushed."""
 
     name: str = "wrench"
 
@@ -100,11 +96,7 @@ class KnownWrench(KnownForce):
 
 @dataclass(frozen=True)
 class ScaledForce(KnownForce):
-    """A force s(t) F on a point of a frame, where the factor s is an exogenous signal.
-
-    The parameter "<name>.force" is F in N, in the world, and "<name>.course" is s, zero by default:
-    a study changes F without another signal.
-    """
+    """A force s(t) F: "<name>.force" is F, and "<name>.course" s, exogenous and zero by default."""
 
     name: str = "scaled_force"
     force: Vector = (0.0, 0.0, 0.0)

@@ -12,25 +12,24 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, vector
-from drake_dae.dae import Signal, share_forces
+from drake_dae.dae import DaeSystem, Parameter, Signal, share_forces
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.robots.actuation.stage import Stage, chain
+from drake_dae.robots.actuation.stage import ActuationChain, Stage, chain, diagonal_parameter
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.constraints.constraint_set import ConstraintSet, LoopState
 from drake_dae.robots.constraints.couplers import plant_constraints
-from drake_dae.robots.equations import (
-    check_mass_matrix,
-    check_outputs,
-    control_choice,
-    robot_equations,
-)
-from drake_dae.robots.force_outputs import ForceOutput, as_force_outputs, force_rows
 from drake_dae.robots.links.links import Links
 from drake_dae.robots.links.multibody import MultibodyExpressions
 from drake_dae.robots.loads import Load
-from drake_dae.robots.outputs import PositionOutput
+from drake_dae.robots.outputs import (
+    ForceOutput,
+    PositionOutput,
+    as_force_outputs,
+    force_rows,
+)
 from drake_dae.robots.statics import StaticBalance, StaticPlacement
 from drake_dae.trace.compiled import Compiled
+from drake_dae.trace.functions import TracedFunction
 
 
 @checked(ModelError)
@@ -103,8 +102,7 @@ class RobotModel:
         self._num_forces = S.shape[0]
         h_1 = ca.vertcat(ca.SX(0, 1), *[o.expression(links) for o in self.outputs])  # (39)
         signals = [signal for output in self.outputs for signal in output.signals(links)]
-        weighted = control_weights is not None
-        check_outputs(name, links, bound.motors, self._num_forces, signals, weighted)
+        self._check_outputs(bound.motors, signals, is_chosen=control_weights is not None)
         driven = chain(actuation, links)
         if driven.stages and bound.motors:
             raise ModelError(
@@ -123,24 +121,13 @@ class RobotModel:
         self.loop_joints = LoopState(bound, links)
         nominal = links.default_positions if nominal_positions is None else nominal_positions
         nominal = vector(f"{name}: nominal_positions", nominal, links.q.numel())
-        equations = robot_equations(
-            name,
-            links,
-            bound,
-            driven,
-            self.loop_joints,
-            self.known_forces,
-            h_1,
-            S,
-            (*signals, *(signal for force in self.forces for signal in force.signals(bound))),
-            choice,
-            nominal,
-        )
+        signals += [signal for force in self.forces for signal in force.signals(bound)]
+        equations = self._equations(bound, driven, h_1, S, tuple(signals), choice, nominal)
         self.dae = replace(equations, compiled=compiled).with_exogenous(exogenous)
         self._check_exogenous()
         if compliances is not None:
             self.dae = share_forces(self.dae, compliances=compliances)
-        check_mass_matrix(self.dae, links, nominal)
+        self._check_mass_matrix(nominal)
         # Redundant rows mislead Newton's method.
         rows = [row for row in ca.vertsplit(self.dae.k) if not ca.depends_on(row, links.v)]
         phi = ca.vertcat(ca.SX(0, 1), *rows) if self.dae.sharing else bound.residual(links)
@@ -157,6 +144,78 @@ class RobotModel:
             values = self.dae.parameter_values
             state, _, _ = self.balance.rest(nominal, np.zeros(self._num_forces), values)
             self.dae = replace(self.dae, nominal_state=state)
+
+    def _equations(
+        self,
+        bound: ConstraintSet,
+        driven: ActuationChain,
+        h_1: ca.SX,
+        S: ca.SX,
+        signals: tuple[Signal, ...],
+        choice: tuple[Parameter, ...],
+        nominal: FloatArray,
+    ) -> DaeSystem:
+        """(43)-(45) with z = (h_1(q), S(q) lambda) and M on the left; stages follow the links."""
+        links = self.links
+        nq, nv, k = links.q.numel(), links.v.numel(), driven.state.numel()
+        controls = (*driven.control_signals, *bound.motors)
+        m, nu = bound.size, len(controls)
+        B = ca.SX(ca.sparsify(ca.DM(links.actuation_matrix)))
+        velocity = ca.mtimes(links.velocity_map, links.v)
+        kinematics, known = links.kinematics(), ca.SX(nv, 1)
+        for load in self.known_forces:
+            known += links.generalized_force(kinematics, load.reaction(kinematics))
+        torque = ca.mtimes(B, driven.joint_force) + known + bound.drag(links)
+        torque += self.loop_joints.force
+        reflected = links.actuation_matrix * links.reflected_inertia @ links.actuation_matrix.T
+        # Rotors move with the links, or with a stage.
+        moved = ca.SX(ca.sparsify(ca.DM(reflected * driven.carries_rotors)))
+
+        def implicit(rate: ca.SX, constraint_force: ca.SX) -> tuple[ca.SX, ca.SX]:
+            acceleration = rate[nq : nq + nv]
+            inertial, constraint_rate = bound.implicit(links, acceleration, constraint_force)
+            slip = ca.sparsify(rate[:nq] - velocity)
+            if slip.nnz():  # q' is an unknown of its own where N is not the identity.
+                moving = links.kinematics()
+                constraint_rate += ca.jtimes(moving.value(bound.rate(moving)), links.q, slip)
+            balance = inertial - ca.mtimes(moved, acceleration) - torque  # (37)
+            stages = ca.mtimes(driven.mass, rate[nq + nv :]) - driven.drift
+            return ca.vertcat(rate[:nq] - velocity, balance, stages), constraint_rate
+
+        return DaeSystem(
+            state=ca.vertcat(links.q, links.v, driven.state),
+            mass_matrix=ca.diagcat(ca.SX.eye(nq), links.mass_matrix - moved, driven.mass),
+            f=ca.vertcat(velocity, torque - links.bias, driven.drift),  # (43)
+            g=ca.vertcat(ca.SX(nq, m), bound.force_matrix(links), ca.SX(k, m)),
+            h=ca.vertcat(
+                ca.SX(nq, nu),
+                ca.horzcat(ca.mtimes(B, driven.direct), self.loop_joints.motors),
+                ca.horzcat(driven.drive, ca.SX(k, self.loop_joints.motors.shape[1])),
+            ),
+            k=bound.constraint_output(links.kinematics()),  # (44)
+            l=ca.vertcat(h_1, ca.SX(S.shape[0], 1)),  # (45)
+            m=ca.vertcat(ca.SX(h_1.numel(), m), S),
+            parameters=(
+                *links.parameters,
+                *driven.parameters,
+                *bound.parameters,
+                *(parameter for load in self.known_forces for parameter in load.parameters),
+                *choice,
+            ),
+            state_signals=(*links.position_signals, *links.velocity_signals, *driven.state_signals),
+            constraint_input_signals=bound.force_signals,
+            constraint_output_signals=bound.residual_signals,
+            control_signals=controls,
+            output_signals=signals,
+            nominal_state=np.concatenate([nominal, np.zeros(nv + k)]),
+            state_scale=np.ones(nq + nv + k),  # For SI units and angles.
+            name=self.name,
+            implicit=implicit,
+            control_metric=ca.diag(choice[0].symbol) if choice else None,
+            free_control=choice[1].symbol if choice else None,
+            contacts=bound.contacts(links),
+            dry=tuple(name for load in self.known_forces for name in load.dry),
+        )
 
     @classmethod
     def from_multibody(cls, plant: MultibodyPlant, *arguments: Any, **options: Any) -> Self:
@@ -191,17 +250,15 @@ class RobotModel:
         parameters: ArrayLike | None = None,
         output_parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """q = psi(z_1) of (58): the consistent configuration with given position outputs.
+        """q = psi(z_1) of (58), shape (nq,): the consistent configuration with given outputs.
 
         Args:
             outputs: z_1, shape (nu - k,) where k forces are outputs; None leaves them free.
-            guess: Where Newton's method starts, shape (nq,).
+            guess: Where Newton's method starts, shape (nq,); if the outputs do not determine q, the
+                one next to it is returned.
             parameters: Values of all parameters; the defaults if None.
             output_parameters: Values of all parameters for z_1, such as those that a law assumes
                 for a wall that its constraint has elsewhere; `parameters` if None.
-
-        Returns:
-            q, shape (nq,); if the outputs do not determine it, the one next to the guess.
 
         Raises:
             InconsistentStateError: There is no such configuration near the guess.
@@ -211,54 +268,103 @@ class RobotModel:
         count = 0 if outputs is None else len(self.position_signals)
         wanted = vector(f"{self.name}: outputs", [] if outputs is None else outputs, count)
         values = self.dae.parameter_vector(parameters)
-        of_outputs = values
-        if output_parameters is not None:
-            of_outputs = self.dae.parameter_vector(output_parameters)
-        return self.placing.solve(wanted, q, values, of_outputs)
+        given = parameters if output_parameters is None else output_parameters
+        return self.placing.solve(wanted, q, values, self.dae.parameter_vector(given))
 
     @checked(ModelError)
     def rest_state(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """The state at rest in a configuration with given constraint forces.
+        """x = (q, 0, s), shape (n,), at rest in a configuration q with given force outputs.
 
-        The states of the stages (shaft positions, currents, actuator forces) and the forces that
-        are not outputs are solved for with v = 0, v' = 0, s' = 0.
+        The states s of the stages (shaft positions, currents, actuator forces) and the forces that
+        are not outputs are solved for with v = 0, v' = 0, s' = 0. With rigid joints the forces do
+        not enter it.
 
         Args:
             positions: q, shape (nq,), on the constraints.
             forces: The force outputs z_2, shape (k,): lambda if all forces are outputs.
             parameters: Values of all parameters; the defaults if None.
 
-        Returns:
-            x = (q, 0, s), shape (n,). With rigid joints the forces do not enter it.
-
         Raises:
             ModelError: No drive holds the robot there.
         """
-        values = self.dae.parameter_vector(parameters)
-        q = vector(f"{self.name}: positions", positions, self.links.q.numel())
-        load = vector(f"{self.name}: forces", forces, self._num_forces)
-        return self.balance.state(q, load, values)
+        return self.balance.state(*self._at_rest(positions, forces, parameters))
 
     @checked(ModelError)
     def rest_forces(
         self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None = None
     ) -> FloatArray:
-        """All constraint forces at rest in a configuration, for given force outputs.
+        """lambda, shape (m,), at rest with S lambda = z_2; arguments as of `rest_state`."""
+        return self.balance.rest(*self._at_rest(positions, forces, parameters))[1]
 
-        Args:
-            positions: q, shape (nq,), on the constraints.
-            forces: The force outputs z_2, shape (k,).
-            parameters: Values of all parameters; the defaults if None.
-
-        Returns:
-            lambda, shape (m,), with S lambda = z_2.
-        """
-        values = self.dae.parameter_vector(parameters)
+    def _at_rest(
+        self, positions: ArrayLike, forces: ArrayLike, parameters: ArrayLike | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         q = vector(f"{self.name}: positions", positions, self.links.q.numel())
         load = vector(f"{self.name}: forces", forces, self._num_forces)
-        return self.balance.rest(q, load, values)[1]
+        return q, load, self.dae.parameter_vector(parameters)
+
+    def _check_outputs(
+        self, motors: Sequence[Signal], positions: Sequence[Signal], is_chosen: bool
+    ) -> None:
+        """Refuses a number of outputs that does not fit that of the actuators."""
+        name, links, forces = self.name, self.links, self._num_forces
+        of_joints, count = len(links.actuator_signals), len(positions)
+        nu = of_joints + len(motors)
+        if nu == 0 and count + forces:
+            raise ModelError(
+                f"{name}: there are no actuators, so no output can be controlled, but {count} "
+                f"positions and {forces} constraint forces are outputs. To simulate it leave both "
+                "out; to steer it give joints actuators, by plant.AddJointActuator or a "
+                "<transmission>"
+            )
+        if is_chosen:
+            if not 0 < count + forces < nu:
+                raise ModelError(
+                    f"{name}: control_weights choose among the controls of more actuators than "
+                    f"outputs, but there are {nu} actuators and {count + forces} outputs"
+                )
+            return
+        rank = int(np.linalg.matrix_rank(links.actuation_matrix)) if of_joints else 0
+        if rank < of_joints:
+            actuators = ", ".join(signal.name for signal in links.actuator_signals)
+            raise ModelError(
+                f"{name}: the {of_joints} actuators {actuators} move the joints in only {rank} "
+                "independent ways; leave one out, or give control_weights and fewer outputs"
+            )
+        if (
+            count + forces and count + forces != nu
+        ):  # A robot that is only simulated needs no outputs.
+            names = ", ".join(signal.name for signal in positions) or "none"
+            remedy = "for fewer, control_weights choose the control"
+            if count + forces > nu:
+                remedy = (
+                    "name in `forces` those that shall be steered, [] for none, or add actuators"
+                )
+            raise ModelError(
+                f"{name}: {nu} actuators can steer {nu} outputs, not {forces} constraint forces "
+                f"and {count} positions ({names}); {remedy}"
+            )
+
+    def _check_mass_matrix(self, nominal: FloatArray) -> None:
+        """Refuses an M, without rotors that move with a stage, that is not positive definite."""
+        dae, links = self.dae, self.links
+        nq, nv = links.q.numel(), links.v.numel()
+        inputs = {"q": links.q, "parameters": dae.parameter_symbol}
+        expression = dae.mass_matrix[nq : nq + nv, nq : nq + nv]
+        function = TracedFunction("mass matrix", inputs, {"mass_matrix": expression})
+        mass = np.atleast_2d(function(nominal, dae.parameter_values)[0])
+        asymmetry = np.abs(mass - mass.T).max()
+        if asymmetry > 1e-9 * np.abs(mass).max():
+            raise ModelError(f"{dae.name}: M(q) is not symmetric, by {asymmetry:.2g}")
+        smallest = float(np.linalg.eigvalsh(mass)[0])
+        if smallest <= 0.0:
+            raise ModelError(
+                f"{dae.name}: M(q) is not positive definite at the nominal configuration: "
+                f"smallest eigenvalue {smallest:.2g}. A link without inertia cannot be moved by a "
+                "force; give it mass, or weld it"
+            )
 
     def _check_exogenous(self) -> None:
         """Refuses exogenous parameters of nonholonomic constraints: their rate is incomplete."""
@@ -284,3 +390,20 @@ class RobotModel:
             f"{self.name}: no configuration on the constraints is found from the default one, nor "
             "from 20 random ones; give nominal_positions near one, or check the constraints"
         )
+
+
+def control_choice(
+    name: str, weights: ArrayLike | None, controls: Sequence[Signal]
+) -> tuple[Parameter, ...]:
+    """The parameters "control_weights" and "free_control" of the least sum w_i (u_i - u_0i)^2."""
+    if weights is None:
+        return ()
+    units = sorted({signal.unit for signal in controls})
+    if np.ndim(weights) == 0 and len(units) > 1:
+        raise ModelError(
+            f"{name}: the controls are in {' and '.join(units)}, which one weight cannot compare; "
+            "give each a weight, as 1 / limit^2"
+        )
+    nu = len(controls)
+    chosen, _ = diagonal_parameter("control_weights", weights, nu, "", positive=True)
+    return chosen, Parameter("free_control", np.zeros(nu), units[0] if len(units) == 1 else "")

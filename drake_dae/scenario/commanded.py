@@ -10,7 +10,8 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError
+from drake_dae.pictures.page.controls import PUSH
 from drake_dae.references import ConstantReference
 from drake_dae.robots import KnownWrench, PointOnSurface
 from drake_dae.scenario.build import build_completed
@@ -18,19 +19,13 @@ from drake_dae.scenario.robot_file.reading import robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 
-PUSH = "push."
-"""The prefix of the names of wrenches on links."""
-
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
-    """A loop that a person can change while it runs.
+    """A loop that a person can change while it runs, and its start.
 
-    Attributes:
-        scenario: The completed scenario, with the added parameters and wrenches.
-        loop: The closed loop of the scenario.
-        context: The initial context of the loop's diagram.
-        left_out: A sentence for each kind of change that is not possible.
+    The completed scenario has the added parameters and wrenches; `left_out` is a sentence for each
+    kind of change that is not possible.
     """
 
     scenario: Scenario
@@ -44,11 +39,7 @@ def build_commanded(scenario: Scenario) -> Commanded:
     """Builds a loop with `CommandedReferences`, surfaces that can be moved, and wrenches on links.
 
     Without commands the loop behaves as in the scenario: surfaces are fixed, and wrenches and
-    additional friction are zero. Signals for which a task waits are inputs of the diagram. The loop
-    omits changes that the scenario does not permit, and `left_out` contains the reasons.
-
-    Args:
-        scenario: A scenario as returned by `load_scenario`.
+    additional friction are zero. Signals for which a task waits are inputs of the diagram.
 
     Raises:
         ScenarioError: The scenario itself is not valid, or its plant has Drake's own contact, which
@@ -58,24 +49,28 @@ def build_commanded(scenario: Scenario) -> Commanded:
         text = "Drake's own contact cannot be traced: take a !CompliantContact in its place"
         raise ScenarioError(("plant", text))
     extended, left_out = scenario, list[str]()
-    for name, add in _PARTS.items():
-        result = add(extended)
-        if isinstance(result, str):
-            left_out.append(f"{name}: {result}")
-        else:
-            extended = result
+    parts: Mapping[str, Callable[[Scenario], Scenario]] = {
+        "friction of the plant": _with_friction,
+        "surfaces that are dragged": _with_moving_surfaces,
+        "links that are pushed": _with_pushes,
+    }
+    for name, add in parts.items():
+        try:
+            extended = add(extended)
+        except ModelError as error:
+            left_out.append(f"{name}: none, since {error}")
     try:
         completed, loop = build_completed(extended, commanded=True)
     except DrakeDaeError as error:
         completed, loop = build_completed(scenario, commanded=True)  # Its own errors come first.
-        left_out = [f"{name}: {error}" for name in _PARTS]
+        left_out = [f"{name}: {error}" for name in parts]
     # The original exogenous signals decide whether the loop starts at rest.
     initial = replace(completed.scenario, exogenous=scenario.exogenous)
     return Commanded(completed.scenario, loop, start_scenario(initial, loop), tuple(left_out))
 
 
-def _with_friction(scenario: Scenario) -> Scenario | str:
-    """Adds a coefficient of friction of 0 to frictionless contacts; or returns why it cannot."""
+def _with_friction(scenario: Scenario) -> Scenario:
+    """Adds a coefficient of friction of 0 to frictionless contacts."""
     constraints = [
         replace(constraint, friction=0.0)
         if isinstance(constraint, PointOnSurface) and constraint.friction is None
@@ -86,20 +81,19 @@ def _with_friction(scenario: Scenario) -> Scenario | str:
     if constraints == scenario.constraints or scenario.plant.material is not None:
         return scenario
     if scenario.actuation:
-        return "none, since the law would differentiate it; give the constraint a friction"
+        raise ModelError("the law would differentiate it; give the constraint a friction")
     return replace(scenario, constraints=constraints)
 
 
-def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
-    """Makes the positions of surfaces constant exogenous signals; or returns why it cannot."""
+def _with_moving_surfaces(scenario: Scenario) -> Scenario:
+    """Makes the positions of surfaces constant exogenous signals."""
     if scenario.plant.material is not None:
         return scenario  # Of a compliant contact they are parameters of the plant alone.
-    for part, what in ((scenario.task, "a task"), (scenario.estimator, "an estimator")):
-        if part is not None:
-            return (
-                f"none, since {what} does not know how a surface moves, and an ideal contact needs "
-                "a law that does; with `plant: !CompliantContact` they are dragged"
-            )
+    if scenario.estimator is not None:
+        raise ModelError(
+            "an estimator does not know how a surface moves, and an ideal contact needs a law that "
+            "does; with `plant: !CompliantContact` they are dragged"
+        )
     moving = dict[str, Any]()
     for constraint in scenario.constraints:
         if isinstance(constraint, PointOnSurface):
@@ -109,7 +103,7 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario | str:
     return replace(scenario, exogenous={**scenario.exogenous, **moving})
 
 
-def _with_pushes(scenario: Scenario) -> Scenario | str:
+def _with_pushes(scenario: Scenario) -> Scenario:
     """Adds a zero wrench to each movable link."""
     plant = robot_links(scenario.robot, SceneGraph(), drawn=False)[0].plant
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
@@ -120,11 +114,3 @@ def _with_pushes(scenario: Scenario) -> Scenario | str:
     ]
     robot = scenario.robot
     return replace(scenario, robot=replace(robot, known_forces=[*robot.known_forces, *pushes]))
-
-
-_PARTS: Mapping[str, Callable[[Scenario], Scenario | str]] = {
-    "friction of the plant": _with_friction,
-    "surfaces that are dragged": _with_moving_surfaces,
-    "links that are pushed": _with_pushes,
-}
-"""What a person changes -> the function that adds it to a scenario, or says why it cannot."""

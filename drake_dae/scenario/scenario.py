@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from casadi import SX
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 from pydrake.systems.analysis import SimulatorConfig
 
 from drake_dae import references as rs
@@ -25,7 +25,7 @@ from drake_dae.errors import ScenarioError
 from drake_dae.files import read_text
 from drake_dae.references import Reference
 from drake_dae.robots import ForceOutput, Load, Pair, Stage, Surface, Vector
-from drake_dae.running.simulate import check_config, check_duration
+from drake_dae.running.simulate import check_config
 from drake_dae.scenario import form, parts, plants
 from drake_dae.scenario.form import Family, Key, Reader, keys_of
 from drake_dae.scenario.parts import (
@@ -42,18 +42,22 @@ from drake_dae.scenario.parts import (
 from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import shipped_scenarios
-from drake_dae.scenario.typed_yaml import MOST_TEXT, TAG, dump_yaml, load_lines, load_yaml
+from drake_dae.scenario.typed_yaml import (
+    MOST_TEXT,
+    TAG,
+    dump_yaml,
+    first_name,
+    load_lines,
+    load_yaml,
+)
 from drake_dae.systems.control.drives import Sampling
 from drake_dae.systems.task import phases
 from drake_dae.trace.compiled import Compiled
 
 
-def _checked_by(check: Callable[[Any], None]) -> AfterValidator:
-    def validate(value: Any) -> Any:
-        check(value)
-        return value
-
-    return AfterValidator(validate)
+def _valid(config: SimulatorConfig) -> SimulatorConfig:
+    check_config(config)
+    return config
 
 
 _INTEGRATOR = {
@@ -134,8 +138,8 @@ class Scenario:
     references: dict[str, Reference | float] = field(default_factory=dict)
     task: ScenarioTask | None = None
     start: Start = field(default_factory=Start)
-    duration: Annotated[float, _checked_by(check_duration)] = 10.0
-    integrator: Annotated[SimulatorConfig, _checked_by(check_config)] = field(
+    duration: Annotated[float, Field(gt=0.0)] = 10.0
+    integrator: Annotated[SimulatorConfig, AfterValidator(_valid)] = field(
         default_factory=lambda: SimulatorConfig(
             **{n: value for n, (value, _) in _INTEGRATOR.items()}
         )
@@ -225,6 +229,7 @@ _VALUES: dict[Any, Any] = {
     Callable[..., SX] | str: str,
     str | Path: Annotated[Any, form.FILE],
     str | Sequence[str]: Annotated[Any, form.NAMES],
+    Compiled: Annotated[Any, form.COMPILED],
     float | list[float]: Annotated[Any, form.NUMBER_OR_LIST],
     ArrayLike: Annotated[Any, form.NUMBERS],
     Vector: Annotated[Any, form.TRIPLE],
@@ -273,9 +278,6 @@ def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     return varied
 
 
-_ROBOT = re.compile(r"<(?:robot|sdf|mujoco)\b|^directives\s*:", re.MULTILINE)
-
-
 @checked(lambda text: ScenarioError(("", text)))
 def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """Reads a scenario file.
@@ -299,9 +301,7 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
     except (OSError, ValueError) as error:  # A null byte in the path.
         raise ScenarioError((str(path), getattr(error, "strerror", None) or str(error))) from None
-    is_markup = text.lstrip().startswith("<")
-    robot = _ROBOT.search(text) if is_markup or "directives" in text else None
-    if robot is not None and is_markup != robot[0].startswith("directives"):
+    if _is_robot(text):
         problem = (
             f"this is a robot, not a scenario; `drake-dae new {path}` writes a scenario with it, "
             "and in one of your own it is robot.file"
@@ -322,11 +322,18 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
 
     def place_of(key: str) -> str:
         """Where a key stands in the file; empty if it is one of the settings."""
-        is_set = any(f"{key}.".startswith(f"{other}.") for other in changed)
+        is_set = first_name(changed, key) is not None
         line = None if is_set else line_of(key)
         return "" if line is None else f"[{path.name}:{line}]"
 
     return scenario_reader().read(data, folder, place_of)
+
+
+def _is_robot(text: str) -> bool:
+    """Whether a text is a robot's file: markup, or Drake's model directives."""
+    if text.lstrip().startswith("<"):
+        return re.search(r"<(?:robot|sdf|mujoco)\b", text) is not None
+    return re.search(r"^directives\s*:", text, re.MULTILINE) is not None
 
 
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:

@@ -16,6 +16,7 @@ from concurrent.futures import (
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from importlib.metadata import version
 from pathlib import Path
+from threading import RLock
 from types import ModuleType
 from typing import Any
 
@@ -177,7 +178,7 @@ def _result(future: "Future[RunResult]") -> RunResult:
 def _processes(count: int, time_limit: float, most: int) -> Iterator[tuple[Submit, int]]:
     """Processes of this machine, each for so many runs. One that dies, or is slow, is replaced."""
     context = _WithoutMain()
-    pool = ProcessPool(count, max_tasks=most, context=context)
+    pool = ProcessPool(count, max_tasks=most, context=context, initializer=_begin)
     try:
         yield (lambda *args: pool.schedule(run_one, args, timeout=time_limit)), 4 * count
     finally:
@@ -186,6 +187,11 @@ def _processes(count: int, time_limit: float, most: int) -> Iterator[tuple[Submi
         for process in filter(_Process.is_alive, list(context.started)):
             process.kill()
         pool.join()
+
+
+def _begin() -> None:
+    """Makes bars lock threads alone: a process that is killed would leave a semaphore behind."""
+    tqdm.set_lock(RLock())
 
 
 class _Process(multiprocessing.context.SpawnProcess):

@@ -69,27 +69,22 @@ class TracedFunction:
         regular: str = "a matrix",
         often: bool = True,
         compiled: Compiled = False,
-        doubt: ca.SX | None = None,
-        lean: bool = False,
-        outside: str = "",
     ) -> None:
         self.name = name
-        self._regular, self._outside = regular, outside
+        self._regular = regular
         self.input_names = tuple(inputs)
         self.output_names = tuple(outputs)
         dense = [ca.densify(expression) for expression in outputs.values()]
         # Two numbers show whether the values are valid: the first is finite exactly if all outputs
-        # are, the last if also the pivot is large enough and the doubt is not negative.
+        # are, the last if also the pivot is large enough.
         finite = sum((ca.sum1(ca.vec(e)) for e in dense if e.numel()), ca.SX(0))
         checks, regularity = [finite], ca.SX(1)
         if pivot is not None:
             regularity = pivot
             checks.append(finite + ca.if_else(pivot >= SINGULAR_PIVOT, 0, np.nan))
-        if doubt is not None:
-            checks.append(checks[-1] + ca.if_else(doubt >= 0, 0, np.nan))
         expressions = [*dense, regularity, *checks]
         self._expressions, self._symbols = expressions, list(inputs.values())
-        self._often, self._lean = often, lean
+        self._often = often
         self.sizes = tuple(symbol.numel() for symbol in self._symbols)
         self._num_inputs, self._num_outputs = len(self.sizes), len(dense)
         self._local, self._lock = local(), RLock()
@@ -103,7 +98,7 @@ class TracedFunction:
     def function(self) -> ca.Function:
         """The CasADi function: outputs, pivot, and numbers that are finite if they are valid."""
         expressions = self._expressions
-        if self._often and not self._lean:
+        if self._often:
             expressions = ca.cse(expressions)
         name = re.sub("[^A-Za-z0-9]+", "_", f"f_{self.name}")  # As CasADi accepts them.
         return ca.Function(name, self._symbols, expressions, {"cse": False})
@@ -181,17 +176,12 @@ class TracedFunction:
         return isfinite(self._arrays.finite[0])
 
     @property
-    def is_regular(self) -> bool:
-        """Whether the last values are finite and the matrix is regular; ignores the doubt."""
-        return self.is_finite and self.pivot >= SINGULAR_PIVOT
-
-    @property
     def pivot(self) -> float:
         """The pivot of the last evaluation; 1 without a matrix."""
         return float(self._arrays.pivot[0])
 
     def failure(self) -> Failure:
-        """Returns the failure of the last evaluation, if it was not valid."""
+        """The failure of the last evaluation, if it was not valid."""
         for fault, limit in ((FailureKind.INPUT, np.inf), (FailureKind.OVERFLOW, HUGE)):
             bad = {
                 name: tuple(int(i) for i in np.flatnonzero(~(np.abs(argument) < limit)))
@@ -201,8 +191,6 @@ class TracedFunction:
             if bad:
                 return Failure(self.name, fault, bad)
         # A value may not be finite because the matrix is singular.
-        if self.is_regular and self._outside:
-            return Failure(self.name, FailureKind.OUTSIDE, {}, self._outside)
         is_singular = self.is_finite or self.pivot < SINGULAR_PIVOT
         fault = FailureKind.SINGULAR if is_singular else FailureKind.VALUE
         return Failure(self.name, fault, {}, self._regular)

@@ -10,7 +10,6 @@ from problems.found import NO, findings
 
 from drake_dae.analysis import analyze
 from drake_dae.dae import DaeSystem, Manifold, Region
-from drake_dae.dae.samples import ConsistentRegion
 
 
 def test_a_region_bounds_all_states():
@@ -84,6 +83,6 @@ def test_downhill_along_the_manifold():
     start = np.array([-0.8, 0.6])
     for high, end in ((2.0, goal), (0.28, np.array([0.28, 0.96]))):
         region = Region(np.array([-2.0, -2.0]), np.array([high, 2.0]))
-        found = ConsistentRegion(circle(), region).descend(distance, start)
+        found = region.descend(circle(), distance, start)
         assert np.linalg.norm(found) == pytest.approx(1.0, abs=1e-12)
         np.testing.assert_allclose(found, end, atol=1e-5)

@@ -11,10 +11,12 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 from numpy.testing import assert_allclose
+from problems import PROBLEMS
 
 from drake_dae import (
     ConstantReference,
     DaeSystem,
+    PointToPointReference,
     SinusoidReference,
     TrackingLaw,
     poles,
@@ -43,7 +45,7 @@ def block():
 def press(law, references, stiffness, start, times, order=0):
     """phi and F = -k phi^(order) of a plant that gives way, shape (len(times), 2)."""
     system = law.system
-    reference = stack_references(references, law.degrees)
+    reference = stack_references(references, law.layout.reference_degrees)
     residual, place = law.structure.manifold, order
 
     def rate(t, x):
@@ -101,6 +103,35 @@ def test_a_force_that_changes_is_followed_with_the_error_derived():
     gain = (STIFFNESS / MASS) / (STIFFNESS / MASS + 1j * speed * c - speed**2) - 1.0
     exact = 5.0 * np.imag(gain * np.exp(1j * speed * times[late]))
     assert_allclose(error, exact, atol=2e-5)
+
+
+def test_a_force_that_rises_within_a_period_of_the_contact_is_followed_by_its_deflection():
+    """From a start without error there is none; 2 pi / sqrt(A k) is 0.09 s, the rise takes 0.05.
+
+    The law is linear in 1 / k, so that half of k leaves the opposite of what none leaves.
+    """
+    force = PointToPointReference([10.0], [40.0], 0.1, 0.15)
+    times, start = np.linspace(0.0, 0.3, 61), [0.0, -10.0 / STIFFNESS, 0.0, 0.0]
+    wanted = np.array([force.derivatives([0])(t)[0] for t in times])
+
+    def errors(stiffness):
+        law = TrackingLaw(
+            block(), poles(-8.0), constraint_damping=poles(-50.0), contact_stiffness=stiffness
+        )
+        found, _ = press(law, [ConstantReference(0.0), force], STIFFNESS, start, times)
+        return found[:, 1] - wanted
+
+    # The integrator leaves 1e-6 of 40 N.
+    assert_allclose(errors(STIFFNESS), 0.0, atol=1e-4)
+    without = errors(None)
+    assert np.abs(without).max() > 5.0
+    assert_allclose(errors(STIFFNESS / 2.0), -without, atol=1e-4)
+
+
+@pytest.mark.parametrize(("problem", "match"), [("pendulum_tension", "0"), ("circuit", "circuit")])
+def test_where_a_deflection_is_not_known_it_is_refused(problem, match):
+    with pytest.raises(ModelError, match=match):
+        TrackingLaw(PROBLEMS[problem]().system, poles(-3.0), contact_stiffness=1e5 * (match != "0"))
 
 
 # Advice.

@@ -27,10 +27,6 @@ def oscillator(
     )
 
 
-def mathieu(s, w, z):
-    return -(1 + 0.9 * z) * s - 0.02 * w
-
-
 def sinusoid(rate: float, size: float = 1.0) -> Callable[[float], Array]:
     """R = (r, r') of r = size cos(rate t)."""
     return lambda t: size * np.array([np.cos(rate * t), -rate * np.sin(rate * t)])
@@ -64,24 +60,6 @@ def monodromy(slopes: Callable[[float], Array], period: float, begin: float = 0.
 
 def by_size(values: Array) -> Array:
     return np.array(sorted(values + 0j, key=lambda v: (-round(abs(v), 6), round(v.imag, 6))))
-
-
-@pytest.mark.slow
-def test_growth_by_a_parameter_that_oscillates():
-    """s'' = -(1 + 0.9 cos 2t) s - 0.02 s': each frozen system is stable, and it grows.
-
-    By Liouville the multipliers have the product exp(-0.02 pi).
-    """
-    found = along(oscillator(mathieu), sinusoid(2.0), np.pi)
-    matrix = monodromy(lambda t: np.array([[0.0, 1.0], [-(1 + 0.9 * np.cos(2 * t)), -0.02]]), np.pi)
-    # The error of integration, 1e-9 a step, in some fifty steps a period.
-    expected = by_size(np.linalg.eigvals(matrix))
-    np.testing.assert_allclose(found.multipliers, expected, rtol=1e-7)
-    product = np.prod(found.multipliers)
-    np.testing.assert_allclose(product, np.exp(-0.02 * np.pi), rtol=1e-7)
-    assert found.verdict is Verdict.UNSTABLE
-    # At rest nothing is wrong.
-    assert ZeroDynamics(oscillator(mathieu)).stability().verdict is Verdict.STABLE
 
 
 @pytest.mark.slow

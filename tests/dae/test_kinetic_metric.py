@@ -38,7 +38,7 @@ def rod_between_masses(masses=(1.0, 1e4), lengths=(1.0, 1.0)) -> Manifold:
     return find_constraint_structure(system).manifold
 
 
-@pytest.mark.parametrize("lengths", [(1.0, 1.0), (1e-3, 1.0), (1.0, 1e3), (1e-6, 1e2)])
+@pytest.mark.parametrize("lengths", [(1.0, 1.0), (1e-6, 1e2)])
 def test_what_is_heavy_stays_in_any_units(lengths):
     """A rod that is too long by 2e-6 m: of it the body of 1 kg moves 1e4 times as far."""
     manifold = rod_between_masses(lengths=lengths)

@@ -1,6 +1,5 @@
 """The coordinates (20)-(22) and their inverse, against hand calculation and MultibodyPlant."""
 
-from dataclasses import replace
 from functools import cache
 
 import casadi as ca
@@ -12,7 +11,7 @@ from problems import PROBLEMS, knife_edge
 from runs import some
 from two_arms import two_arms
 
-from drake_dae.dae import DaeSystem, NormalForm, Structure, find_structure
+from drake_dae.dae import NormalForm, Structure, find_structure
 from drake_dae.errors import InconsistentStateError, ModelError
 
 ROBOTS = {
@@ -163,32 +162,6 @@ def test_chosen_completions_are_named_states():
         ("joint1_motor.velocity", "rad/s"),
         ("joint2_motor.velocity", "rad/s"),
     ]
-
-
-def radius() -> DaeSystem:
-    """z = (x0^2 + x1^2)/2 is pushed radially; its level curves turn by more than 90 degrees."""
-    return DaeSystem.from_functions(
-        2,
-        f=lambda x: [x[1], -x[0]],
-        h=lambda x: [x[0], x[1]],
-        l=lambda x: (x[0] ** 2 + x[1] ** 2) / 2,
-        nominal_state=[1.0, 1.0],
-        name="radius",
-    )
-
-
-@pytest.mark.parametrize("small", [-0.1, 0.02])
-def test_combinations_of_states_where_no_single_state_will_do(small):
-    """dz = (x0, x1): x0 completes it where x1 is not 0, x1 where x0 is not, x0 - x1 at both."""
-    states = np.array([[1.0, 1.0], [1.0, small], [small, 1.0]])
-    structure = replace(find_structure(radius()), states=states)
-    normal_form = NormalForm(structure.system, structure=structure)
-    (signal,) = normal_form.completion_signals
-    assert signal.name == "x0 - x1"
-    for x in states:
-        coordinates = normal_form.coordinates(x)
-        np.testing.assert_allclose(coordinates, [x @ x / 2, x[0] - x[1]], rtol=0, atol=1e-15)
-        np.testing.assert_allclose(normal_form.state(coordinates), x, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize(

@@ -15,16 +15,9 @@ Matrices = dict[str, np.ndarray]
 
 
 def matrices(system: DaeSystem) -> Matrices:
-    """F, G, H, K, L, M of a linear system."""
+    """F, G and K of a linear system."""
     x = system.state
-    expressions = {
-        "F": ca.jacobian(system.f, x),
-        "G": system.g,
-        "H": system.h,
-        "K": ca.jacobian(system.k, x),
-        "L": ca.jacobian(system.l, x),
-        "M": system.m,
-    }
+    expressions = {"F": ca.jacobian(system.f, x), "G": system.g, "K": ca.jacobian(system.k, x)}
     function = ca.Function(
         "m", [x, system.parameter_symbol], [ca.densify(e) for e in expressions.values()]
     )
@@ -53,38 +46,11 @@ def kronecker_index(a: Matrices) -> int:
     return index
 
 
-def invariant_zeros(a: Matrices, longest: int) -> np.ndarray:
-    """Finite s where Rosenbrock's matrix of (1)-(3) from (v, u) to (y, z) loses rank.
-
-    Args:
-        a: The matrices.
-        longest: Of the degrees r and mu.
-    """
-    n, m = a["G"].shape
-    p = a["H"].shape[1]
-    rosenbrock = np.block(
-        [
-            [a["F"], a["G"], a["H"]],
-            [a["K"], np.zeros((m, m)), np.zeros((m, p))],
-            [a["L"], a["M"], np.zeros((p, p))],
-        ]
-    )
-    e = scipy.linalg.block_diag(np.eye(n), np.zeros((m + p, m + p)))
-    # Turned around a regular point, finite zeros s are 1/(s - c) and infinite ones 0. These are in
-    # chains of length degree + 1, which round-off of 1e-14 brings to the root of that order.
-    shift = 0.731
-    turned = np.linalg.eigvals(np.linalg.solve(rosenbrock - shift * e, e))
-    finite = np.abs(turned) > 10.0 * 1e-14 ** (1.0 / (longest + 1))
-    return np.sort_complex(shift + 1.0 / turned[finite])
-
-
 @pytest.mark.parametrize("name", ["circuit", "linear", "cart", "held_point"])
 def test_linear_problems_by_matrices(name):
     problem = PROBLEMS[name]()
     a = matrices(problem.system)
     assert kronecker_index(a) == problem.index
-    longest = max(problem.constraint_degrees + problem.output_degrees)
-    assert len(invariant_zeros(a, longest)) == problem.zero_dynamics
 
 
 # ---- zero dynamics
@@ -103,7 +69,6 @@ EIGENVALUES = {
     "swing_network": swing_eigenvalues(),
     "aircraft": np.array([np.sqrt(2.0), -np.sqrt(2.0)]),
     "dc_motor": np.array([-0.8]),
-    "linear": invariant_zeros(matrices(PROBLEMS["linear"]().system), 1),
 }
 
 
@@ -125,6 +90,3 @@ def decided(request) -> Problem:
 def test_the_verdict_is_that_of_the_literature(decided):
     verdict = ZeroDynamics(decided.system).stability().verdict
     assert verdict is (Verdict.STABLE if decided.minimum_phase else Verdict.UNSTABLE)
-
-
-# ---- systems made from their normal form

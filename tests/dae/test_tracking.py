@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 from problems import (
     PROBLEMS,
-    Problem,
     closed_loop_outputs,
     reference_at,
     wanted_outputs,
@@ -16,11 +15,6 @@ from drake_dae.dae import (
     gain_matrices,
     poles,
 )
-
-
-def starts(problem: Problem) -> np.ndarray:
-    """Where each output's entries of the reference start."""
-    return np.cumsum([0, *(degree + 1 for degree in problem.output_degrees)])
 
 
 @pytest.mark.slow
@@ -75,29 +69,6 @@ def test_the_motion_under_the_law_is_that_of_the_system_under_its_control(proble
 
 
 LAMBDA_2 = np.array([[11.0, 2.0], [-1.0, 9.0]])
-
-
-@pytest.mark.slow
-def test_error_coordinates_are_the_derivatives_of_the_outputs(problem):
-    """e_i^(j) = L_f*^j l*_i - r_i^(j), against differences along the closed loop."""
-    law = TrackingLaw(problem.system, poles(-3.0), structure=problem.structure)
-    start = problem.consistent(np.random.default_rng(3))
-    step = 1e-4
-    reference = reference_at(problem, 0.0)
-    coordinates = law.error_coordinates(start, reference)
-    assert coordinates.shape == (sum(problem.output_degrees),)
-    outputs, _ = closed_loop_outputs(problem, law, start, np.array([0.0, step, 2 * step]))
-    slope = (-3 * outputs[0] + 4 * outputs[1] - outputs[2]) / (2 * step)
-    first = 0
-    for i, degree in enumerate(problem.output_degrees):
-        if degree >= 1:
-            wanted = reference[starts(problem)[i]]
-            assert coordinates[first] == pytest.approx(outputs[0, i] - wanted, abs=1e-12)
-        if degree >= 2:
-            # Second differences: step^2 times a third derivative of order 100.
-            wanted = reference[starts(problem)[i] + 1]
-            assert coordinates[first + 1] == pytest.approx(slope[i] - wanted, abs=1e-5)
-        first += degree
 
 
 @pytest.mark.equation(5)

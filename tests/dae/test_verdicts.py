@@ -63,9 +63,6 @@ def test_a_pole_on_a_cart_that_rests_anywhere_is_unstable():
 
 
 AT_INFINITY = {
-    "exp": lambda a: ca.exp(-a),
-    "logistic": lambda a: 1 / (1 + ca.exp(a)),
-    "tanh": lambda a: 1 - ca.tanh(a),
     "bell": lambda a: ca.exp(-(a**2)),
     "arc tangent": lambda a: ca.pi / 2 - ca.atan(a),
     "small": lambda a: 1e-3 * ca.exp(-2 * a),
@@ -85,7 +82,7 @@ def test_what_only_falls_is_no_equilibrium(name, others):
     with pytest.raises(InconsistentStateError, match="z0 = 0"):
         dynamics.equilibrium([0.0])
     random = np.random.default_rng(0)
-    guesses = random.uniform(-3.0, 60.0, (12, 2 + others))
+    guesses = random.uniform(-3.0, 60.0, (6, 2 + others))
     assert not len(dynamics.equilibria(guesses, outputs=[0.0]))
     assert dynamics.stability().verdict is not Verdict.STABLE
 

@@ -10,9 +10,18 @@ from arms import (
     numbers,
     shipped,
 )
-from runs import run
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from runs import run, scenario
 
-from drake_dae import ConstantReference, RobotPlant, SinusoidReference, make_closed_loop
+from drake_dae import (
+    ConstantReference,
+    RobotPlant,
+    SinusoidReference,
+    TracedSystem,
+    build_scenario,
+    compile_diagram,
+    make_closed_loop,
+)
 
 ARMS = ["two_link", "seven_joint"]
 
@@ -34,16 +43,16 @@ def test_references_come_in_order_or_by_name(references):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scenario", "position", "force", "residual"),
+    ("name", "position", "force", "residual"),
     [("two_link_wall", 1e-12, 1e-11, 1e-12), ("seven_joint_wall", 1e-9, 1e-8, 1e-12)],
 )
 @pytest.mark.equation(62, 63)
-def test_error_is_the_closed_form_of_60(scenario, position, force, residual):
+def test_error_is_the_closed_form_of_60(name, position, force, residual):
     """Both poles at -4: e(t) = (e(0) + (e'(0) + 4 e(0)) t) exp(-4 t).
 
     RK5 at 1 ms leaves about 1e-15; the tolerances are those of the issue.
     """
-    loop, context = shipped(scenario)
+    loop, context = shipped(name)
     record = run(loop, context, 10.0, fixed_step())
     assert record.time[-1] == 10.0
     count = len(loop.plant.model.position_signals)
@@ -57,6 +66,30 @@ def test_error_is_the_closed_form_of_60(scenario, position, force, residual):
     pressed = record["constraint_force"][:, 0]
     np.testing.assert_allclose(pressed, 20.0 + 5.0 * np.sin(2.0 * record.time), atol=force)
     assert np.max(np.abs(record["constraint_residual"])) < residual
+
+
+COMPLIANT = "plant=!CompliantContact {time_step: 0.001, friction: 0.3}"
+
+
+@pytest.mark.parametrize(
+    "case",
+    [("two_link_wall",), pytest.param(("wall_point_contact", COMPLIANT), marks=pytest.mark.slow)],
+)
+def test_a_loop_as_one_block_has_its_ports_and_its_motion(case):
+    """To 1e-12 after 0.2 s: other common subexpressions are removed."""
+    loop, context = build_scenario(scenario(*case, "compiled=false"))
+    one = TracedSystem(compile_diagram(loop.diagram, context=context))
+    own = one.CreateDefaultContext()
+    for system, its in ((loop.diagram, context), (one, own)):
+        simulator = Simulator(system, its)
+        ApplySimulatorConfig(fixed_step(), simulator)
+        simulator.AdvanceTo(0.2)
+    for i in range(loop.diagram.num_output_ports()):
+        port = loop.diagram.get_output_port(i)
+        wanted = port.Eval(context)
+        found = one.GetOutputPort(port.get_name()).Eval(own)
+        size = max(1.0, np.abs(wanted).max(initial=0.0))
+        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * size)
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -6,8 +6,7 @@ import pytest
 from runs import both
 from scipy.interpolate import BSpline
 
-from drake_dae.references.polynomials import UNROLLED, PiecewisePolynomials
-from drake_dae.references.splines import TimeSpline, basis_pieces
+from drake_dae.references.splines import UNROLLED, PiecewisePolynomials, TimeSpline, basis_pieces
 from drake_dae.trace.functions import TracedFunction
 
 

@@ -31,9 +31,6 @@ def two_link(*settings: str) -> Scenario:
     return found
 
 
-FINE, ROUGH = "sensors.encoders.resolution=1.0e-5", "sensors.encoders.position_noise=1.0e-3"
-
-
 def chosen(found: Scenario) -> Scenario:
     return build_completed(found)[0].scenario
 
@@ -81,14 +78,6 @@ def test_a_roughness_without_use_is_refused():
         chosen(two_link("law.largest_roughness=1.0"))
     with pytest.raises(ScenarioError, match="-1"):
         chosen(two_link("sensors.encoders={resolution: 1.0e-5}", "law.largest_roughness=-1.0"))
-
-
-@pytest.mark.slow
-def test_a_noise_that_no_gains_smooth_is_named():
-    with pytest.raises(ScenarioError, match="position"):
-        chosen(
-            two_link("sensors.encoders={position_noise: 1.0e-3}", "law.largest_roughness=1.0e-4")
-        )
 
 
 def test_largest_errors_bound_what_is_predicted_or_say_what_forbids_them():

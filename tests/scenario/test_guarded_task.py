@@ -7,26 +7,14 @@ import numpy as np
 import pytest
 from arms import numbers
 from numpy.testing import assert_allclose
+from scenario_texts import task_text
 
 from drake_dae import Record, build_scenario, load_scenario
 from drake_dae.cli import main
 from drake_dae.diagrams.record import phase_spans
 from drake_dae.errors import ScenarioError
 
-# At rest 20 mm before the wall, which gives way.
-SHORT = """
-robot: {file: package://drake_dae_models/two_link_arm.urdf}
-constraints:
-- {name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
-outputs:
-- {frame: tool, axes: z}
-law:
-  gains: {all: [-25]}
-  constraint_damping: {all: [-250]}
-plant: !CompliantContact {radius: 1.0e-5}
-task:
-  gains: {outputs: {wall.distance: [-8], "*": [-25]}}
-  phases:
+SHORT = task_text("""
   - !Approach
     name: feel
     speed: 0.05
@@ -42,9 +30,7 @@ task:
     guards: [{of: force, above: 40}, {of: control, above: 200}]
   - !Release {over: 0.1}
   - !Retreat {name: away, distance: 0.03, over: 0.1}
-start: {positions: {joint1: 1.1653, joint2: -1.8326}}
-duration: 1.0
-"""
+""")
 BARE = [
     "--rollout",
     "--force",
@@ -104,12 +90,6 @@ def test_a_task_that_is_given_up_fails_the_check(file, tmp_path, capsys):
     ("change", "message"),
     [
         ("task.phases.0.on_failure=park", r"task: .*feel: on_failure: .*'park'"),
-        (
-            "task.phases.1.guards.0.of=heat",
-            r"task\.phases\.1\.guards\.0\.of: ",
-        ),
-        ("task.phases.1.guards.0.above=.nan", r"task\.phases\.1\.guards\.0.*above"),
-        ("task.phases.0.speed=0", r"task\.phases\.0.*speed"),
         (
             "task.phases.3=!Dwell {name: away, until: [{of: signal, name: go, above: 0.5}]}",
             r"task\.signals\.go",

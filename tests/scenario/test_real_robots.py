@@ -32,7 +32,7 @@ pytestmark = [
 ]
 
 
-DEAR = ("tiago", "so100", "ur10", "xarm7", "z1", "kinova")
+DEAR = ("panda", "tiago", "so100", "ur10", "xarm7", "z1", "kinova")
 """They take long, or show what others do."""
 
 

@@ -25,21 +25,16 @@ def refusal(*settings):
     [
         ("", ["scenario: ", "'robot'"]),
         ("- a list", ["scenario: ", "['a list']"]),
-        ("word", ["scenario: ", "'word'"]),
         ("a: [1\nb: 2", ["s.yaml: ", "line 2: "]),
         ("robot:\n\tfile: x", ["s.yaml: ", "line 2: ", "'\\t'"]),
         ("a: \x07", ["s.yaml: ", "x0007"]),
         (b"\xff\xfe", ["s.yaml: ", "UTF-8"]),
         (TWO_LINK + "duration: 3\n", ["s.yaml: ", "line 34: ", "'duration'"]),
-        (TWO_LINK + "3: 4\n", ["s.yaml: ", "line 34: ", "'3'"]),
         (TWO_LINK.replace("joint1: 1.2", "on: 1.2"), ["s.yaml: ", "line 26: ", "'on'"]),
+        (TWO_LINK + "compiled: maybe\n", ["compiled: ", "'maybe'", "auto", "[s.yaml:34]"]),
         (TWO_LINK + "---\na: 1\n", ["s.yaml: ", "line 34: "]),
         ("!Foo\n" + TWO_LINK, ["scenario: ", "!Foo"]),
         (TWO_LINK.replace("start:", "start: !Foo"), ["start: ", "!Foo"]),
-        (
-            TWO_LINK.replace("references:", "references: !Foo"),
-            ["references: ", "!Foo"],
-        ),
         (TWO_LINK.replace("duration: 10.0", "duration: !Foo 1"), ["s.yaml: ", "line 29: ", "!Foo"]),
         (
             TWO_LINK + "x: !!python/object/apply:os.getcwd []",
@@ -96,14 +91,10 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        # Keys.
-        ("duratoin=1", ["scenario: ", "'duration'"]),
-        ("constraints.0.surface.radius=1", ["constraints.0.surface: ", "!Plane"]),
         # Settings.
         ("duration", ["--set duration: "]),
         ("duration=[1", ["duration: ", "line 1: "]),
         ("duration=1\nfoo: 2", ["duration: ", "line 2: "]),
-        # Types.
         # The robot's file.
         ("robot.file=no.urdf", ["robot.file: ", "/no.urdf"]),
         (
@@ -117,18 +108,8 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             ("outputs=[]", f"constraints=[{WALL}, {WALL.replace('name: wall', 'name: b')}]"),
             ["constraints: ", "(2)"],
         ),
-        ("constraints.0.surface.normal=[0, 0, 0]", ["constraints.0.surface: normal"]),
-        (
-            f"{SPHERE} {{center: [0, 0, 0], radius: -1}}",
-            ["constraints.0.surface: radius", "-1"],
-        ),
         ("constraints.0.surface.point=[3, 0, 0]", ["start.positions: ", "wall.distance"]),
         # Welds and pins.
-        ("constraints.0=!Weld {}", ["0: ", "!PointOnSurface", "!WeldedFrames", "!Coinc"]),
-        (
-            f"{WELD} frame_b: tool, pose: {{rpy: [0, 0, 0]}}}}",
-            ["constraints.0.pose: ", "'rpy'", "rpy_deg"],
-        ),
         (f"{WELD} frame_b: tool}}", ["outputs: ", "6", "2"]),
         (
             ("outputs=[]", f"{PIN} point_b: [1, 0, 0], axes: yz}}"),
@@ -140,17 +121,11 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ),
         # Outputs.
         ("outputs.0.axes=xz", ["outputs: ", "1", "2", "(tool.x, tool.z)"]),
-        ("outputs.0.axes=x", ["outputs: ", "(5)", "'tool.x'"]),
-        (
-            "plant.parameters={wall.position: [[1, 0, 0]]}",
-            ["plant.parameters.wall.position: ", "[[1, 0, 0]"],
-        ),
         # Gains.
         ("law.gains.all=[1]", ["gains: ", "Hurwitz"]),
         ("law.gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),
         # References.
         ("references={}", ["references: ", "tool.z", "wall.force"]),
-        ("references={tool.z: a}", ["references.tool.z: ", "!C"]),
         (
             "references.tool.z=!Constant {values: [1, 2, 3]}",
             ["references.tool.z: ", "3", "1", "tool.z"],
@@ -160,29 +135,17 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             ["references.wall.force, tool.z: ", "1", "2", "wall.force", "tool.z"],
         ),
         (
-            f"{SINES} {{offset: 1, amplitudes: [1, 2], frequencies: [1, 2], phases: [0]}}",
-            ["references.wall.force: ", "amplitudes", "phases"],
-        ),
-        (
             f"{SINES} {{offset: 1, amplitudes: [], frequencies: []}}",
-            ["wall.force: "],
+            ["wall.force.amplitudes: "],
         ),
-        (f"{MOVE} {{start: [1], end: [2], end_time: 0}}", ["references.tool.z: ", "end_time", "0"]),
         (f"{MOVE} {{start: [1], end: [2], end_time: 1, order: 1}}", ["tool.z: ", "order=2"]),
         # Actuation and force.
         (
             "actuation=[!FlexibleJoints {stiffness: [1, 2, 3], inertia: [1]}]",
             ["actuation.0: ", "stiffness"],
         ),
-        (f"{SPRINGS} abc}}]", ["actuation.0.stiffness: ", "'abc'"]),
-        (f"{SPRINGS} [[1, 0], [0]]}}]", ["actuation.0.stiffness: ", "[[1, 0]", "[0]"]),
-        (f"{SPRINGS} [[1, 2], [2, 1]]}}]", ["actuation.0: ", "-1"]),
         (f"{SPRINGS} [[1, 0, 0], [0, 1, 0]]}}]", ["actuation.0: ", "(2,)", "(2, 2)"]),
-        ("sensors.force={gain: 1}", ["sensors.force: ", "'gain'", "bias"]),
-        (
-            "sensors.force={time_constant: 1, seed: -1}",
-            ["sensors.force: seed: ", "-1"],
-        ),
+        ("sensors.force={time_constant: 1, seed: -1}", ["sensors.force: seed: ", "-1"]),
         ("plant.parameters={link9.mass: [1]}", ["plant.parameters: ", "link9.mass", "link2.mass"]),
         # The start.
         (
@@ -192,7 +155,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ("start.errors.tool.x=1", ["start.errors: ", "'tool.x'", "tool.z"]),
         ("start.errors.tool.z=5", ["start: ", "tool.z", "5.3"]),
         # The run.
-        ("duration=0", ["duration: ", "positive", "0"]),
+        ("duration=0", ["duration: ", "0"]),
         ("integrator.integration_scheme=runge_kuta5", ["integrator: ", "'runge_kutta5'"]),
     ],
 )
@@ -232,8 +195,6 @@ def test_all_problems_are_reported_at_once():
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(ScenarioError, match="'nowhere'"):
         find_scenario("nowhere")
-    with pytest.raises(ScenarioError, match="'two_link_wal'"):
-        find_scenario("two_link_wal")
     with pytest.raises(ScenarioError, match=tmp_path.name):
         find_scenario(str(tmp_path))
     with pytest.raises(ScenarioError, match=r"gone\.yaml"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
 from scenario_texts import lever, run, two_link
-from two_arms import GRASP, two_arms
+from two_arms import GRASP
 
 from drake_dae import (
     AxisCoordinates,
@@ -37,7 +37,6 @@ from drake_dae import (
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import Blade, RollingBall
 from drake_dae.scenario import parts as forms
-from drake_dae.scenario import parts as written
 from drake_dae.scenario.robot_file.robot import Pose, Robot
 from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario
@@ -59,7 +58,7 @@ def test_every_form_reads_back_equal(tmp_path):
                 PointOnSurface("a", surface, (0.1, 1e-17, -0.0), f"c{i}")
                 for i, surface in enumerate(surfaces)
             ],
-            written.WeldedFramesForm("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
+            forms.WeldedFramesForm("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
             CoincidentPoints("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), "zx", "p"),
             FixedDistance("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), 1 / 3, "r"),
             JointCoupler("a", "b", -1 / 3, 0.1, "m", "j"),
@@ -71,7 +70,7 @@ def test_every_form_reads_back_equal(tmp_path):
         outputs=[
             PointCoordinates("yes", "xy"),
             AxisCoordinates("b", "z", "xy"),
-            written.SurfaceCoordinatesForm("c0"),
+            forms.SurfaceCoordinatesForm("c0"),
             JointPositions(["joint1", "2"]),
         ],
         forces=[
@@ -136,9 +135,7 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
     [
         ("duration=5", lambda s: s.duration == 5.0),
         ("integrator.accuracy=1e-9", lambda s: s.integrator.accuracy == 1e-9),
-        ("write.plots=true", lambda s: s.write.plots is True),
         ("constraints.0.surface.point.0=1.1", lambda s: s.constraints[0].surface.point[0] == 1.1),
-        ("constraints.0.surface.point=[1, 0, 0]", lambda s: s.constraints[0].surface.point[0] == 1),
         (
             "law.gains=!Coefficients {all: [16, 8]}",
             lambda s: s.law.gains == forms.Coefficients([16, 8]),
@@ -148,7 +145,6 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
         ("references.tool=0.3", lambda s: list(s.references) == ["tool.z", "wall.force", "tool"]),
         ("start.errors.tool.z=0.01", lambda s: s.start.errors == {"tool.z": 0.01}),
         ("law.gains={outputs: {tool.z: [-3]}}", lambda s: s.law.gains.outputs == {"tool.z": [-3]}),
-        ("judgement.tolerances.tool.z=2", lambda s: s.judgement.tolerances == {"tool.z": 2.0}),
         ("plant.parameters.link2.mass=[5]", lambda s: s.plant.parameters == {"link2.mass": [5]}),
         ("description=a b", lambda s: s.description == "a b"),
         ("description=", None),
@@ -195,22 +191,16 @@ def test_a_run_begins_at_its_start_time_with_the_errors_there():
     assert np.max(distance) < 1e-6
 
 
-@pytest.mark.slow
 def test_weld():
-    """The shipped scenario is the model of tests/support/two_arms.py."""
-    loop, _ = build_scenario(load_scenario(find_scenario("two_arms")))
-    (weld,) = loop.plant.model.constraints
+    """The shipped scenario has the weld of tests/support/two_arms.py."""
+    weld = load_scenario(find_scenario("two_arms")).constraints[0].make(())
     assert (weld.frame_a, weld.frame_b, weld.name) == (GRASP.frame_a, GRASP.frame_b, "grasp")
     np.testing.assert_allclose(
         weld.pose.GetAsMatrix4(), GRASP.pose.GetAsMatrix4(), rtol=0, atol=1e-15
     )
-    ours, wanted = loop.plant.dae, two_arms().dae
-    assert ours.name == "two_arms"
-    for name in ("state_signals", "control_signals", "output_signals", "constraint_input_signals"):
-        assert getattr(ours, name) == getattr(wanted, name)
     # A pose that is left out is that of frames that coincide.
     plain = load_scenario(
         find_scenario("two_arms"),
         ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
     )
-    assert plain.constraints[0] == written.WeldedFramesForm("left::tool", "right::tool", Pose())
+    assert plain.constraints[0] == forms.WeldedFramesForm("left::tool", "right::tool", Pose())

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from runs import some
+from scenario_texts import task_text
 
 from drake_dae import build_scenario, load_scenario, shipped_model
 from drake_dae.cli import main
@@ -13,26 +14,11 @@ from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.rolled import roll_scenario
 from drake_dae.scenario.start import start_scenario
 
-# At rest 20 mm before the wall; as `scenarios/wall_polish`, but short.
-SHORT = """
-robot: {file: package://drake_dae_models/two_link_arm.urdf}
-constraints:
-- {name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
-outputs:
-- {frame: tool, axes: z}
-law:
-  gains: {all: [-25]}
-  constraint_damping: {all: [-250]}
-plant: !CompliantContact {radius: 1.0e-5}
-task:
-  gains: {outputs: {wall.distance: [-8], "*": [-25]}}
-  phases:
+SHORT = task_text("""
   - !Approach {speed: 0.1, over: 0.1}
   - !Press {force: 10, over: 0.1}
   - !Move {references: {tool.z: 0.31, wall.force: 12}, duration: 0.2, over: 0.2}
-start: {positions: {joint1: 1.1653, joint2: -1.8326}}
-duration: 1.0
-"""
+""")
 
 
 @pytest.fixture
@@ -44,15 +30,13 @@ def file(tmp_path):
 
 @pytest.mark.slow
 def test_command_runs_a_task_in_drakes_own_contact(file, tmp_path, capsys):
-    """Its plots and its animation tell the phases."""
+    """Its animation tells the phases."""
     words = ["--set", "plant=!MultibodyPlant {radius: 1.0e-5}", "--set", "duration=0.3"]
-    words += ["--set", "write.plots=true"]
     assert main(["simulate", str(file), *words, "--out", str(tmp_path / "run")]) == 0
     told = capsys.readouterr().out
     assert "wall.distance" in told
     assert "\n0 s: Approach, " in told
     assert ": Press, " in told
-    assert (tmp_path / "run" / "outputs.png").stat().st_size > 10_000
     page = (tmp_path / "run" / "animation.html").read_text()
     assert '"phases": [[0.0, "Approach"], [0.' in page
 
@@ -100,7 +84,6 @@ def test_a_touch_lasts_up_to_the_computed_speed(file, mass):
     [
         ("task.phases=[]", "task: "),
         ("task.phases.0.speed=-1", r"task\.phases\.0: .*speed.*-1"),
-        ("task.phases.0.sped=1", r"task\.phases\.0: .*'sped'"),
         ("task.phases.1.if_lost=wait", r"Press: if_lost: .*'wait'"),
         ("task.phases.2.references={tool.x: 1}", r"Move: .*'tool\.x'"),
         ("task.contact=floor", r"task\.contact: 'floor'"),
@@ -119,7 +102,7 @@ def test_what_does_not_fit_is_named_by_its_key(file, change, message):
 def test_a_rollout_of_a_task_reports_its_phases(file, tmp_path, capsys):
     told = []
     for number, more in enumerate(([], ["--rollout"])):
-        words = ["--out", str(tmp_path / f"run {number}")]
+        words = ["--set", "write.animation=false", "--out", str(tmp_path / f"run {number}")]
         assert main(["simulate", str(file), *words, *more]) == 0
         lines = capsys.readouterr().out.splitlines()
         (first,) = [i for i, line in enumerate(lines) if line.startswith("0 s: Approach")]

@@ -43,3 +43,23 @@ def run(scenario):
     """The loop, its record, and the largest distance of each error from the predicted one."""
     loop, _, record = run_scenario(scenario)
     return loop, record, np.abs(record["tracking_error"] - loop.predicted_error(record)).max(axis=0)
+
+
+def task_text(phases: str) -> str:
+    """A scenario of the two links with these phases, at rest 20 mm before a wall that gives way."""
+    return f"""
+robot: {{file: package://drake_dae_models/two_link_arm.urdf}}
+constraints:
+- {{name: wall, frame: tool, surface: {{point: [1.2, 0, 0], normal: [-1, 0, 0]}}}}
+outputs:
+- {{frame: tool, axes: z}}
+law:
+  gains: {{all: [-25]}}
+  constraint_damping: {{all: [-250]}}
+plant: !CompliantContact {{radius: 1.0e-5}}
+task:
+  gains: {{outputs: {{wall.distance: [-8], "*": [-25]}}}}
+  phases:{phases}
+start: {{positions: {{joint1: 1.1653, joint2: -1.8326}}}}
+duration: 1.0
+"""

@@ -201,22 +201,6 @@ class MultibodyExpressions(Links):
         force += ca.SX(self._rotors) * kinematics.acceleration - self._spring_force
         return force - kinematics.value(reaction.generalized)  # (37)
 
-    @cached_property
-    def kinetic_energy(self) -> ca.SX:
-        """v^T M v / 2 in J, a scalar; it includes the rotors."""
-        return ca.dot(self.v, self.mass_matrix @ self.v) / 2
-
-    @cached_property
-    def potential_energy(self) -> ca.SX:
-        """The energy of gravity and springs in J, a scalar; as in Drake, zero at height 0."""
-        gravity = ca.SX(self.gravity)
-        energy = self._spring_energy
-        for link, (rotation, origin) in zip(self.links, self.link_poses, strict=True):
-            mass = link.inertia.mass - link.weightless.mass
-            first = link.inertia.first - link.weightless.first
-            energy -= ca.dot(gravity, mass * origin + rotation @ first)
-        return energy
-
     def _read_signals(self, joints: Sequence[Joint]) -> None:
         positions, velocities = [], []
         for joint, name in zip(joints, unique_names(self.plant, joints), strict=True):
@@ -287,7 +271,7 @@ class MultibodyExpressions(Links):
         return tuple(parameters)
 
     def _read_springs(self, joints: Sequence[Joint]) -> None:
-        """The force, shape (nv, 1), and the energy in J of dampers and springs."""
+        """The generalized force of dampers and springs, shape (nv, 1)."""
         for joint in joints:
             largest = np.max(joint.default_damping_vector(), initial=0.0)
             if largest > LARGEST:
@@ -296,7 +280,7 @@ class MultibodyExpressions(Links):
                     f"can be computed with is {LARGEST:g}"
                 )
         damping = np.concatenate([joint.default_damping_vector() for joint in joints])
-        force, energy = -ca.SX(damping) * self.v, ca.SX(0)
+        force = -ca.SX(damping) * self.v
         along: list[LinearSpringDamper] = []
         for i in range(self.plant.num_force_elements()):
             match element := self.plant.get_force_element(ForceElementIndex(i)):
@@ -317,7 +301,6 @@ class MultibodyExpressions(Links):
                     )
             place = element.joint().position_start()
             force[place] += stiffness * (rest - self.q[place])
-            energy += stiffness / 2 * (rest - self.q[place]) ** 2
         for spring in along:
             start = self.position(spring.bodyA().body_frame(), spring.p_AP())
             end = self.position(spring.bodyB().body_frame(), spring.p_BQ())
@@ -326,8 +309,7 @@ class MultibodyExpressions(Links):
             tension = spring.stiffness() * (length - spring.free_length())
             tension += spring.damping() * (gradient @ self.v)
             force -= gradient.T @ tension
-            energy += spring.stiffness() / 2 * (length - spring.free_length()) ** 2
-        self._spring_force, self._spring_energy = force, energy
+        self._spring_force = force
 
     @property
     def gravity(self) -> FloatArray:

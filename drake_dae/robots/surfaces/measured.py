@@ -73,7 +73,7 @@ class MeasuredSurface(Surface):
         if self.size is not None:
             object.__setattr__(self, "size", tuple(vector("size", self.size, 2).tolist()))
         for name in ("size", "scale", "resolution"):
-            for length in np.ravel(1.0 if (value := getattr(self, name)) is None else value):
+            for length in np.ravel([] if (value := getattr(self, name)) is None else value):
                 positive(name, length)
         if (self.heights is None) == (self.file is None):
             raise ModelError("give either heights, row by row, or a file with them")
@@ -102,9 +102,10 @@ class MeasuredSurface(Surface):
     @property
     def remark(self) -> str:
         source = f" '{Path(self.file).name}'" if self.file else ""
-        largest, width = 1e3 * self.fit.largest, 1e3 * max(self.fit.widths)
-        off = f"MeasuredSurface{source} is off its data by at most {largest:.2g} mm"
-        return f"{off}; details finer than {width:.2g} mm are smoothed away"
+        return (
+            f"MeasuredSurface{source} is off its data by at most {1e3 * self.fit.largest:.2g} mm; "
+            f"details finer than {1e3 * max(self.fit.widths):.2g} mm are smoothed away"
+        )
 
     def picture(self, center: ArrayLike, size: float) -> PosedShape:
         even = np.linspace(-0.5, 0.5, 3 * CELLS + 1)
@@ -127,10 +128,7 @@ class MeasuredSurface(Surface):
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """The smooth heights: a plane, and bells exp(-(x - x_j)^2 / 2 d^2) along x and along y.
-
-    Their distance d is their width: so they span polynomials to 1e-8 and are still distinct.
-    """
+    """A plane, and bells exp(-(x - x_j)^2 / 2 d^2), d apart: they span polynomials to 1e-8."""
 
     extent: FloatArray  # The first and last x and y of the data, shape (2, 2).
     plane: FloatArray  # c_0, c_1, c_2.
@@ -160,7 +158,6 @@ class _Fit:
 
 
 def _bells(values: FloatArray, places: FloatArray, width: float) -> FloatArray:
-    """All bells at some places, shape (values, bells)."""
     return np.asarray(np.exp(-(((values[:, None] - places) / width) ** 2) / 2))
 
 
@@ -205,8 +202,7 @@ def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
     left, sizes, right = np.linalg.svd(shares, full_matrices=False)
     a, b = to_x @ right.T, to_y @ (left * sizes)
     terms_a, terms_b = at[0] @ a, at[1] @ b
-    # A few terms are often enough: a wave along one axis takes one. The others are smaller than the
-    # residual of the fit, or than round-off.
+    # A wave along one axis takes one term; others are below the residual, or round-off.
     rms = float(np.sqrt(np.mean((rest - terms_b @ terms_a.T) ** 2)))
     added = np.max(np.abs(terms_a), axis=0) * np.max(np.abs(terms_b), axis=0)
     n = int(np.sum(np.cumsum(added[::-1])[::-1] > max(0.1 * rms, 1e-10 * float(np.ptp(rest)))))
@@ -244,7 +240,7 @@ def _table(what: str, rows: Any) -> FloatArray:
 def _mesh_heights(
     surface: MeasuredSurface, file: Path
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """The places x and y of a grid, the heights of a mesh there, and the default resolution."""
+    """Places x and y, the heights of a mesh there, and the default resolution."""
     vertices, triangles = read_mesh(file)
     axes = np.column_stack([*tangents(surface.normal), np.array(surface.normal)])
     vertices = surface.scale * vertices @ axes

@@ -11,17 +11,13 @@ from drake_dae.arrays import FloatArray
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
 
-_SAG = 2.5e-6
-"""The wanted distance in m of a facet's edge from the surface."""
+_SAG, _MOST, _LEAST = 2.5e-6, 60, 4
+"""The wanted distance in m of a facet's edge from the surface; the largest and the least number of
+facets along each side."""
 
-_MOST, _LEAST = 60, 4
-"""The largest and the least number of facets along each side; 60 take some seconds."""
-
-_RIM = 1.2
-"""The width of the outermost facets, where the pressure falls, relative to the depth."""
-
-_APEX = 2.0
-"""The depth of the lowest vertex, relative to the longer side."""
+_RIM, _APEX = 1.2, 2.0
+"""The width of the outermost facets, where the pressure falls, relative to the depth; the depth of
+the lowest vertex, relative to the longer side."""
 
 _TETRAHEDRA = np.array([*"013701750273026704570476", *"45784768"], dtype=int).reshape(-1, 4)
 """Of each cell: its corners have the bits row, column, below; 8 is the lowest vertex."""
@@ -63,11 +59,7 @@ def facets_needed(grid: FloatArray) -> tuple[int, int]:
 
 
 def sides(facets: int, length: float, depth: float) -> FloatArray:
-    """Places along a side, from -1/2 to 1/2 of its length, shape (facets + 3,).
-
-    The outermost facets are as wide as the layer is deep, so that the pressure is that of the
-    surface everywhere else.
-    """
+    """Places along a side, from -1/2 to 1/2 of its length, shape (facets + 3,)."""
     rim = _RIM * depth / length
     if not rim < 0.25:
         raise ModelError(
@@ -81,9 +73,8 @@ def layer_below(grid: FloatArray, surface: TracedFunction, depth: float) -> Pose
     """A layer of tetrahedra below the points of a grid, shape (r, c, 3).
 
     The pressure of a hydroelastic mesh is linear in each tetrahedron, zero on its boundary, and the
-    modulus where a vertex is farthest from it. Here these are the points at `depth` below the grid,
-    so that the pressure is modulus times depth / thickness, as in a half space. They are joined to
-    one vertex far below. `surface` gives distance and gradient at a point.
+    modulus where a vertex is farthest from it: at `depth` below the grid, so that it is that of a
+    half space. One vertex is far below. `surface` gives distance and gradient at a point.
     """
     _check_whole(grid)
     flat = grid.reshape(-1, 3)
@@ -103,14 +94,13 @@ def layer_below(grid: FloatArray, surface: TracedFunction, depth: float) -> Pose
         raise ModelError(
             "the surface is too curved for one layer; give a smaller piece (plant.piece)"
         )
+    count = len(tetrahedra)
     lines = ["# vtk DataFile Version 3.0", "layer", "ASCII", "DATASET UNSTRUCTURED_GRID"]
-    lines += [
-        f"POINTS {len(points)} double",
-        *(f"{x:.12g} {y:.12g} {z:.12g}" for x, y, z in points),
-    ]
-    lines += [f"CELLS {len(tetrahedra)} {5 * len(tetrahedra)}"]
+    lines += [f"POINTS {len(points)} double"]
+    lines += [f"{x:.12g} {y:.12g} {z:.12g}" for x, y, z in points]
+    lines += [f"CELLS {count} {5 * count}"]
     lines += ["4 " + " ".join(map(str, row)) for row in tetrahedra.tolist()]
-    lines += [f"CELL_TYPES {len(tetrahedra)}", *["10"] * len(tetrahedra), ""]
+    lines += [f"CELL_TYPES {count}", *["10"] * count, ""]
     file = MemoryFile("\n".join(lines), ".vtk", "layer")
     return PosedShape(Mesh(mesh_data=InMemoryMesh(mesh_file=file)), RigidTransform())
 

@@ -23,8 +23,6 @@ from drake_dae.robots.surfaces.surface import (
     axes_along,
     normalized,
     tangents,
-    triple,
-    unit_vector,
 )
 from drake_dae.trace.expressions import length_of, result_of
 from drake_dae.trace.formula import check_names, parse_formula
@@ -93,10 +91,6 @@ class Sphere(Surface):
     coordinate_signals: ClassVar = (Signal("longitude", "rad"), Signal("latitude", "rad"))
     has_exact_distance: ClassVar = True
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive("radius", self.radius)
-
     def distance(self, offset: ca.SX) -> ca.SX:
         return _side(length_of(offset) - self.radius, self.inside)
 
@@ -137,11 +131,8 @@ class Cylinder(Surface):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive("radius", self.radius)
-        if self.zero is not None:
-            object.__setattr__(self, "zero", unit_vector("zero", self.zero))
-            if np.linalg.norm(np.cross(self.zero, self.axis)) < 1e-6:
-                raise ModelError(f"zero must not lie along the axis, got {self.zero}")
+        if self.zero is not None and np.linalg.norm(np.cross(self.zero, self.axis)) < 1e-6:
+            raise ModelError(f"zero must not lie along the axis, got {self.zero}")
 
     def distance(self, offset: ca.SX) -> ca.SX:
         x, y, _ = _components(self.axis, offset)
@@ -181,7 +172,6 @@ class Ellipsoid(Surface):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "semi_axes", triple("semi_axes", self.semi_axes))
         for length in self.semi_axes:
             positive("semi_axes", length)
 
@@ -223,8 +213,6 @@ class Torus(Surface):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive("minor_radius", self.minor_radius)
-        positive("major_radius", self.major_radius)
         if not self.major_radius > self.minor_radius:
             raise ModelError(
                 f"major_radius {self.major_radius} must exceed minor_radius {self.minor_radius}"

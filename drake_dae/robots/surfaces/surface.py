@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
-from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.arrays import FloatArray, positive, show, vector
 from drake_dae.dae import Parameter, Signal, as_expression
 from drake_dae.errors import ModelError
 from drake_dae.robots.surfaces.meshes import (
@@ -59,11 +59,15 @@ class Surface(ABC):
     has_exact_distance: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Points become tuples of floats, and directions unit vectors."""
-        converted = {"point": triple, "center": triple, "normal": unit_vector, "axis": unit_vector}
-        for name, convert in converted.items():
-            if hasattr(self, name):
-                object.__setattr__(self, name, convert(name, getattr(self, name)))
+        """Points become tuples of floats, and directions unit vectors; radii are positive."""
+        for names, convert in (
+            (("point", "center", "semi_axes"), triple),
+            (("normal", "axis", "zero"), unit_vector),
+            (("radius", "minor_radius", "major_radius"), positive),
+        ):
+            for name in names:
+                if getattr(self, name, None) is not None:
+                    object.__setattr__(self, name, convert(name, getattr(self, name)))
 
     @property
     def position(self) -> Vector:

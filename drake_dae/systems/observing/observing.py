@@ -12,11 +12,18 @@ from drake_dae.errors import ModelError
 class Observing:
     """The rates of a `StateEstimator` in 1/s, and its thresholds for friction.
 
-    k_o is the `rate` of disturbances along the free directions, k_n the `force_rate` along the
-    constrained ones, which change only constraint forces; None for k_o. With w, the `state_rate`,
-    the state is corrected by measured positions; None for the state as it is measured. k_f, the
-    `friction_rate`, is that of coefficients of friction, from 0 to `largest_friction`. Below
-    `least_speed`, in m/s, a contact may stick, and below `least_force`, in N, it counts as lost.
+    Attributes:
+        rate: k_o, the rate of disturbances along the free directions.
+        force_rate: k_n, the rate of disturbances along the constrained directions, which change
+            only constraint forces; None for k_o.
+        state_rate: w, the rate at which the state is corrected by measured positions; None for the
+            state as it is measured.
+        friction_rate: k_f, the rate at which coefficients of friction are identified.
+        largest_friction: The upper bound of coefficients of friction.
+        least_speed: The speed in m/s below which a contact may stick, so that its friction is not
+            identified.
+        least_force: The force in N below which a contact counts as lost: its coefficient and
+            integrals are not updated.
     """
 
     rate: float

@@ -47,8 +47,11 @@ class Condition:
     - control: |u| of a control, or the largest of all, in its unit, N m for joints;
     - signal: the value of the input signal_<name>, in a scenario one of task.signals.
 
-    It holds at or above `above`, or at or below `below`, of which one is given. `name` is that of
-    the signal or of the control; of the largest control if empty.
+    Attributes:
+        of: The watched quantity: "force", "time", "distance", "travel", "control" or "signal".
+        above: It holds at or above this value.
+        below: It holds at or below this value. Either this or `above` is given.
+        name: The name of the signal or of the control; of the largest control if empty.
     """
 
     of: Watched

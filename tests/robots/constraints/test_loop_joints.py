@@ -170,19 +170,6 @@ def rates(cut: int, both, torques):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cut", [2, 3, 6])
-def test_it_moves_as_where_it_is_cut_elsewhere(cut):
-    """Accelerations up to 1e3, by two sets of equations: 1e-9 of them."""
-    random = np.random.default_rng(cut)
-    for seed in range(3):
-        both, torques = moving(seed), random.uniform(-5.0, 5.0, COUNT)
-        *_, expected = rates(7, both, torques)
-        *_, found = rates(cut, both, torques)
-        common = [i for i in range(COUNT) if i not in (cut, 7)]
-        assert_allclose(found[common], expected[common], rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("cut", [2, 3, 6])
 def test_what_the_loop_joint_exerts_is_what_drakes_joint_does(cut):
     """Drake's forward dynamics and reaction forces of the tree that is cut at joint 7, which gets
     the force of that cut from outside. Forces up to 100 N: 1e-9."""

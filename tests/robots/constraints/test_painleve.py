@@ -51,7 +51,7 @@ def context_of(plant, state):
 
 
 @pytest.mark.parametrize("angle", some([0.3, 0.8, 1.0, 1.4], of=3))
-@pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize("friction", [0.0, 0.8])
 def test_analyze_finds_the_critical_coefficient_at_a_state(angle, friction):
     """mu_crit in closed form; s is 1 except for (v_s / v)^2 / 2 = 1e-7. Without friction, too."""
     system = rod(friction).dae
@@ -135,7 +135,7 @@ def minors(matrix, rows):
     return np.array([np.linalg.det(matrix[np.ix_(s, s)]) for s in sets])
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_reserve_is_positive_exactly_for_a_p_matrix(seed):
     """Against all principal minors, of contacts 1, 2 and 4 of four constraints and more or less
     friction; the critical factor is where one of them comes to zero."""

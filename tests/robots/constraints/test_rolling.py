@@ -182,11 +182,6 @@ def test_rates_are_velocities_of_the_points_that_touch():
         np.testing.assert_allclose(found[2], expected, atol=1e-12)
 
 
-# A ball, carried by a gantry without mass whose motors push its center.
-
-BALL, SIZE = 1.3, 0.2
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [

@@ -133,9 +133,8 @@ def test_sizes_and_names(links):
     assert links.landmarks().shape[0] == 3
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_mass_matrix_is_one(links, seed):
-    (mass,), _ = numbers(links, {}, {"M": links.mass_matrix}, seed)
+def test_mass_matrix_is_one(links):
+    (mass,), _ = numbers(links, {}, {"M": links.mass_matrix})
     mass = np.atleast_2d(mass)
     np.testing.assert_allclose(mass, mass.T, **CLOSE)
     assert np.linalg.eigvalsh(mass)[0] > 0.0

@@ -17,7 +17,6 @@ from random_plants import (
     assert_close,
     assert_terms_agree,
     default_masses,
-    plant_bias,
     random_context,
     random_robot,
     state,
@@ -40,7 +39,7 @@ def test_terms_are_those_of_the_plant(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", some(SEEDS, of=4))
 def test_accelerations_are_those_of_the_continuous_plant(seed):
     """Holds damping, springs, actuation and rotors to what Drake simulates.
 
@@ -57,7 +56,7 @@ def test_accelerations_are_those_of_the_continuous_plant(seed):
         plant.get_actuation_input_port().FixValue(context, u)
     q, v = state(plant, context)
     derivatives = plant.EvalTimeDerivatives(context).CopyToVector()
-    M, H, N, _ = robot.terms(q, v, default_masses(expressions))
+    M, H, N = robot.terms(q, v, default_masses(expressions))
     acceleration = derivatives[q.size :]
     inertial = M @ acceleration
     assert_close(N @ v, derivatives[: q.size], "q'")
@@ -102,78 +101,7 @@ def test_frames_are_where_the_plant_has_them(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(8), of=3))
-def test_contact_forces_and_their_constraints_by_inverse_dynamics(seed):
-    """J against the plant's frame Jacobians; the rest against M v' + H - J^T lambda and phi''.
-
-    The constraint depends on the poses of two frames and, directly, on q.
-    """
-    robot = random_robot(seed)
-    plant, expressions = robot.plant, robot.expressions
-    random = np.random.default_rng(600 + seed)
-    first, second = (
-        plant.get_frame(FrameIndex(int(i)))
-        for i in random.choice(np.arange(1, plant.num_frames()), 2, replace=False)
-    )
-    point, direction = random.normal(size=(2, 3))
-
-    def phi(links):
-        apart = links.rotation(second).T @ (links.position(first, point) - links.position(second))
-        tilt = ca.dot(links.rotation(first) @ ca.SX(direction), links.rotation(second)[:, 0])
-        return ca.vertcat(apart, tilt * ca.sin(links.q[0]) + links.q[-1] ** 2)
-
-    q, v, N = expressions.q, expressions.v, expressions.velocity_map
-    a, force = ca.SX.sym("a", v.numel()), ca.SX.sym("f", 4)
-    speed = N @ v
-    rate = ca.jtimes(phi(expressions), q, speed)
-    twice = ca.jtimes(rate, ca.vertcat(q, v), ca.vertcat(speed, a))
-    kinematics = expressions.kinematics(a)
-    own_rate = kinematics.derivative(phi(kinematics))
-    reaction = kinematics.reaction(ca.dot(force, own_rate))
-    residual = expressions.inverse_dynamics(kinematics, reaction)
-    second_rate = kinematics.value(kinematics.derivative(own_rate))
-    columns = reaction.map(lambda part: ca.jacobian(part, force))
-    jacobian = expressions.generalized_force(kinematics, columns).T
-    masses = ca.vertcat(*[parameter.symbol for parameter in expressions.parameters])
-    function = TracedFunction(
-        "balance",
-        {"q": q, "v": v, "a": a, "f": force, "masses": masses},
-        {"J": jacobian, "own": residual, "rate": second_rate, "twice": twice},
-    )
-    context = random_context(plant, random)
-    numbers = state(plant, context)
-    acceleration, load = random.normal(size=v.numel()), random.normal(size=4)
-    J, own, own_rate, other_rate = function(
-        *numbers, acceleration, load, default_masses(expressions)
-    )
-    M, H = plant.CalcMassMatrix(context), plant_bias(plant, context)
-    scale = np.abs(M * acceleration).max() + np.abs(J.T * load).max()
-    assert_close(own, M @ acceleration + H - J.T @ load, "M v' + H - J^T lambda", scale)
-    assert_close(own_rate, other_rate, "phi''", np.abs(J * acceleration).max())
-    world = plant.world_frame()
-
-    def twist(frame, offset):
-        return plant.CalcJacobianSpatialVelocity(
-            context, JacobianWrtVariable.kV, frame, offset, world, world
-        )
-
-    X_1, X_2 = (plant.CalcRelativeTransform(context, world, f) for f in (first, second))
-    R_2, apart = X_2.rotation().matrix(), X_1 @ point - X_2.translation()
-    spin_1, spin_2 = twist(first, point)[:3], twist(second, np.zeros(3))[:3]
-    moved = twist(first, point)[3:] - twist(second, np.zeros(3))[3:]
-    wanted = R_2.T @ (moved + np.array([np.cross(apart, w) for w in spin_2.T]).T)
-    assert_close(J[:3], wanted, "J", np.abs(moved).max())
-    arrow, axis = X_1.rotation().matrix() @ direction, R_2[:, 0]
-    row = np.sin(numbers[0][0]) * np.cross(arrow, axis) @ (spin_1 - spin_2)
-    row += robot.terms(*numbers, default_masses(expressions))[2].reshape(v.numel(), -1)[0] * (
-        np.cos(numbers[0][0]) * arrow @ axis
-    )
-    row += 2 * numbers[0][-1] * robot.terms(*numbers, default_masses(expressions))[2][-1]
-    assert_close(J[3], row, "J of an angle", 1.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_masses_change_as_with_set_mass(seed):
     robot = random_robot(seed)
     plant, expressions = robot.plant, robot.expressions

@@ -202,15 +202,12 @@ def test_beyond_its_edges_a_map_is_calm(rough):
     "data",
     [
         WAVES,
-        0.05 + 0.02 * np.sin(10 * X) * np.cos(12 * Y)[:, None] + 0.1 * Y[:, None],
-        0.03 * np.exp(-((X - 0.05) ** 2 + (Y[:, None] + 0.02) ** 2) / 0.003),
         0.04 * (X > 0.03) + 0.0 * Y[:, None],
         WAVES + 1e-4 * np.random.default_rng(1).normal(size=WAVES.shape),
-        np.random.default_rng(2).uniform(0.0, 0.1, WAVES.shape),
     ],
-    ids=["wave", "waves", "bump", "step", "noisy", "noise"],
+    ids=["wave", "step", "noisy"],
 )
-@pytest.mark.parametrize("resolution", [None, 0.04, 0.1])
+@pytest.mark.parametrize("resolution", [None, 0.1])
 def test_a_fit_does_not_multiply_the_round_off_of_its_data(data, resolution):
     """Heights that differ in their last digit, some 1e-17 m, give surfaces that do.
 

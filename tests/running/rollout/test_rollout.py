@@ -31,7 +31,7 @@ from drake_dae.errors import (
     ModelError,
     SimulationError,
 )
-from drake_dae.references.polynomials import UNROLLED
+from drake_dae.references.splines import UNROLLED
 from drake_dae.running import start_values
 from drake_dae.running.rollout import run_loop
 from drake_dae.running.rollout_program import program_of

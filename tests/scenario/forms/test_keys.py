@@ -20,7 +20,6 @@ from drake_dae.errors import ScenarioError
             "start={positions: {joint1: 0}}",
             ["outputs: Assumption (5)", "start.positions"],
         ),
-        ("two_link_wall", "outputs.0.axes=xz", ["outputs: ", "`forces`"]),
     ],
 )
 def test_a_robot_that_cannot_start_is_sent_to_its_keys(name, setting, words):

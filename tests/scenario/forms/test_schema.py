@@ -2,13 +2,11 @@
 
 import re
 
-import pytest
 from book.keys import forms, keys_page
-from runs import scenario_validator, untagged
+from runs import scenario_validator
 
 from drake_dae.scenario import scenario_schema
 from drake_dae.scenario.shipped import shipped_scenarios
-from drake_dae.scenario.typed_yaml import load_yaml
 
 
 def test_every_form_and_key_is_on_the_page_of_keys_with_its_meaning():
@@ -22,15 +20,12 @@ def test_every_form_and_key_is_on_the_page_of_keys_with_its_meaning():
             assert f"\n| `{name}` | " in section, f"{title}.{name}"
 
 
-@pytest.mark.slow
-def test_editors_accept_shipped_scenarios_and_no_wrong_keys():
-    validator, used = scenario_validator(), set()
+def test_editors_are_told_of_wrong_keys_and_of_all_tags():
+    """That shipped scenarios are accepted is tested with their runs."""
+    used = set()
     for path in shipped_scenarios().values():
-        text = path.read_text()
-        used |= set(re.findall(r"(?<= )![A-Z]\w+", text))
-        data = untagged(load_yaml(text, path.name))
-        assert not list(validator.iter_errors(data)), path.stem
-        assert list(validator.iter_errors({**data, "duratoin": 5}))
+        used |= set(re.findall(r"(?<= )![A-Z]\w+", path.read_text()))
+    assert all(f"{tag} mapping" in scenario_schema()["$comment"] for tag in used)
+    validator = scenario_validator()
     assert validator.is_valid({"robot": {"file": "a"}, "references": {}, "_anchors": 1})
     assert not validator.is_valid({"robot": {"file": "a", "bsae": {}}, "references": {}})
-    assert all(f"{tag} mapping" in scenario_schema()["$comment"] for tag in used)

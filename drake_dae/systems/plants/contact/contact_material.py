@@ -34,13 +34,19 @@ class PointMaterial:
     a) off the surface. This deviation from ideal contact is reduced by a smaller radius, not by a
     stiffer contact. A tool that stays normal to its surface does not roll.
 
-    The stiffness is in N/m, the Hunt-Crossley dissipation in s/m, the radius of the ball in m; the
-    time_step is in s, 0 for a continuous plant. `friction` is the coefficient of all contacts, None
-    for those of the constraints. `stiction_tolerance` is v_s of Drake's regularized friction, m/s.
-    In a continuous plant, fixed steps of an explicit scheme must not exceed m v_s / (mu f_n), with
-    the mass m that slides and the normal force f_n: the slope of friction over velocity is
-    15/8 mu f_n / v_s, and the velocity of a point that sticks would alternate from step to step.
-    Where the steps of a scenario are longer, `analyze` says so, and `simulate` before the run.
+    Attributes:
+        time_step: The step of the plant in s; 0 for a continuous plant.
+        stiffness: The stiffness of point contact, N/m.
+        dissipation: The Hunt-Crossley dissipation, s/m.
+        friction: The coefficient of friction of all contacts; None for those of the constraints.
+        stiction_tolerance: v_s of Drake's regularized friction, m/s. In a continuous plant, fixed
+            steps of an explicit scheme must not exceed m v_s / (mu f_n), with the mass m that
+            slides and the normal force f_n: the slope of friction over velocity is 15/8 mu f_n /
+            v_s, and the velocity of a point that sticks would alternate from step to step. Where
+            the steps of a scenario are longer, `analyze` says so, and `simulate` before the run.
+        radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
+            constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
+            radius.
     """
 
     time_step: float = 1e-3
