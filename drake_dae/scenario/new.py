@@ -421,7 +421,8 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
             inverse = np.linalg.pinv(best.gradients[rows_at])[:, 1 : 1 + len(free)]
             fastest = np.max(np.abs(inverse) / speeds[:, None], initial=1e-9)
             torque = np.max(np.abs(best.gradients[axis]) / efforts, initial=1e-9)
-            why = f"where {len(rows_at)} directions of motion are free of each other there"
+            ways_out = f"{len(rows_at)} directions of motion are free of each other there"
+            why = f"where {ways_out} by {score / len(rows_at):.2g} (1 is best, 0 singular)"
             x, y, z = (round(float(value), decimals) + 0.0 for value in best.rows[:3])
             i, j, k = (sign * (n == axis) + 0.0 for n in range(3))
             of_limits = _SHARE / fastest, _SHARE / 2 / torque
