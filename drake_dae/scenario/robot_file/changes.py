@@ -81,8 +81,9 @@ def change_robot(
         _drive_joints(robot.actuators, plant, leaders, of_joints.get("effort", {}), armatures)
     add_payloads("robot.payloads", robot.payloads, plant)
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
+    movable = _movable(plant)  # Without those that are locked.
     for name, armature in armatures.items() if ARMATURE not in robot.leave_out else ():
-        if joint_names(plant)[name].index() not in driven:
+        if name in movable and movable[name].index() not in driven:
             raise ModelError(
                 f"joint '{name}' has an armature of {armature:g} and no motor, and Drake gives "
                 "only motors one; name it under robot.actuators, or write leave_out: "
@@ -151,9 +152,12 @@ def _lock_joints(
     for _ in leaders:  # As often as the longest chain needs.
         for follower, (leader, ratio, offset) in leaders.items():
             if leader in positions:
-                positions.setdefault(follower, ratio * positions[leader] + offset)
-            if follower in locked:
-                raise ModelError(f"'{follower}' follows '{leader}', which can be locked instead")
+                coupled = ratio * positions[leader] + offset
+                if abs(positions.setdefault(follower, coupled) - coupled) > 1e-9:
+                    text = f"'{follower}' follows '{leader}', which makes it {coupled:g}"
+                    raise ModelError(f"{text}, and not {positions[follower]:g}; lock one of them")
+            elif follower in positions and ratio != 0.0:
+                positions[leader] = (positions[follower] - offset) / ratio
     for name, value in positions.items():
         joint = _named(name, joints)
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
