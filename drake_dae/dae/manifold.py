@@ -180,7 +180,7 @@ class Manifold:
         step = step_from(moved, start, p)[0]
         left = norm(step)
         if left * left <= PRECISION * length:  # The test of `newton`, without its overhead.
-            while ROUNDING < left < 0.5 * length:
+            while 0.0 < left < 0.5 * length:
                 moved, length = moved + scale * step, left
                 step = step_from(moved, start, p)[0]
                 left = norm(step)
