@@ -118,7 +118,7 @@ class Manifold:
             solved = normal.solve(self.residual_expression / sizes)
             step = regular - ca.mtimes(scaled.T, solved)
         inputs = {"other": other}
-        return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
+        return self.system.trace("step to the manifold", {"step": step}, inputs)
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
     def _relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
