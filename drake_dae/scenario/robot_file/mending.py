@@ -46,32 +46,25 @@ _FLAT = 1e-8
 class Mender:
     """Makes mended copies of files. A "model" is the name of a model instance, "" for a lone robot.
 
-    Attributes:
-        told: Category of a warning and its text -> what it concerns.
-        lost: Part of the files that is lost -> where.
-        originals: Copy -> its file.
-        joints: "effort" limit, "armature", "follows" (leader, ratio, offset), position at which it
-            "stands", "parent" of SDFormat -> (model, joint) -> value.
-        floating: The floating joints.
-        crossed: (model, link) of which visual geometry is left out.
+    `folder` is an empty one for the copies, None to make none; `shapes` has "read" if geometry is
+    read, and "drawn" if it is converted to be drawn.
     """
 
     def __init__(
         self, files: RobotFiles, robot: Robot, folder: Path | None, shapes: Collection[str] = ()
     ) -> None:
-        """`folder` is an empty one for the copies, None to make none.
-
-        `shapes` has "read" if geometry is read, and "drawn" if it is converted to be drawn.
-        """
         self.files, self.leave_out, self.folder = files, robot.leave_out, folder
         self.drives = robot.actuators is None  # Else the file's motors do not count.
         self.has_geometry, self.drawn = "read" in shapes, "drawn" in shapes
+        # Category of a warning and its text -> what it concerns; part that is lost -> where.
         self.told: dict[tuple[type[Warning], str], list[str]] = defaultdict(list)
         self.lost: dict[str, list[str]] = defaultdict(list)
-        self.originals: dict[Path, Path] = {}
+        self.originals: dict[Path, Path] = {}  # Copy -> its file.
+        # "effort" limit, "armature", "follows" (leader, ratio, offset), position at which it
+        # "stands", "parent" of SDFormat -> (model, joint) -> value.
         self.joints: dict[str, dict[tuple[str, str], Any]] = defaultdict(dict)
         self.floating: list[Floating] = []
-        self.crossed: set[tuple[str, str]] = set()
+        self.crossed: set[tuple[str, str]] = set()  # (model, link) without a visual shape.
 
     def copy(
         self,
