@@ -47,7 +47,7 @@ WEB = (
 WEB_PATIENCE = 600.0
 """That compiler hangs if it takes longer than this, in s."""
 
-ANSWERS = 10.0
+ANSWERS = 60.0
 """A compiler that takes longer than this to report its version counts as hanging, in s."""
 
 _HANGING: dict[str, str] = {}
