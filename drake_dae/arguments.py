@@ -1,9 +1,8 @@
 """Checks the arguments of public functions and constructors by their annotations."""
 
 import inspect
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cache, wraps
-from itertools import chain
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -15,18 +14,18 @@ from drake_dae.arrays import all_finite, brief, number, numbers
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+Problem = tuple[str, str, Any]
+"""Where a value is not what an annotation says, what would be right there, and what it is."""
+
 
 def checked(error: Callable[[str], Exception]) -> Callable[[F], F]:
     """Decorates a public name so that arguments which do not match their annotations raise.
 
     Of a class, the constructor and the class methods are decorated; what it makes keeps copies of
-    the caller's arrays. A number must be finite and not
-    a bool, text is no list of letters, and the entries of lists and dictionaries are checked as
-    well. Shapes and ranges are left to the function. A default is always accepted. A check takes
-    some 10 us: nothing that is called in a loop has one.
-
-    Args:
-        error: Makes the exception of "<name>: <argument> must be <condition>, got <value>".
+    the caller's arrays. A number must be finite and not a bool, text is no list of letters, and the
+    entries of lists and dictionaries are checked as well. Shapes and ranges are left to the
+    function. A default is always accepted. A check takes some 10 us: nothing that is called in a
+    loop has one. `error` makes the exception of "<name>: <argument> must be <condition>, got ...".
     """
 
     def decorate(target: F) -> F:
@@ -53,52 +52,49 @@ def _checked(function: F, error: Callable[[str], Exception], owner: str) -> F:
         for name, value in (*zip(names, arguments, strict=False), *options.items()):
             if name not in hints() or value is parameters[name].default:
                 continue
-            if problems := list(_problems(hints()[name], value, "")):
+            if problems := _problems(hints()[name], value):
                 place, _, wrong = max(problems, key=lambda problem: len(problem[0]))
                 wanted = dict.fromkeys(words for where, words, _ in problems if where == place)
                 text = f"{name}{place} must be {' or '.join(wanted)}, got {brief(wrong)}"
                 raise error(f"{owner}: {text}")
         if function.__name__ == "__init__":
-            own = (value.copy() if isinstance(value, np.ndarray) else value for value in arguments)
-            arguments = tuple(own)
-            options |= {n: v.copy() for n, v in options.items() if isinstance(v, np.ndarray)}
+            arguments = tuple(map(_own, arguments))
+            options = {name: _own(value) for name, value in options.items()}
         return function(*arguments, **options)
 
     return call  # type: ignore[return-value]
 
 
-def _problems(hint: Any, value: Any, place: str) -> Iterator[tuple[str, str, Any]]:
-    """Where a value is not what an annotation says, what would be right there, and what it is."""
+def _own(value: Any) -> Any:
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def _problems(hint: Any, value: Any, place: str = "") -> list[Problem]:
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType) and hint != ArrayLike:
         if set(parts) >= _ARRAY:
             parts = (ArrayLike, *(part for part in parts if part not in _ARRAY))
-        found = [list(_problems(part, value, place)) for part in parts]
-        if all(found):
-            yield from chain(*found)
-    elif inspect.isclass(origin) and issubclass(origin, Mapping):
+        found = [_problems(part, value, place) for part in parts]
+        return [problem for one in found for problem in one] if all(found) else []
+    kind = origin if inspect.isclass(origin) else object
+    if issubclass(kind, Mapping):
         if not isinstance(value, Mapping):
-            yield place, "a dictionary", value
-            return
-        for key, entry in value.items():
-            yield from _problems(parts[0], key, f"{place}[{key!r}]")
-            yield from _problems(parts[1], entry, f"{place}[{key!r}]")
-    elif inspect.isclass(origin) and issubclass(origin, Collection) and origin is not np.ndarray:
-        count = None if origin is not tuple or parts[1:] == (...,) else len(parts)
+            return [(place, "a dictionary", value)]
+        pairs = [(parts[k], pair[k], f"[{pair[0]!r}]") for pair in value.items() for k in (0, 1)]
+    elif issubclass(kind, Collection) and kind is not np.ndarray:
+        count = None if kind is not tuple or parts[1:] == (...,) else len(parts)
         is_list = isinstance(value, Collection) and not isinstance(value, (str, bytes, Mapping))
         if not is_list or count not in (None, len(value)):
-            yield place, "a list" if count is None else f"{count} entries", value
-            return
-        for index, entry in enumerate(value):
-            yield from _problems(parts[index if count else 0], entry, f"{place}[{index}]")
+            return [(place, "a list" if count is None else f"{count} entries", value)]
+        hints = parts if count else [parts[0]] * len(value)
+        pairs = [(hints[k], entry, f"[{k}]") for k, entry in enumerate(value)]
     else:
         wanted, holds = _rule(hint)
         try:
-            is_right = holds(value)
+            return [] if holds(value) else [(place, wanted, value)]
         except (ValueError, TypeError, OverflowError, RuntimeError):
-            is_right = False
-        if not is_right:
-            yield place, wanted, value
+            return [(place, wanted, value)]
+    return [p for of, entry, at in pairs for p in _problems(of, entry, place + at)]
 
 
 def _rule(hint: Any) -> tuple[str, Callable[[Any], object]]:
@@ -109,16 +105,13 @@ def _rule(hint: Any) -> tuple[str, Callable[[Any], object]]:
     if get_origin(hint) is Literal:
         words = get_args(hint)
         return " or ".join(map(repr, words)), lambda v: isinstance(v, str) and v in words
+    if hint is Any or not inspect.isclass(hint):  # Any is a class, too.
+        return "anything", lambda v: True
     if getattr(hint, "_is_protocol", False):
         names = [name for kind in hint.__mro__ for name in vars(kind) if name[0] != "_"]
         has = inspect.getattr_static  # It evaluates no property, and an attribute may be None.
-        return f"a {hint.__name__}", lambda v: all(has(v, n, _NOT) is not _NOT for n in names)
-    if hint is Any or not inspect.isclass(hint):  # Any is a class, too.
-        return "anything", lambda v: True
+        return f"a {hint.__name__}", lambda v: all(has(v, n, _RULES) is not _RULES for n in names)
     return f"a {hint.__name__}", lambda v: isinstance(v, hint)
-
-
-_NOT = object()
 
 
 def _is_whole(value: Any) -> bool:

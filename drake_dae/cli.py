@@ -50,12 +50,7 @@ needed until its end, and Python's default takes a sixth of the time of a short 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code, as in `EXIT_CODES`.
-
-    Args:
-        arguments: The arguments after the command's name; None for those of this process, which
-            must do nothing else then.
-    """
+    """Runs the command line, by default that of this process, and returns the exit code."""
     if arguments is not None:
         return _main(arguments)
     gc.set_threshold(YOUNG)

@@ -24,12 +24,7 @@ MOST_RECORDED = 1 << 31
 
 
 def open_file(path: str | Path) -> BinaryIO:
-    """Opens a file for reading: no pipe, which may block for ever, and no device without end.
-
-    Raises:
-        OSError: It cannot be read, or is no regular file.
-        ValueError: The path contains a null byte, or characters that paths must not have.
-    """
+    """Opens a file for reading: no pipe, which may block for ever, and no device without end."""
     mode = os.stat(path).st_mode
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -43,8 +38,7 @@ def check_file(
 ) -> tuple[str, int, int]:
     """Checks the size of a file that another library will read, and of an archive what is packed.
 
-    Returns:
-        Its name, the time of its last change in ns, and its size in bytes.
+    Returns its name, the time of its last change in ns, and its size in bytes.
     """
     try:
         with open_file(path) as file:
@@ -61,7 +55,7 @@ def check_file(
 
 
 def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
-    """The bytes of a file of at most this size; raises what `open_file` raises, or OSError."""
+    """The bytes of a file of at most this size."""
     with open_file(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
@@ -77,11 +71,7 @@ def read_text(path: str | Path, most: int = MOST_BYTES) -> str:
 
 
 def read_mesh(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The vertices of a mesh, shape (n, 3), in its unit, and its triangles, shape (k, 3).
-
-    Raises:
-        ModelError: It cannot be read, or the package trimesh is not installed.
-    """
+    """The vertices of a mesh, shape (n, 3), in its unit, and its triangles, shape (k, 3)."""
     check_file(file, ModelError)
     if file.suffix.lower() not in MESHES:
         raise ModelError(f"'{file.name}' is none of the meshes that are read: {', '.join(MESHES)}")
@@ -102,11 +92,7 @@ def read_mesh(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def check_unwritten(files: Iterable[Path], force: bool) -> None:
-    """The rule of all commands: a file is replaced by --force alone, and what is no file never.
-
-    Raises:
-        ModelError: One of the files exists, or is a link, a folder or a device.
-    """
+    """The rule of all commands: a file is replaced by --force alone, and what is no file never."""
     there = [path for path in files if os.path.lexists(path)]
     for path in there:
         if path.is_symlink() or not path.is_file():

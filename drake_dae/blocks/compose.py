@@ -30,15 +30,12 @@ Port = tuple[System, int]
 
 @dataclass(frozen=True, eq=False)
 class Leaves:
-    """The leaf systems of a diagram, and the wires between them, with nested diagrams flattened.
+    """The leaf systems of a diagram, and the wires between them, with nested diagrams flattened."""
 
-    Attributes:
-        systems: The leaves, in the order of Drake's states and parameters.
-        sources: Input port of a leaf -> the output port of a leaf that it is wired to.
-    """
-
-    systems: list[System] = field(default_factory=list)
-    sources: dict[Port, Port] = field(default_factory=dict)
+    systems: list[System] = field(default_factory=list)  # in the order of Drake's states
+    sources: dict[Port, Port] = field(
+        default_factory=dict
+    )  # input port -> the output port it is wired to
 
     @classmethod
     def of(cls, diagram: Diagram) -> "Leaves":

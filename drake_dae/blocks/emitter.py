@@ -59,21 +59,7 @@ def can_be_emitted(function: ca.Function) -> bool:
 
 
 def emitted(function: ca.Function, name: str, constants: list[float]) -> str:
-    """Returns a function as C, with its values in the order in which CasADi computes them.
-
-    The text does not depend on the values of constants: functions that differ in them alone share
-    their machine code.
-
-    Args:
-        function: A function of expressions (SX), whose inputs and outputs are dense columns.
-        name: The name of the C function, `mask name(const double *c, const real *a0, ..., real *r0,
-            ...)`. It returns for which runs an angle is too large for `turn`.
-        constants: The constants are appended to it, one for each use, and the C function reads them
-            from `c`.
-
-    Raises:
-        ModelError: An operation is not supported, see `can_be_emitted`.
-    """
+    """A function as C that reads its constants, appended to a list, from `c`: code is shared."""
     if not can_be_emitted(function):
         raise ModelError(f"{function.name()} has an operation that lanes do not support")
     places: dict[int, str | float] = {}
@@ -138,11 +124,7 @@ def emitted(function: ca.Function, name: str, constants: list[float]) -> str:
 
 
 def _divisors(function: ca.Function) -> tuple[set[int], set[int]]:
-    """Returns divisions that become products, since a division takes as long as ten of them.
-
-    Returns:
-        Divisions with a common divisor or by a square root; and the square roots.
-    """
+    """Divisions with a common divisor or by a root, which become products; and these roots."""
     places, divisions = dict[int, int](), dict[int, list[int]]()
     roots = set[int]()
     for i in range(function.n_instructions()):

@@ -18,26 +18,13 @@ diagram is.
 
 
 def weakly(method: Callable[..., Any], *first: Any) -> Callable[..., Any]:
-    """A callback for Drake that does not keep its system alive.
-
-    Drake stores callbacks in C++, which the garbage collector does not see: a bound method there
-    would keep its system forever.
-
-    Args:
-        method: A method bound to its system.
-        first: Its first arguments; Drake gives the others.
-    """
+    """A callback by a bound method, which Drake stores in C++ without keeping its system alive."""
     weak = MethodType(method.__func__, proxy(method.__self__))  # type: ignore[attr-defined]
     return partial(weak, *first) if first else weak
 
 
 def port_value(method: Callable[..., Any], *first: Any) -> Callable[[Context, BasicVector], None]:
-    """The calculation of a vector output port by a method that returns its value.
-
-    Args:
-        method: A method bound to its system; its last argument is the context.
-        first: Its other arguments.
-    """
+    """The calculation of a vector output port by a method of a context that returns its value."""
     value = weakly(method, *first)
 
     def calculate(context: Context, output: BasicVector) -> None:

@@ -46,13 +46,7 @@ SLOWER = 4
 
 
 class Stepper(NamedTuple):
-    """The machine code of a block.
-
-    Attributes:
-        code: The library; diagrams that differ in constants alone share that of several runs.
-        constants: The constants of this block.
-        functions: Its functions.
-    """
+    """The machine code of a block; for several runs, of all that differ in constants alone."""
 
     code: ctypes.CDLL
     constants: FloatArray
@@ -97,17 +91,7 @@ def can_run_several(functions: StepFunctions) -> bool:
 def load(
     functions: StepFunctions, compiled: Compiled, make: bool, several: bool = False
 ) -> Stepper | None:
-    """The machine code of a block; None if there is none.
-
-    Args:
-        functions: The block.
-        compiled: The choice, True or "auto".
-        make: Whether to make it if it is not in the cache.
-        several: Whether it makes several runs side by side.
-
-    Warns:
-        MachineCodeWarning: It cannot be made.
-    """
+    """The machine code of a block, of one run or of several side by side; None if there is none."""
     constants: list[float] = []
     operations = functions.num_operations
     options: tuple[str, ...] = ()
@@ -121,14 +105,7 @@ def load(
 
 
 def source(functions: StepFunctions, constants: list[float], several: bool = False) -> str:
-    """The C source that steps a block.
-
-    Args:
-        functions: The block.
-        constants: A list to which its constants are appended, which the code reads from the batch;
-            none for a single run.
-        several: Whether it makes several runs side by side.
-    """
+    """The C source that steps a block; for several runs its constants are appended to a list."""
     sizes = dict(zip(["SIZE", "HELD", "PARAMETERS", "NOISE"], functions.sizes[1:], strict=True))
     sizes |= {"WIDTH": functions.row.numel_out(0), "RATES": len(functions.rates)}
     sizes["PROJECTS"] = int(functions.projects)

@@ -23,20 +23,13 @@ SMALLEST = 1e-13
 
 
 class Rate(NamedTuple):
-    """Held values that are updated together, at t_k = offset + k period.
-
-    Attributes:
-        period, offset: In s.
-        is_unrestricted: As of `Held`.
-        places: Their indices among all held values.
-        function: (time, state, held, parameters, noise) -> the next values.
-    """
+    """Held values that are updated together, at t_k = offset + k period."""
 
     period: float
     offset: float
     is_unrestricted: bool
-    places: list[int]
-    function: ca.Function
+    places: list[int]  # among all held values
+    function: ca.Function  # of (time, state, held, parameters, noise)
 
 
 class Buffered:
@@ -154,11 +147,7 @@ class StepFunctions:
     def projected(
         self, time: float, state: FloatArray, held: FloatArray, parameters: FloatArray
     ) -> FloatArray:
-        """The state on the manifold, also where plain Newton steps do not lead there.
-
-        Raises:
-            InconsistentStateError: It is too far away.
-        """
+        """The state on the manifold, also where plain Newton steps do not lead there."""
         assert self.block.projection is not None
         values = self._expressions[1](time, state, held, parameters).full()[:, 0]
         return self.block.projection.project(state, values)
@@ -235,29 +224,17 @@ Look = Callable[[Callable[[], FloatArray]], bool]
 
 @dataclass(frozen=True, eq=False)
 class StepSettings:
-    """How to step.
+    """How to step."""
 
-    Attributes:
-        longest: The longest step, or the fixed one, in s.
-        tableau: The method of fixed steps; None for error control by DOP853.
-        absolute: The absolute tolerance of a step for each state, shape (n,).
-        relative: The relative tolerance.
-        look: May stop a run.
-    """
-
-    longest: float
-    tableau: Tableau | None
-    absolute: FloatArray
+    longest: float  # or the fixed one, in s
+    tableau: Tableau | None  # None: error control by DOP853
+    absolute: FloatArray  # of each state, (n,)
     relative: float
-    look: Look
+    look: Look  # may stop a run
 
     @classmethod
     def of(cls, config: SimulatorConfig, functions: StepFunctions, look: Look) -> Self:
-        """The settings from Drake's.
-
-        Raises:
-            ModelError: The steps are fixed, and the scheme is implicit.
-        """
+        """The settings from Drake's; implicit schemes have no fixed steps."""
         tableau, scheme = None, config.integration_scheme
         if not config.use_error_control:
             if scheme not in FIXED:
@@ -274,23 +251,15 @@ class StepSettings:
 
 @dataclass(frozen=True, eq=False)
 class RunProblem:
-    """One run, or many over the same times, which then have a row each.
+    """One run, or k runs over the same times, which then have a row each."""
 
-    Attributes:
-        times: The times of the rows in s, from the start to the end, shape (j,).
-        state, held: The states and the held values at the start, shape (n,) or (k, n).
-        parameters: All parameters, shape (p,) or (k, p); (1, p) for all runs.
-        events, due: The times of updates in s, and the rates that are due then, as bits.
-        noise: The random numbers of each update, shape (len(events), q), or (k, ...), (1, ...).
-    """
-
-    times: FloatArray
-    state: FloatArray
+    times: FloatArray  # of the rows, from the start to the end
+    state: FloatArray  # (n,) or (k, n)
     held: FloatArray
-    parameters: FloatArray
+    parameters: FloatArray  # (p,) or (k, p); (1, p) for all
     events: FloatArray
-    due: np.ndarray
-    noise: FloatArray
+    due: np.ndarray  # the rates that are due at the events, as bits
+    noise: FloatArray  # (len(events), q), or (k, ...), (1, ...)
 
     def run(self, i: int) -> "RunProblem":
         """One of many."""
@@ -302,28 +271,16 @@ class RunProblem:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The result of a run.
+    """The result of a run."""
 
-    Attributes:
-        rows: The rows of the record up to its end.
-        ending: How it ended.
-        time: The time of the last accepted state, in s.
-        state, held: The last accepted state, and the held values there.
-        steps: The number of accepted steps.
-        mark: The time a thousand steps ago, in s.
-        next: The end of a step that was not accepted, in s.
-        trial_time, trial: The earliest trial after `time` that failed; not finite if none did.
-        error: An exception of Drake.
-    """
-
-    rows: FloatArray
+    rows: FloatArray  # up to its end
     ending: RunEnding
-    time: float
+    time: float  # of the last accepted state
     state: FloatArray
     held: FloatArray
     steps: int
-    mark: float = np.nan
-    next: float = np.nan
-    trial_time: float = np.inf
+    mark: float = np.nan  # the time a thousand steps ago
+    next: float = np.nan  # the end of a step that was not accepted
+    trial_time: float = np.inf  # of the earliest trial that failed
     trial: FloatArray | None = None
-    error: Exception | None = None
+    error: Exception | None = None  # of Drake

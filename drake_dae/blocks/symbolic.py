@@ -130,16 +130,7 @@ def from_symbolic(
 
 
 def to_casadi(expression: Any, symbols: Mapping[int, ca.SX], smooth: bool = True) -> ca.SX:
-    """Converts a scalar expression of `pydrake.symbolic`, or a number, to CasADi.
-
-    Args:
-        expression: The expression, or a Formula in it.
-        symbols: Variable.get_id() -> its CasADi symbol.
-        smooth: Whether it must have derivatives everywhere.
-
-    Raises:
-        ModelError: A variable has no symbol, or a function is not smooth or not known.
-    """
+    """A scalar expression of `pydrake.symbolic`, a Formula in it, or a number, in CasADi."""
     if isinstance(expression, Variable):
         if expression.get_id() not in symbols:
             raise ModelError(

@@ -181,11 +181,7 @@ class TracedSystem(LeafSystem):
 
 
 def check_context(system: System, context: Context) -> None:
-    """Refuses the context of another system.
-
-    Raises:
-        ModelError: It belongs to another system.
-    """
+    """Refuses the context of another system."""
     try:
         system.ValidateContext(context)
     except RuntimeError:
@@ -196,11 +192,7 @@ def check_context(system: System, context: Context) -> None:
 
 
 def context_in(system: System, root: Context) -> Context:
-    """The context of a system in that of a diagram that contains it.
-
-    Raises:
-        ModelError: It belongs to a diagram without this system.
-    """
+    """The context of a system in that of a diagram that contains it."""
     try:
         return system.GetMyMutableContextFromRoot(root)
     except RuntimeError:

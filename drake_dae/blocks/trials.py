@@ -48,40 +48,23 @@ _DONE = EventStatus.DidNothing()
 
 @dataclass
 class RunProgress:
-    """The progress of a simulation in one context, for one block.
+    """The progress of a simulation in one context, for one block."""
 
-    Attributes:
-        time: The time of the last accepted state, in s; infinite without a simulation, so that no
-            state is a trial.
-        state: The continuous state of the block then; empty if it has none.
-        failures: The number of failed trials since then.
-        reason: The error of the earliest of them.
-        start: The start of the simulation, in s.
-        steps: The number of accepted steps.
-        mark: The time after the last `PACE_STEPS` steps, in s.
-        entry: The cache entry of this value, since looking it up takes longer.
-    """
-
-    time: float = inf
-    state: FloatArray = field(default_factory=lambda: np.zeros(0))
-    failures: int = 0
-    reason: SimulationError | None = None
+    time: float = inf  # of the last accepted state; without a simulation no state is a trial
+    state: FloatArray = field(default_factory=lambda: np.zeros(0))  # then
+    failures: int = 0  # trials since then
+    reason: SimulationError | None = None  # the error of the earliest
     start: float = 0.0
     steps: int = 0
-    mark: float = 0.0
-    entry: CacheEntry | None = None
+    mark: float = 0.0  # after the last PACE_STEPS steps
+    entry: CacheEntry | None = None  # of this value: looking it up takes longer
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "RunProgress":
         return replace(self, state=self.state.copy())
 
 
 class StepWatch:
-    """Distinguishes trials from accepted states for one block, and ends runs without progress.
-
-    Args:
-        system: The block, which gets two events and a cache entry.
-        sees_steps: Whether it gets the events; without them no state is a trial.
-    """
+    """Distinguishes trials from accepted states for one block, and ends runs without progress."""
 
     def __init__(self, system: LeafSystem, sees_steps: bool = True) -> None:
         self._system = proxy(system)
@@ -98,12 +81,7 @@ class StepWatch:
             system.DeclarePerStepPublishEvent(weakly(self._accept))
 
     def tolerate(self, context: Context, error: SimulationError) -> None:
-        """Returns if the context is at a trial state, where a failure is allowed.
-
-        Raises:
-            SimulationError: The error, at an accepted state or without a simulation; or one of its
-                class, if no step is short enough.
-        """
+        """Raises the error, except at a trial state, from which shorter steps may lead on."""
         progress = self._progress(context)
         step = error.time - progress.time
         # After other trials, a step of length zero is a rounded one: steps are very short by now.

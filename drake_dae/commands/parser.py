@@ -61,11 +61,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def check_folder(folder: Path) -> None:
-    """Checks that a path is a folder, or can become one.
-
-    Raises:
-        ModelError: It is a file or a device, or a link that leads nowhere.
-    """
+    """Checks that a path is a folder, or can become one."""
     if os.path.lexists(folder) and not folder.is_dir():
         raise ModelError(f"'{folder}' is a file, and no folder; name a folder")
 
@@ -74,8 +70,7 @@ def check_folder(folder: Path) -> None:
 def complete(folder: Path, name: str = "") -> Iterator[Path]:
     """A temporary folder, whose files are moved into a folder when they are complete.
 
-    Raises:
-        OSError: A file cannot be written; the error names this file if it has no other path.
+    An OSError without another path names the file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     temporary = TemporaryDirectory(prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True)
@@ -92,11 +87,7 @@ def complete(folder: Path, name: str = "") -> Iterator[Path]:
 
 
 def open_page(page: Path) -> None:
-    """Opens a file in the browser.
-
-    Raises:
-        ModelError: There is no browser.
-    """
+    """Opens a file in the browser."""
     address = page.resolve().as_uri()
     try:
         opened = webbrowser.open(address)
@@ -130,12 +121,13 @@ def waiting(what: str) -> Iterator[None]:
             print(f"\r{what} ... {passed:.0f} s", end="", file=sys.stderr, flush=True)
         print(file=sys.stderr)
 
+    if not sys.stderr.isatty():
+        yield
+        return
     teller = threading.Thread(target=tell, daemon=True)
-    if sys.stderr.isatty():
-        teller.start()
+    teller.start()
     try:
         yield
     finally:
         done.set()
-        if teller.is_alive():
-            teller.join()
+        teller.join()

@@ -25,7 +25,6 @@ from .equilibria import Stability as Stability
 from .equilibria import Verdict as Verdict
 from .extension import Extension as Extension
 from .extension import dynamic_extension as dynamic_extension
-from .extension import extend as extend
 from .fields import as_expression as as_expression
 from .floquet import StabilityAlong as StabilityAlong
 from .gains import FeedbackGains as FeedbackGains

@@ -48,16 +48,15 @@ def eliminate_numbers(
     constraint_gradient: FloatArray,
     constraint_matrix: FloatArray,
     scale: FloatArray,
-    negligible: float,
 ) -> tuple[Sized, Sized]:
     """Returns h* (10) and n* (12) at one state, without round-off."""
     h, size = fields["h"], np.abs(fields["h"])
-    by_control = multiply(constraint_gradient, (h, size), scale, negligible)
+    by_control = multiply(constraint_gradient, (h, size), scale)
     # Units of the constraints' derivatives, and of the constraint inputs.
     rows, columns = equilibration(np.abs(constraint_matrix))
     scaled = np.linalg.inv(constraint_matrix / rows[:, None] / columns)
     inverse = scaled / columns[:, None] / rows
-    beta = multiply(-inverse, by_control, rows, negligible)
-    added, added_size = multiply(fields["g"], beta, 1.0 / columns, negligible)
+    beta = multiply(-inverse, by_control, rows)
+    added, added_size = multiply(fields["g"], beta, 1.0 / columns)
     h_star = without_round_off(h + added, size + added_size)
-    return h_star, multiply(fields["m"], beta, 1.0 / columns, negligible)
+    return h_star, multiply(fields["m"], beta, 1.0 / columns)

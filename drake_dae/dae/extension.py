@@ -74,35 +74,6 @@ class Extension:
 
 
 @checked(ModelError)
-def extend(
-    system: DaeSystem,
-    integrators: Mapping[str, int] | Sequence[str],
-    nominal_control: Mapping[str, float] | None = None,
-) -> DaeSystem:
-    """Puts integrators before controls: u_i, u_i', ... become states, the next one the control."""
-    _refuse_metric(system)
-    if not isinstance(integrators, Mapping):
-        integrators = dict.fromkeys(integrators, 1)
-    if any(type(count) is not int or count < 1 for count in integrators.values()):
-        raise ModelError(
-            f"{system.name}: integrators must be whole numbers from 1, got {dict(integrators)}"
-        )
-    nominal = _by_control(system, "nominal_control", nominal_control)
-    _by_control(system, "integrators", integrators)
-    base = system.control_signals
-    for order in range(max(integrators.values(), default=0)):
-        columns = [i for i, signal in enumerate(base) if integrators.get(signal.name, 0) > order]
-        system = _integrated(
-            system,
-            columns,
-            added=[base[i].derivative(order) for i in columns],
-            following=[base[i].derivative(order + 1) for i in columns],
-            nominal=nominal[columns] if order == 0 else np.zeros(len(columns)),
-        )
-    return system
-
-
-@checked(ModelError)
 def dynamic_extension(
     system: DaeSystem,
     *,
@@ -130,17 +101,25 @@ def dynamic_extension(
 
     Raises:
         AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
-            isolated states only, or more than n are needed; or Assumption (3) is violated, where
-            `extend` helps.
+            isolated states only, or more than n are needed; or Assumption (3) is violated.
         ModelError, InconsistentStateError: The system has no structure, see `find_structure`, or it
             has a `control_metric`.
     """
-    _refuse_metric(system)
-    held, spreads = (
-        _by_control(system, "nominal_control", nominal_control),
-        spread_of(system, spread),
-    )
-    names = [signal.name for signal in system.control_signals]
+    if system.control_metric is not None:
+        raise ModelError(
+            f"{system.name}: control_metric compares controls, not their derivatives; leave it "
+            "out, and give the extended system one"
+        )
+    given, names = nominal_control or {}, [signal.name for signal in system.control_signals]
+    unknown = [name for name in given if name not in names]
+    if unknown:
+        raise ModelError(
+            f"{system.name}: nominal_control names {', '.join(unknown)}, but the controls are "
+            f"{', '.join(names) or 'none'}"
+        )
+    values = [given.get(name, 0.0) for name in names]
+    held = vector(f"{system.name}: nominal_control", values, len(names))
+    spreads = spread_of(system, spread)
     bases = [(signal, 0) for signal in system.control_signals]
     extended, integrators = system, dict[str, int]()
     offset, matrix = ca.SX(system.num_controls, 1), ca.SX.eye(system.num_controls)
@@ -267,14 +246,6 @@ def _controls_to_integrate(structure: Structure) -> tuple[list[int], ca.SX | Non
     return columns, mixing
 
 
-def _refuse_metric(system: DaeSystem) -> None:
-    if system.control_metric is not None:
-        raise ModelError(
-            f"{system.name}: control_metric compares controls, not their derivatives; leave it "
-            "out, and give the extended system one"
-        )
-
-
 def _integrated(
     system: DaeSystem,
     columns: list[int],
@@ -310,16 +281,3 @@ def _integrated(
         mass_matrix=ca.diagcat(system.mass_matrix, ca.SX.eye(q)),
         implicit=None,  # The derivatives of the constraints may differ.
     )
-
-
-def _by_control(system: DaeSystem, what: str, values: Mapping[str, float] | None) -> FloatArray:
-    """Numbers by the names of controls as an array, shape (p,); 0 for others."""
-    values = values or {}
-    names = [signal.name for signal in system.control_signals]
-    unknown = [name for name in values if name not in names]
-    if unknown:
-        raise ModelError(
-            f"{system.name}: {what} names {', '.join(unknown)}, but the controls are "
-            f"{', '.join(names) or 'none'}"
-        )
-    return vector(f"{system.name}: {what}", [values.get(n, 0.0) for n in names], len(names))

@@ -31,12 +31,11 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         )
     state = ca.vec(state)
     check_choice(name, given["compiled"])
-    for key in ("least_margin", "negligible"):
-        if not 1e-15 <= number(f"{name}: {key}", given[key]) < 1.0:
-            raise ModelError(
-                f"{name}: {key} must be from 1e-15, which is round-off, to below 1, got "
-                f"{brief(given[key])}"
-            )
+    if not 1e-15 <= number(f"{name}: least_margin", given["least_margin"]) < 1.0:
+        raise ModelError(
+            f"{name}: least_margin must be from 1e-15, which is round-off, to below 1, got "
+            f"{brief(given['least_margin'])}"
+        )
     for key, kind in (("contacts", UnilateralInput), ("parameters", Parameter)):
         items = given[key]
         if not isinstance(items, (list, tuple)) or not all(isinstance(i, kind) for i in items):
@@ -69,16 +68,14 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         if len(signals) != count:
             raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
         _check_unique(name, key, [signal.name for signal in signals])
-    sizes = {"nominal_state": given["nominal_state"], "state_scale": given["state_scale"]}
-    sizes["nominal_state"] = (
-        np.zeros(n) if sizes["nominal_state"] is None else given["nominal_state"]
-    )
-    for key, value in sizes.items():
+    nominal, scale = given["nominal_state"], given["state_scale"]
+    nominal = np.zeros(n) if nominal is None else nominal
+    for key, value in (("nominal_state", nominal), ("state_scale", scale)):
         if value is not None:
             fields[key] = vector(f"{name}: {key}", value, n)
             fields[key].setflags(write=False)
-    if not np.all(fields.get("state_scale", 1.0) > 0.0):
-        raise ModelError(f"{name}: state_scale must be positive, got {brief(sizes['state_scale'])}")
+    if scale is not None and not np.all(fields["state_scale"] > 0.0):
+        raise ModelError(f"{name}: state_scale must be positive, got {brief(scale)}")
     if free is not None and metric is None:
         raise ModelError(
             f"{name}: free_control needs a control_metric, which measures the distance from it"
@@ -98,15 +95,9 @@ def fields_of_functions(
     functions: Mapping[str, Any],
     parameters: Mapping[str, ArrayLike],
     labels: Mapping[str, Any],
-    fields: Sequence[str],
 ) -> dict[str, Any]:
     """Returns the fields of a `DaeSystem` from Python functions; see `from_functions`."""
     owner = labels.get("name", "system")
-    fixed = {"state", "parameters", "state_signals", *"fghklm"}
-    allowed = [item for item in fields if item not in fixed]
-    for label in labels:
-        if label not in allowed:
-            raise ModelError(f"{owner}: {unknown_name('field', label, allowed)}")
     bad = [name for name in parameters if not name.isidentifier()]
     if bad:
         raise ModelError(

@@ -179,7 +179,7 @@ class InputActions:
             if not np.all(np.isfinite(gradients)):
                 nowhere = np.full((len(gradients), field[0].shape[1]), np.nan)
                 return nowhere, nowhere
-            return multiply(gradients, field, self._scale, system.negligible)
+            return multiply(gradients, field, self._scale)
 
         return row
 
@@ -211,7 +211,7 @@ class InputActions:
         fields = fields_at(self._system, state, parameters)
         gradient, matrix = map(as_matrix, self._factors(state, parameters))
         try:
-            return eliminate_numbers(fields, gradient, matrix, self._scale, self._system.negligible)
+            return eliminate_numbers(fields, gradient, matrix, self._scale)
         except np.linalg.LinAlgError:
             h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
             return (h_star, h_star), (n_star * np.nan, n_star)

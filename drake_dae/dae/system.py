@@ -19,7 +19,7 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
-from drake_dae.trace.round_off import NEGLIGIBLE, SINGULAR
+from drake_dae.trace.round_off import SINGULAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,6 @@ class DaeSystem:
             terms of u^T W u comparable, as by 1 / limit^2.
         compiled: Machine code from the first call (True), never, or when it pays ("auto").
         least_margin: A(x) or B(x) is singular where its smallest singular value, scaled, is below.
-        negligible: Entries below this, relative to their row or column, are zero in degrees.
         contacts: Constraint inputs that only push, if one has friction: see `contacts`.
         dry: The names of parameters that are coefficients of Coulomb friction in f.
 
@@ -99,7 +98,6 @@ class DaeSystem:
     compiled: Compiled = "auto"
     contacts: tuple[UnilateralInput, ...] = ()
     least_margin: float = SINGULAR
-    negligible: float = NEGLIGIBLE
     dry: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -148,8 +146,7 @@ class DaeSystem:
             ModelError: A function fails, or the functions do not form a system; see the class.
         """
         functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
-        names = [item.name for item in fields(cls)]
-        system = cls(**fields_of_functions(state, functions, parameters or {}, labels, names))
+        system = cls(**fields_of_functions(state, functions, parameters or {}, labels))
         system = system.with_exogenous(exogenous) if exogenous else system
         return system.with_bounds(bounds) if bounds else system
 
@@ -252,7 +249,7 @@ class DaeSystem:
     @checked(ModelError)
     def with_exogenous(self, names: Sequence[str]) -> "DaeSystem":
         """Returns the same system with some parameters as exogenous signals."""
-        return self._with_parameters({name: {"exogenous": True} for name in names})
+        return self._with_parameters("exogenous", dict.fromkeys(names, True))
 
     @checked(ModelError)
     def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
@@ -266,23 +263,20 @@ class DaeSystem:
             bounds: Name -> (low, high), each a number or one for each entry; the default lies
                 between them. Equal bounds fix the parameter; as an exogenous signal it is constant.
         """
-        return self._with_parameters({name: {"bounds": each} for name, each in bounds.items()})
+        return self._with_parameters("bounds", bounds)
 
     @checked(ModelError)
     def with_values(self, values: Mapping[str, ArrayLike]) -> "DaeSystem":
         """Returns the same system with other defaults of some parameters."""
-        known = {p.name: p for p in self.parameters}
-        return self._with_parameters(
-            {
-                name: {"value": known[name].entries(value) if name in known else value}
-                for name, value in values.items()
-            }
-        )
+        sized = {p.name: p.entries(values[p.name]) for p in self.parameters if p.name in values}
+        return self._with_parameters("value", {**values, **sized})
 
-    def _with_parameters(self, changes: Mapping[str, dict[str, Any]]) -> "DaeSystem":
-        for name in changes:
+    def _with_parameters(self, key: str, values: Mapping[str, Any]) -> "DaeSystem":
+        for name in values:
             self.parameter_slice(name)
-        parameters = (replace(p, **changes.get(p.name, {})) for p in self.parameters)
+        parameters = [
+            replace(p, **{key: values[p.name]}) if p.name in values else p for p in self.parameters
+        ]
         return replace(self, parameters=tuple(parameters))
 
     @property

@@ -90,7 +90,6 @@ class TrackingLaw:
         )
         self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
         self.gains = self.design(gains)
-        self._last_gains: tuple[FeedbackGains | None, FloatArray] = None, np.empty(0)
         self.function = self._trace()
 
     def __repr__(self) -> str:
@@ -181,8 +180,6 @@ class TrackingLaw:
         The gains are the law's own if None; others must be zero where the law's own are.
         """
         values = self.system.parameter_vector(parameters)
-        if gains is not None and gains is self._last_gains[0]:  # As in most runs of a study.
-            return np.concatenate([values, self._last_gains[1]])
         chosen = self.gains if gains is None else self.design(gains)
         has = self.gains.matrix != 0.0
         if np.any(chosen.matrix[~has]):
@@ -192,10 +189,7 @@ class TrackingLaw:
                 f"the law has no gain from the error of {signals[j].name} to "
                 f"{self.system.output_signals[i].name}; make a new law with such a gain"
             )
-        entries = chosen.matrix.T[has.T]
-        if chosen is gains:
-            self._last_gains = chosen, entries
-        return np.concatenate([values, entries])
+        return np.concatenate([values, chosen.matrix.T[has.T]])
 
     @property
     def parameter_signals(self) -> list[Signal]:

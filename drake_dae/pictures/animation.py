@@ -67,7 +67,7 @@ def make_animation(
     open contact has no arrow. A contact with friction has a friction cone.
 
     Args:
-        loop: A loop of a `RobotPlant`.
+        loop: A loop of a `RobotPlant`, a `CompliantPlant` or a `ContactPlant`.
         record: The record of a run of this loop.
         context: The context of its diagram, which contains the parameters; not changed.
         title: The title of the page; the robot's name if empty.
@@ -203,5 +203,5 @@ def _draw_tube(meshcat: Meshcat, path: str, points: FloatArray, color: Rgba, rad
     second = np.column_stack([following, following + _SIDES, corner + _SIDES])
     segments = _SIDES * np.arange(len(points) - 1)[:, None, None]
     faces = (np.vstack([first, second]) + segments).reshape(-1, 3)
-    vertices = rings.reshape(-1, 3)
-    meshcat.SetTriangleMesh(path, np.asfortranarray(vertices.T), np.asfortranarray(faces.T), color)
+    columns = (np.asfortranarray(table.T) for table in (rings.reshape(-1, 3), faces))
+    meshcat.SetTriangleMesh(path, *columns, color)

@@ -1,6 +1,7 @@
 """The film of a run of a robot, rendered by Drake without a screen or a browser."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.animation import PillowWriter
@@ -69,20 +70,10 @@ _PHYSICAL_LIGHTS = (
 
 @checked(ModelError)
 def save_film(loop: ClosedLoop, record: Record, context: Context, path: str | Path) -> None:
-    """Writes a film of a recorded run, with the paths and the forces of the contacts.
+    """Writes a film of a recorded run of a robot, with the paths and the forces of the contacts.
 
-    The actual path is blue, the desired path green.
-
-    Args:
-        loop: A loop of a `RobotPlant` whose links have geometry.
-        record: The record of a run of this loop.
-        context: The context of its diagram, which contains the parameters; not changed.
-        path: A .gif for the film, or a .png for four pictures of it side by side.
-
-    Raises:
-        ModelError: The plant is not a robot, its links have no geometry, or the file has another
-            suffix.
-        OSError: The file cannot be written.
+    The actual path is blue, the desired path green. The context has the parameters. A .gif has the
+    film, a .png four pictures of it side by side.
     """
     path = Path(path)
     if path.suffix not in (".gif", ".png"):
@@ -109,11 +100,7 @@ def save_film(loop: ClosedLoop, record: Record, context: Context, path: str | Pa
 
 
 class FilmScene:
-    """Draws the links, surfaces, paths and forces of a run, frame by frame.
-
-    Raises:
-        ModelError: The links have no geometry.
-    """
+    """Draws the links, surfaces, paths and forces of a run, frame by frame."""
 
     def __init__(self, motion: RunMotion, scene_graph: SceneGraph | None) -> None:
         model, links = motion.model, motion.model.links.plant
@@ -185,6 +172,7 @@ class FilmScene:
     def draw(self, axis: Axes, number: int, phase: str = "") -> None:
         """Draws a frame of the film, with the actual paths up to its time."""
         motion, halo = self.motion, [withStroke(linewidth=3.0, foreground="white")]
+        text: dict[str, Any] = {"fontsize": 10, "path_effects": halo}
         axis.imshow(self._render(number), interpolation="nearest", extent=(0, _WIDTH, _HEIGHT, 0))
         axis.set_axis_off()
         wrench = motion.wrenches[number]
@@ -199,23 +187,13 @@ class FilmScene:
             shape = {"color": _FORCE, "width": 2.5, "headwidth": 9, "headlength": 9}
             axis.annotate("", head, tail, arrowprops=shape)
             name = f"{constraint.name} " if len(tails) > 1 else ""
-            is_left = tail[0] < head[0]
-            axis.text(
-                tail[0] + (-5 if is_left else 5),
-                tail[1],
-                f"{name}{force:.3g} N",
-                color=_FORCE,
-                fontsize=10,
-                ha="right" if is_left else "left",
-                va="center",
-                path_effects=halo,
-            )
-        time = motion.start_time + motion.times[number]
-        for x, text, side in (
-            (12, f"t = {time:.1f} s\n{phase}", "left"),
-            (_WIDTH - 12, self._scale, "right"),
-        ):
-            axis.text(x, 12, text, color="0.3", fontsize=10, ha=side, va="top", path_effects=halo)
+            text |= {"color": _FORCE, "va": "center"}
+            beside, text["ha"] = (-5, "right") if tail[0] < head[0] else (5, "left")
+            axis.text(tail[0] + beside, tail[1], f"{name}{force:.3g} N", **text)
+        time = f"t = {motion.start_time + motion.times[number]:.1f} s\n{phase}"
+        text |= {"color": "0.3", "va": "top"}
+        axis.text(12, 12, time, **{**text, "ha": "left"})
+        axis.text(_WIDTH - 12, 12, self._scale, **{**text, "ha": "right"})
         axis.set_xlim(0, _WIDTH)
         axis.set_ylim(_HEIGHT, 0)
 
@@ -260,9 +238,7 @@ def _rendered(form: Shape | TriangleSurfaceMesh) -> Shape:
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     for k in range(3):
         np.add.at(normals, faces[:, k], across)
-    rows = [
-        *("v {:.9g} {:.9g} {:.9g}".format(*point) for point in points),
-        *("vn {:.9g} {:.9g} {:.9g}".format(*normal) for normal in normals),
-        *("f " + " ".join(f"{k}//{k}" for k in face) for face in faces + 1),
-    ]
+    rows = ["v {:.9g} {:.9g} {:.9g}".format(*point) for point in points]
+    rows += ["vn {:.9g} {:.9g} {:.9g}".format(*normal) for normal in normals]
+    rows += ["f " + " ".join(f"{k}//{k}" for k in face) for face in faces + 1]
     return Mesh(InMemoryMesh(mesh_file=MemoryFile("\n".join(rows), ".obj", "surface")))

@@ -293,35 +293,22 @@ def _legend_columns(labels: Sequence[str], width: float) -> int:
 def _add_legend(figure: Figure) -> None:
     """Adds one legend above all axes, with the labels of the curves in the first."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="upper center",
-        bbox_to_anchor=(0.5, 1.0 - 0.05 / figure.get_figheight()),
-        borderaxespad=0.0,
-        ncols=_legend_columns(labels, figure.get_figwidth()),
-        fontsize=9,
-    )
+    columns = _legend_columns(labels, figure.get_figwidth())
+    top = 0.5, 1.0 - 0.05 / figure.get_figheight()
+    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": top, "borderaxespad": 0.0}
+    figure.legend(handles, labels, ncols=columns, fontsize=9, **place)
 
 
 def _mark(figure: Figure, record: Record, events: Sequence[RunEvent]) -> None:
     """Marks events on all axes of time, shades every second phase, and writes the phases' names."""
     spans = phase_spans(record)
+    mark: dict[str, Any] = {"linestyle": "", "marker": "^", "markersize": 5, "clip_on": False}
     for axis in figure.axes:
+        below = axis.get_xaxis_transform()
         for kind in kinds_of(events):
             times = [event.time for event in events if event.kind is kind]
-            axis.plot(
-                times,
-                [0.0] * len(times),
-                color=kind.color,
-                linestyle="",
-                marker="^",
-                markersize=5,
-                clip_on=False,
-                transform=axis.get_xaxis_transform(),
-                label=kind.label,
-                zorder=3.0,
-            )
+            mark |= {"color": kind.color, "label": kind.label}
+            axis.plot(times, [0.0] * len(times), transform=below, zorder=3.0, **mark)
         axis.margins(x=0.01)
         width = axis.get_position().width * figure.get_figwidth()
         # The names of short phases are moved to the right, so that they do not overlap.
@@ -331,18 +318,10 @@ def _mark(figure: Figure, record: Record, events: Sequence[RunEvent]) -> None:
             if number % 2:
                 axis.axvspan(span.begin, span.end, color="C0", alpha=0.06, linewidth=0, zorder=0.3)
             time = max(span.begin, time + apart)
-            axis.text(
-                time,
-                0.97,
-                f" {span.name}",
-                transform=axis.get_xaxis_transform(),
-                rotation=90,
-                va="top",
-                fontsize=6,
-                color="0.45",
-                path_effects=[withStroke(linewidth=2.0, foreground="white")],
-                zorder=0.7,  # Below the curves.
-            )
+            halo = [withStroke(linewidth=2.0, foreground="white")]
+            small: dict[str, Any] = {"fontsize": 6, "color": "0.45", "path_effects": halo}
+            look = {"rotation": 90, "va": "top", "zorder": 0.7, **small}  # Below the curves.
+            axis.text(time, 0.97, f" {span.name}", transform=below, **look)
 
 
 def _set_decades(axis: Axes, floor: float) -> None:

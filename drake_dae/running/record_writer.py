@@ -44,14 +44,10 @@ class RecordWriter:
         record: Callable[[Context, float | None], Record],
         about: Mapping[str, Any] | None = None,
     ) -> None:
-        self.path = Path(path)
-        self.about = dict(about or {})
-        self._record = record
+        self.path, self.about, self._record = Path(path), dict(about or {}), record
         self._file: int | None = None
-        self._end = 0
         self._time: float | None = None
-        self._next = time.perf_counter() + PERIOD
-        self._warned = False
+        self._end, self._next, self._warned = 0, time.perf_counter() + PERIOD, False
 
     def __enter__(self) -> Self:
         return self

@@ -55,7 +55,6 @@ def simulate(
     duration: float,
     config: SimulatorConfig | None = None,
     progress: bool = False,
-    after_step: Callable[[Context], None] | None = None,
     may_diverge: bool = False,
     look: Callable[[Context], None] | None = None,
 ) -> RunStatistics:
@@ -64,8 +63,8 @@ def simulate(
     If the states or errors of a `Plant` diverge, an exception ends the run: see `DiagramWatch`.
 
     In runs of many steps all traced blocks are composed to one, so that Drake calls Python once for
-    each derivative and sample; see `compile_diagram`. `after_step`, a live view or a real-time rate
-    need each step; then the blocks run one by one.
+    each derivative and sample; see `compile_diagram`. A live view or a real-time rate need each
+    step; then the blocks run one by one.
 
     A run whose start_time is the end of an earlier run appends to its logs. A run that starts
     earlier clears them.
@@ -80,7 +79,6 @@ def simulate(
         duration: The duration to simulate, in s.
         config: Drake's integrator settings; its defaults if None. The run starts at its start_time.
         progress: Shows simulated time and speed on stderr.
-        after_step: A function that is called with the context after each step.
         may_diverge: Whether a diverging run continues.
         look: A function that is called with the context after some steps, at least after every
             32nd, such as `RecordWriter.update`.
@@ -105,7 +103,6 @@ def simulate(
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
     start, going_on = context.get_time(), EventStatus.DidNothing()
-    followers = [function for function in (after_step, look) if function is not None]
     began, composed = 0.0, None
     watch = RunWatch(diagram, context, config, duration)
     accepted = start, context.get_continuous_state_vector().CopyToVector()
@@ -120,8 +117,8 @@ def simulate(
         nonlocal accepted
         accepted = current.get_time(), current.get_continuous_state_vector().CopyToVector()
         bar.show(current.get_time() - start)
-        for function in followers:
-            function(current)
+        if look is not None:
+            look(current)
         watch.look(current, steps)
         return ending.signal is None
 
@@ -138,9 +135,9 @@ def simulate(
             if not may_diverge:
                 watch.begin(context)
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
-            if progress or followers or watch.sees or ending.signal is not None:
+            if progress or look is not None or watch.sees or ending.signal is not None:
                 simulator.set_monitor(monitor)
-            if after_step is None and not config.target_realtime_rate:
+            if not config.target_realtime_rate:
                 composed = CompiledRun.of(diagram, context, config, duration)
             if composed is None or not composed.run(start + duration, seen):
                 if composed is not None:  # To the failure, whose message the blocks know.

@@ -70,11 +70,7 @@ def build_scenario(
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:
-    """Completes a scenario and builds its loop, which `start_scenario` can start repeatedly.
-
-    `commanded` is whether a person changes references during the run; signals for which a task
-    waits are then inputs of the diagram.
-    """
+    """The completed scenario and its loop; a person may change the references if `commanded`."""
     # The robot, with the outputs and the start that the scenario leaves out.
     check_task(scenario)
     drawn = {"scene_graph": (scene_graph := SceneGraph()), "meshcat": meshcat}

@@ -61,9 +61,7 @@ def completions(
 ) -> Iterator[Completed]:
     """Yields a scenario with its missing outputs and its start, the best one first.
 
-    For the rule see `complete_scenario`. Starts and sets of joints are compared by the least
-    `Postures.quality` along the reference; it is zero where a joint leaves its limits of position
-    or speed.
+    Starts and sets of joints are compared by the least `Postures.quality` along the reference.
     """
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
     outputs = [make(form, constraints) for form in scenario.outputs]
@@ -89,8 +87,6 @@ def completions(
     first = postures.solve((), np.zeros(0), guess)
     near = postures.at(guess if first is None else first)
     forces = [signal.name for output in steered for signal in output.signals(bound)]
-    if missing:
-        _check_forces(forces, near)
     # Some rows of a planar arm are constant.
     some = [np.abs(postures.at(q).gradients).max(axis=1) for q in postures.guesses(4)]
     along = [row for row in rows.points(near) if max(one[row] for one in some) > 1e-9]
@@ -116,7 +112,7 @@ def completions(
             quality = _least(postures, goals, posture, held, enough)
             found.append(((quality > 0.0, count, quality), posture, held, added))
     if not found:
-        raise ScenarioError(_why_none(starts[0], rows, named, missing, bound))
+        raise ScenarioError(_why_none(starts[0], rows, named, missing, bound, forces))
     # Of those that are equal along the reference, the best one at the start.
     found.sort(key=lambda entry: entry[0], reverse=True)
     fewer = [entry for entry in found[MOST:] if entry[0][1] < found[0][0][1]]
@@ -159,14 +155,10 @@ def _starts(
     polished = postures.solve(named, wanted, q)
     if polished is not None:
         return [postures.at(polished)]
-    signals = [rows.signals[row] for row in named]
-    reached = postures.at(q).rows[list(named)]
-    missed = [
-        f"{s.name} comes to {value:.4g} {s.unit}, {abs(goal - value):.2g} {s.unit} from {goal:.4g} "
-        f"{s.unit}"
-        for s, value, goal in zip(signals, reached, wanted, strict=True)
-        if abs(goal - value) > 1e-6
-    ]
+    signals, missed = [rows.signals[row] for row in named], list[str]()
+    for s, value, goal in zip(signals, postures.at(q).rows[list(named)], wanted, strict=True):
+        if abs(goal - value) > 1e-6:
+            missed.append(f"{s.name} comes to {value:.4g} {s.unit}, and not to {goal:.4g} {s.unit}")
     residual = float(np.max(np.abs(left[: left.size - len(named)]), initial=0.0))
     if residual > 1e-6:
         missed.append(f"{residual:.2g} (m or rad) is left of the constraints")
@@ -301,15 +293,10 @@ def _joined(forms: Iterator[WrittenOutput]) -> list[WrittenOutput]:
 
 
 class _Rows:
-    """The rows of the scenario's outputs, then the rows that may complete them.
+    """The `given` rows of the scenario's outputs, then the rows that may complete them.
 
-    Attributes:
-        given: The number of rows of the scenario's outputs.
-        forms: An output for each of the other rows.
-        signals: Names and units of all rows.
-        tilts: The rows that are zero where tools are normal to their surfaces.
-        axes: The rows of the tools' directions that may be outputs, by `tool_axis`.
-        joints: The rows of positions of joints.
+    `tilts` are zero where tools are normal to their surfaces; `axes` are the rows of the tools'
+    directions that may be outputs, by `tool_axis`.
     """
 
     def __init__(
@@ -406,12 +393,7 @@ class _Rows:
 
 
 class _Goals:
-    """The rows to which references refer, and their values.
-
-    Attributes:
-        rows: The rows of the scenario's outputs, then those that references name beside them.
-        path: Their values and rates at some times, the first one at the start.
-    """
+    """The rows to which references refer; `path` are their values and rates at some times."""
 
     def __init__(
         self,
@@ -509,35 +491,28 @@ def _meaning(
             chosen = of_point or [others[k] for k in denoted(name, others, [2] * len(others))]
             return [signals.index(signal) for signal in chosen]
         outputs += others
-    for constraint in rows.bound.constraints:
-        if name in [signal.name for signal in constraint.coordinate_signals]:
-            text = (
-                f"no output '{name}'; it is a coordinate along the constraint '{constraint.name}'"
-            )
-            form = f"!SurfaceCoordinates {{constraint: {constraint.name}}}"
-            raise ScenarioError((key, f"{text}: add {form} to outputs"))
     raise ScenarioError((key, unknown_name("output", name, outputs)))
 
 
-def _check_forces(names: Sequence[str], posture: Posture) -> None:
-    """Refuses force outputs z_2 = S lambda that depend on each other, with their names."""
-    left, values, _ = np.linalg.svd(posture.forces)
-    rank = int(np.count_nonzero(values > 1e-6 * np.max(values, initial=0.0)))
-    if rank < len(names):
-        weights = np.linalg.norm(left[:, rank:], axis=1)
-        dependent = [name for name, weight in zip(names, weights, strict=True) if weight > 1e-6]
-        text = (
-            f"{', '.join(dependent)} depend on each other at the start: of {len(names)} force "
-            f"outputs {rank} are independent. Leave out {len(names) - rank} of them; a force "
-            "across several contacts of one plane is a !ForceCombination of those normal to it"
-        )
-        raise ScenarioError(("forces", text))
-
-
 def _why_none(
-    posture: Posture, rows: _Rows, named: Sequence[int], missing: int, bound: ConstraintSet
+    posture: Posture,
+    rows: _Rows,
+    named: Sequence[int],
+    missing: int,
+    bound: ConstraintSet,
+    forces: Sequence[str],
 ) -> tuple[str, str]:
     """The key and text of the problem if no positions complete the outputs."""
+    left, values, _ = np.linalg.svd(posture.forces)
+    rank = int(np.count_nonzero(values > 1e-6 * np.max(values, initial=0.0)))
+    if rank < len(forces):
+        weights = np.linalg.norm(left[:, rank:], axis=1)
+        dependent = [name for name, weight in zip(forces, weights, strict=True) if weight > 1e-6]
+        return "forces", (
+            f"{', '.join(dependent)} depend on each other at the start: of {len(forces)} force "
+            f"outputs {rank} are independent. Leave out {len(forces) - rank} of them; a force "
+            "across several contacts of one plane is a !ForceCombination of those normal to it"
+        )
     ways = len(posture.mass) - int(np.linalg.matrix_rank(posture.constraints, 1e-9))
     lacking = rows.given + missing - ways
     if lacking <= 0:

@@ -18,6 +18,7 @@ from typing import (
     Annotated,
     Any,
     Generic,
+    Literal,
     NotRequired,
     TypeVar,
     Union,
@@ -145,6 +146,7 @@ INTERVAL = Expected(
     Annotated[list[float | list[float]], pydantic.Field(min_length=2, max_length=2)],
     tuple,
 )
+COMPILED = Expected("true, false or auto", bool | Literal["auto"])
 FILE = Expected("the name of a file", str, in_folder)
 NAMES = Expected("a name or a list of names", str | list[str])
 
@@ -160,6 +162,7 @@ def _shown(data: Any) -> str:
 _WORDS = {
     "float_type": "a number",
     "finite_number": "a finite number",
+    "greater_than": "a positive number",
     "int_type": "a whole number",
     "bool_type": "true or false",
     "string_type": "text",

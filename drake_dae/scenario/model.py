@@ -106,10 +106,7 @@ def completed_model(
     payloads: Sequence[Payload] = (),
     robot: RobotLinks | None = None,
 ) -> tuple[Completed, RobotModel, Structure | None]:
-    """The results of `complete_scenario` and `scenario_model`, for a robot with payloads.
-
-    The structure is there where it was needed.
-    """
+    """The results of `complete_scenario` and `scenario_model`; the structure where it is known."""
     if robot is None:
         drawn = scene_graph is not None
         robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)
@@ -322,11 +319,7 @@ def reference_and_start(
 
 
 def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> str:
-    """What is in the way of a scenario along its references, as a sentence; empty if nothing is.
-
-    It is decided as a run is: by the inverse dynamics of the law's model, and the limits of joints,
-    drives, contacts and links in front of surfaces.
-    """
+    """What is in the way along the references, as a sentence; empty if nothing is."""
     try:
         reference, start = reference_and_start(scenario, model, structure)
         begin, end = scenario.integrator.start_time, scenario.duration

@@ -281,20 +281,19 @@ def _longest(paths: Mapping[str, list[Joint]], joints: Sequence[Joint]) -> list[
 
 
 def _tip(plant: MultibodyPlant, chain: Sequence[Joint], paths: dict[str, list[Joint]]) -> str:
-    """The vendor's frame at the end of a chain, otherwise the outermost one that it alone moves."""
+    """The vendor's frame at the end of a chain, otherwise the outermost one."""
     context = plant.CreateDefaultContext()
     origin = chain[-1].frame_on_child().CalcPoseInWorld(context).translation()
-    distances, fixed = {}, set()
+    distances = {}
     for name, path in paths.items():
         if sum(joint in chain for joint in path) == len(chain):
             pose = GetScopedFrameByName(plant, name).CalcPoseInWorld(context)
             distances[name] = float(np.linalg.norm(pose.translation() - origin))
-            fixed |= {name} if not any(map(_has_room, path[path.index(chain[-1]) + 1 :])) else set()
     for word in _TOOLS:
         named = [n for n in distances if word.search(n) and not _FINGER.search(n)]
         if named:
             return max(named, key=lambda name: distances[name])
-    return max(fixed, key=lambda name: distances[name])
+    return max(distances, key=lambda name: distances[name])
 
 
 def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:

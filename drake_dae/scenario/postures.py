@@ -30,30 +30,18 @@ _NEWTON_STEPS = 25
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """A configuration q, shape (nq,), with the values of its rows: functions of q, c of them.
-
-    Attributes:
-        q: The configuration.
-        rows: The values of the rows, shape (c,).
-        gradients, constraints: The rates of rows and constraints per unit of v, (c, nv), (m, nv).
-        forces: S of the force outputs, shape (s, m).
-        mass: M(q), shape (nv, nv).
-        actuation: The generalized force per unit of each control, shape (nv, nu).
-        normals: The unit normal of each surface at its contact, shape (contacts, 3).
-        leans: The cosine between the outward axis of each tool and its surface's normal.
-        depth: The largest depth of a link behind a surface, in m.
-    """
+    """A configuration q, shape (nq,), with the values of its rows: functions of q, c of them."""
 
     q: FloatArray
-    rows: FloatArray
-    gradients: FloatArray
-    constraints: FloatArray
-    forces: FloatArray
-    mass: FloatArray
-    actuation: FloatArray
-    normals: FloatArray
-    leans: FloatArray
-    depth: float
+    rows: FloatArray  # (c,)
+    gradients: FloatArray  # (c, nv), rates of the rows per unit of v.
+    constraints: FloatArray  # (m, nv), those of the constraints.
+    forces: FloatArray  # (s, m), S of the force outputs.
+    mass: FloatArray  # (nv, nv), M(q).
+    actuation: FloatArray  # (nv, nu), the generalized force per unit of each control.
+    normals: FloatArray  # (contacts, 3), of the surfaces.
+    leans: FloatArray  # The cosine between the outward axis of each tool and its surface's normal.
+    depth: float  # The largest one of a link behind a surface, m.
 
     def independence(self, rows: Sequence[int]) -> float:
         """How independently the controls act on some rows and the force outputs, from 0 to 1.
@@ -102,11 +90,9 @@ class Posture:
 
 
 class Postures:
-    """The configurations of a robot with constraints.
+    """The configurations of a robot with constraints: `low` and `high` limits of q, shape (nq,).
 
-    Attributes:
-        low, high: The limits of q, shape (nq,) each.
-        size: The largest distance between its bodies, in m, in its default configuration.
+    `size` is the largest distance between its bodies, in m, in its default configuration.
     """
 
     def __init__(
@@ -187,10 +173,7 @@ class Postures:
     def nearest(
         self, rows: Sequence[int], wanted: FloatArray, guesses: Iterable[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """The configuration within limits nearest to given values of rows, and what is left.
-
-        Of the constraints a hundredth is left of what is left of rows.
-        """
+        """The configuration within limits nearest to given values of rows, and what is left."""
         from scipy.optimize import least_squares  # Imported here, since few runs need it.
 
         residual, slopes = self._residual(rows, wanted)
@@ -248,18 +231,11 @@ class Postures:
 
         A link behind a surface, or a tool that points away from its surface, reduces it to a tenth.
         """
-        quality = posture.independence(rows) * self.margin(posture.q)
-        if posture.depth > 0.0:
-            quality *= 0.1
-        if np.max(posture.leans, initial=-1.0) > 0.0:
-            quality *= 0.1
-        return quality
+        faults = (posture.depth > 0.0) + (np.max(posture.leans, initial=-1.0) > 0.0)
+        return posture.independence(rows) * self.margin(posture.q) * 0.1 ** int(faults)
 
     def is_too_fast(self, posture: Posture, rows: Sequence[int], rates: FloatArray) -> bool:
-        """Whether a joint exceeds its speed limit where rows have given rates, shape (len(rows),).
-
-        Without limits of speed none does.
-        """
+        """Whether a joint exceeds its speed limit where rows have given rates."""
         slopes = np.vstack([posture.constraints, posture.gradients[list(rows)]])
         wanted = np.concatenate([np.zeros(len(posture.constraints)), rates])
         v = np.linalg.lstsq(slopes, wanted, rcond=None)[0]

@@ -87,21 +87,19 @@ def roll_scenario(
     seen: float | None = None
     failure: SimulationError | None = None
 
-    def see(rows: Record, is_last: bool = False) -> None:
+    def diverges(rows: Record, is_last: bool = False) -> bool:
         nonlocal seen, due, failure
         due = time.perf_counter() + PERIOD
-        if scenario.judgement.may_diverge or failure is not None or not rows.time.size:
-            return
-        seen = float(rows.time[-1])
-        try:
-            watch.look(rows, is_last=is_last)
-        except SimulationError as error:
-            failure = error
+        if not scenario.judgement.may_diverge and failure is None and rows.time.size:
+            seen = float(rows.time[-1])
+            try:
+                watch.look(rows, is_last=is_last)
+            except SimulationError as error:
+                failure = error
+        return failure is not None
 
     def watched(record: RecordAfter) -> bool:
-        if time.perf_counter() > due:
-            see(record(seen))
-        return failure is not None or look(record)
+        return (time.perf_counter() > due and diverges(record(seen))) or look(record)
 
     (rollout,) = run_loop(
         loop,
@@ -113,6 +111,7 @@ def roll_scenario(
         lasting=lasting,
         look=watched,
     )
-    see(rollout.record.after(seen), is_last=rollout.failure is None)
-    rollout = rollout if failure is None else rollout.ended(failure)
+    if diverges(rollout.record.after(seen), is_last=rollout.failure is None):
+        assert failure is not None
+        rollout = rollout.ended(failure)
     return diagnosed(loop, rollout, scenario.integrator)

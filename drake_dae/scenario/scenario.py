@@ -229,6 +229,7 @@ _VALUES: dict[Any, Any] = {
     Callable[..., SX] | str: str,
     str | Path: Annotated[Any, form.FILE],
     str | Sequence[str]: Annotated[Any, form.NAMES],
+    Compiled: Annotated[Any, form.COMPILED],
     float | list[float]: Annotated[Any, form.NUMBER_OR_LIST],
     ArrayLike: Annotated[Any, form.NUMBERS],
     Vector: Annotated[Any, form.TRIPLE],

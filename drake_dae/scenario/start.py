@@ -21,13 +21,10 @@ limit. Also the allowed depth behind a surface, in m."""
 
 
 def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
-    """A context of a closed loop at a scenario's start.
+    """A context of a closed loop at a scenario's start; see `Start`.
 
-    The robot is at rest or, with exogenous motion, moves with the references. A law starts at its
-    references plus the errors, with outputs as in its model, where `plant.parameters` may differ,
-    and on the plant's constraints; a task and a mechanism without drive at start.positions. start,
-    plant.parameters, integrator, the numbers of uncoupled gains, and the seed of the sensor may be
-    others than those that the loop was built with.
+    start, plant.parameters, integrator, the numbers of uncoupled gains, and the seed of the sensor
+    may be others than those that the loop was built with.
     """
     context, plant, controller = loop.diagram.CreateDefaultContext(), loop.plant, loop.controller
     _set_numbers(scenario, loop, context)
@@ -200,10 +197,7 @@ def start_state(
     parameters: FloatArray,
     of_law: FloatArray,
 ) -> FloatArray:
-    """The state at rest near start.positions, within limits, with given outputs z, shape (p,).
-
-    The constraints have the parameters of the plant, and the outputs those that the law assumes.
-    """
+    """The state at rest near start.positions, within limits, with given outputs z, shape (p,)."""
     count = len(model.position_signals)
     # By default near the start of the completion.
     guess = start_guess(scenario, model.links, model.nominal_positions)

@@ -50,7 +50,8 @@ class _Loader(yaml.SafeLoader):
             names = set()
             for key, _ in node.value:
                 if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
-                    raise self._error(f"the key {brief(key.value)} is not text; quote it", key)
+                    name = brief(key.value) if isinstance(key, yaml.ScalarNode) else "of a mapping"
+                    raise self._error(f"the key {name} is not text; quote it", key)
                 if key.value in names:
                     raise self._error(f"the key '{key.value}' is given twice", key)
                 names.add(key.value)

@@ -26,14 +26,12 @@ Sized = tuple[FloatArray, FloatArray]
 """A matrix without its round-off, and the sizes of its entries before cancellation."""
 
 
-def multiply(
-    left: FloatArray, right: Sized, scale: FloatArray, negligible: float = NEGLIGIBLE
-) -> Sized:
+def multiply(left: FloatArray, right: Sized, scale: FloatArray) -> Sized:
     """Multiplies matrices; entries that are only round-off are set to zero."""
     value, size = right
     row, column = np.abs(left) * scale, size / scale[:, None]
-    row_noise = negligible * np.max(row, axis=1, keepdims=True, initial=0.0)
-    column_noise = negligible * np.max(column, axis=0, keepdims=True, initial=0.0)
+    row_noise = NEGLIGIBLE * np.max(row, axis=1, keepdims=True, initial=0.0)
+    column_noise = NEGLIGIBLE * np.max(column, axis=0, keepdims=True, initial=0.0)
     left = np.where(row > row_noise, left, 0.0)
     significant = np.abs(value) / scale[:, None] > column_noise
     value, size = np.where(significant, value, 0.0), np.where(column > column_noise, size, 0.0)

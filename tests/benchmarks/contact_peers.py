@@ -359,7 +359,9 @@ def run(law: str, condition: Condition, friction: float) -> tuple[float, ...]:
         found = [log.FindLog(own) for log in logs]
         time, z, u = found[0].sample_times(), found[0].data().T, found[1].data().T
     late = time > SETTLED
-    goal = loop.reference.along(time)[:, loop.controller.law.layout.lowest]
+    goal = np.array([loop.reference.reference(t) for t in time])[
+        :, loop.controller.law.layout.lowest
+    ]
     error = (z - goal)[late]
     rms = [np.linalg.norm(error[:, :2], axis=1), error[:, -1], np.diff(u[late], axis=0)]
     position, force, rough = (float(np.sqrt(np.mean(part**2))) for part in rms)

@@ -1,6 +1,5 @@
 """The command: what it prints, what it leaves, and how it ends."""
 
-import json
 import os
 import re
 import shlex
@@ -10,7 +9,6 @@ import warnings
 import webbrowser
 from pathlib import Path
 
-import jsonschema
 import numpy as np
 import pytest
 from command_line import BARE, QUICK, command, error_line, shown_on_a_terminal
@@ -250,9 +248,3 @@ def test_what_cannot_be_shown(name, words, tmp_path, monkeypatch, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ")
     assert words in line
-
-
-@pytest.mark.slow
-def test_the_schema_is_printed(capsys):
-    assert main(["schema"]) == 0
-    jsonschema.Draft202012Validator.check_schema(json.loads(capsys.readouterr().out))

@@ -1,10 +1,6 @@
 """What commands tell programs, JSON and exit codes, and what of earlier runs they keep."""
 
 import json
-import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -103,35 +99,6 @@ def test_words_that_mean_nothing_are_wrong_usage(arguments, words, tmp_path, mon
     assert ended.value.code == 2
     assert words in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-# What it keeps.
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sent", [signal.SIGTERM])
-def test_a_film_that_is_ended_leaves_nothing_behind(sent, tmp_path):
-    folder = tmp_path / "run"
-    settings = ("--set=duration=5", *BARE)
-    assert main(["simulate", "two_link_wall", *settings, f"--out={folder}"]) == 0
-    before = sorted(path.name for path in folder.iterdir())
-    code = (
-        "import signal, sys\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from drake_dae.cli import main\nsys.exit(main(sys.argv[1:]))"
-    )
-    command = [sys.executable, "-c", code, "plot", "--film", str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    limit = time.monotonic() + 60
-    while not list(folder.glob(".unfinished-*")):
-        assert process.poll() is None
-        assert time.monotonic() < limit
-        time.sleep(0.005)
-    process.send_signal(sent)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 128 + sent
-    assert said.splitlines()[-1] == "interrupted"
-    assert sorted(path.name for path in folder.iterdir()) == before
 
 
 # Where it starts.

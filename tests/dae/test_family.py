@@ -1,6 +1,5 @@
 """Relative degrees belong to all numbers that a system may have, not to its defaults alone."""
 
-import casadi as ca
 import pytest
 from runs import some
 
@@ -53,11 +52,9 @@ def coupled(gain):
 
 OUTPUTS = {
     "sum": (lambda x, p: x[0] + p.w * x[1], {"w": 0.0}, 2, ("w",)),
-    "last": (lambda x, p: x[0] + p.w * x[2] ** 3, {"w": 0.0}, 1, ("w",)),
     "one of a vector": (lambda x, p: x[0] + p.w[1] * x[1], {"w": [1.0, 0.0]}, 2, ("w",)),
     "difference": (lambda x, p: x[0] + (p.a - p.b) * x[2], {"a": 2.0, "b": 2.0}, 1, ("a", "b")),
     "both": (lambda x, p: x[0] + p.a * p.b * x[2], {"a": 0.0, "b": 0.0, "c": 3.0}, 1, ("a", "b")),
-    "sine": (lambda x, p: x[0] + ca.sin(p.w) * ca.sin(x[1]), {"w": 0.0}, 2, ("w",)),
 }
 """Outputs of three integrators, parameters, the degree elsewhere, and what decides. At the defaults
 the degree is 3."""

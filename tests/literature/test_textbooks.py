@@ -5,23 +5,18 @@ The sources were read where they are published on the web; each test names its o
 
 import casadi as ca
 import numpy as np
-import pytest
 from arms import error_controlled
 from numpy.testing import assert_allclose
-from pydrake.math import RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RpyFloatingJoint, SpatialInertia
 
 from drake_dae import (
     DaePlant,
     DaeSystem,
     LinkExpressions,
-    Plane,
     RobotModel,
     RobotPlant,
     simulate,
 )
-from drake_dae.robots import Blade, RollingBall
+from drake_dae.robots import Blade
 
 G = 9.81
 NOTHING = np.zeros((3, 0))
@@ -44,40 +39,6 @@ def flat(mass, about_center, center=0.0, gravity=G):
     H = ca.vertcat(spun * c, spun * s + mass * gravity, lever * gravity * c)
     links = {"body": (turned, ca.vertcat(q[0], 0, q[1]))}
     return LinkExpressions(q, v, M, H, links, actuation_matrix=NOTHING)
-
-
-def point(mass):
-    """A point in space under gravity."""
-    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
-    H = ca.vertcat(0, 0, mass * G)
-    return LinkExpressions(q, v, mass * ca.SX.eye(3), H, {"point": q}, actuation_matrix=NOTHING)
-
-
-@pytest.mark.slow
-def test_a_ball_rolls_down_a_slope_with_five_sevenths_and_needs_two_sevenths():
-    """a = 5/7 g sin t, friction 2/7 m g sin t, and m g cos t across the slope.
-
-    Mini Physics, "UY1: More About Rolling Motion".
-    """
-    mass, radius, slope = 1.3, 0.2, 0.5
-    tilt = RotationMatrix.MakeYRotation(slope).matrix()
-    plant = MultibodyPlant(0.0)
-    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(mass, radius))
-    plant.AddJoint(RpyFloatingJoint("free", plant.world_frame(), ball.body_frame()))
-    plant.Finalize()
-    normal = tilt[:, 2]
-    hill = RollingBall("ball", Plane((0, 0, 0), tuple(normal)), radius, name="hill")
-    start = [0, 0, 0, *(radius * normal)]
-    model = RobotModel.from_multibody(plant, [hill], [], start, "ball", forces=[])
-    block = RobotPlant(model)
-    context = block.CreateDefaultContext()
-    block.set_state(context, [*start, *np.zeros(6)])
-    force = block.GetOutputPort("constraint_force").Eval(context)
-    down, weight = G * np.sin(slope), mass * G * np.cos(slope)
-    assert_allclose(force, [weight, -2 / 7 * mass * down, 0.0], atol=1e-13)
-    simulate(block, context, 1.2, error_controlled(1e-11))
-    way = (block.state(context)[3:6] - start[3:]) @ tilt
-    assert_allclose(way, [5 / 7 * down * 1.2**2 / 2, 0.0, 0.0], atol=1e-10)
 
 
 def test_a_ball_on_a_turntable_goes_round_with_two_sevenths_of_its_rate():

@@ -70,13 +70,3 @@ def test_runs_that_cannot_be_filmed_are_refused(tmp_path, capsys):
         save_film(*recorded("two_link_wall", "duration=0.01"), "x.mp4")
     assert main(["plot", "--film", str(tmp_path)]) == 1
     assert str(tmp_path) in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_command_films_a_run(tmp_path, capsys):
-    folder = tmp_path / "run"
-    assert main(["simulate", "two_link_wall", "--set", "duration=0.3", "--out", str(folder)]) == 0
-    assert main(["plot", "--film", str(folder)]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"written to {folder}/film.gif"
-    with Image.open(folder / "film.gif") as film:
-        assert film.n_frames == 4

@@ -29,11 +29,11 @@ def run(chosen, path, then=lambda writer, loop, context: None):
     loop, context = build_scenario(chosen)
     with RecordWriter(path, loop.record) as writer:
 
-        def after_step(current):
+        def look(current):
             writer.update(current)
             then(writer, loop, current)
 
-        simulate(loop.diagram, context, chosen.duration, chosen.integrator, after_step=after_step)
+        simulate(loop.diagram, context, chosen.duration, chosen.integrator, look=look)
         writer.finish(context)
     return loop.record(context)
 

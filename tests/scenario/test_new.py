@@ -80,16 +80,6 @@ def off_prediction(scenario):
     return loop, record, np.abs(record["tracking_error"] - loop.predicted_error(record)).max()
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """The command's file for the robot that was written by hand, beside that."""
-    folder = tmp_path_factory.mktemp("by_hand")
-    (folder / "planar.urdf").write_text(BY_HAND)
-    file = folder / "task.yaml"
-    assert main(["new", str(folder / "planar.urdf"), "--out", str(file)]) == 0
-    return file
-
-
 def test_the_command_writes_a_file_that_it_checked(tmp_path, capsys):
     (tmp_path / "planar.urdf").write_text(BY_HAND)
     file = tmp_path / "task.yaml"
@@ -104,19 +94,6 @@ def test_the_command_writes_a_file_that_it_checked(tmp_path, capsys):
     # Nothing is written over.
     assert main(["new", str(tmp_path / "planar.urdf"), "--out", str(file)]) == 1
     assert file.read_text().splitlines() == lines
-
-
-@pytest.mark.slow
-def test_the_file_runs_as_predicted_within_all_limits(written):
-    loop, record, off = off_prediction(
-        load_scenario(written, ["duration=0.5", "integrator.accuracy=1e-8"])
-    )
-    assert off < 1e-7  # The accuracy of the integrator is 1e-8.
-    model = loop.plant.model
-    assert np.all(np.abs(record["control"]).max(axis=0) < 0.8 * model.control_limits)
-    low, high = model.links.position_limits
-    q = record["state"][:, : low.size]
-    assert np.all((low < q) & (q < high))
 
 
 @pytest.mark.slow

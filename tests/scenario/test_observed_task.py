@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from runs import run_scenario, some
 
 from drake_dae import Record, build_scenario, load_scenario
 from drake_dae.cli import main
@@ -108,20 +107,13 @@ def test_a_bias_is_found_before_the_touch(file, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rollout", some([True, False]))
-def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys, rollout):
+def test_a_contact_that_is_lost_after_the_last_phase(file, tmp_path, capsys):
     """A push pulls with 40 N where the arm rests with 10 N; the law in contact would go on."""
     push = "plant.disturbances=[{frame: tool, force: [-40, 0, 0], start_time: 0.8, end_time: 3}]"
     only = "task.phases=[!Approach {speed: 0.1, over: 0.1}, !Press {force: 10, over: 0.1}]"
     settings = [push, only, "estimator=null", "task.patience=0.02", "duration=1.6"]
-    settings.append("plant.friction=0")
-    if rollout:
-        found = rolled(file, tmp_path, *settings)
-        told = capsys.readouterr().out
-    else:
-        loop, _, found = run_scenario(load_scenario(file, settings))
-        told = "\n".join(map(str, loop.changes(found)))
-    assert "held, the contact is lost at rest" in " ".join(told.split("; "))
+    found = rolled(file, tmp_path, *settings, "plant.friction=0")
+    assert "held, the contact is lost at rest" in " ".join(capsys.readouterr().out.split("; "))
     assert found["constraint_force"][found.time < 0.8][-1] > 5.0
     assert found["phase"][found.time < 0.8][-1, 2] == 1.0  # It is done.
     assert np.all(found["constraint_force"][found.time > 1.0] == 0.0)
@@ -149,16 +141,9 @@ def test_gains_of_a_task_are_advised(file, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            "sensors.force=null",
-            "observer",
-        ),
+        ("sensors.force=null", "observer"),
         ("task.contact_force=0.1", r"contact_force: .*0\.3.*0\.1"),
-        (
-            "task.tare_time=0.01",
-            r"task: tare_time: .*0\.01",
-        ),
-        ("task.tare_time=-1", r"task: tare_time.*-1"),
+        ("task.tare_time=0.01", r"task: tare_time: .*0\.01"),
         ("task.phases.0.behind=0", r"task\.phases\.0: .*behind"),
     ],
 )

@@ -31,6 +31,7 @@ def refusal(*settings):
         (b"\xff\xfe", ["s.yaml: ", "UTF-8"]),
         (TWO_LINK + "duration: 3\n", ["s.yaml: ", "line 34: ", "'duration'"]),
         (TWO_LINK.replace("joint1: 1.2", "on: 1.2"), ["s.yaml: ", "line 26: ", "'on'"]),
+        (TWO_LINK + "compiled: maybe\n", ["compiled: ", "'maybe'", "auto", "[s.yaml:34]"]),
         (TWO_LINK + "---\na: 1\n", ["s.yaml: ", "line 34: "]),
         ("!Foo\n" + TWO_LINK, ["scenario: ", "!Foo"]),
         (TWO_LINK.replace("start:", "start: !Foo"), ["start: ", "!Foo"]),

@@ -213,7 +213,6 @@ def test_a_constraint_of_a_scenario_holds_with_the_predicted_error(name, tmp_pat
     [
         ("rod", ["constraints.0.length=0"], ["constraints.0: ", "'rod.length'"]),
         ("rod", ["constraints.0.frame_b=tol"], ["constraints.0: ", "'tool'"]),
-        ("wheels", ["constraints.1.name=left"], ["constraints.1.name: "]),
         ("wheels", ["forces=null"], ["outputs: ", "3"]),
         ("wheels", ["forces=[left]"], ["forces.0: ", "'left'", "left.traction"]),
         (

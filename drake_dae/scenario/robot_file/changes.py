@@ -11,6 +11,7 @@ from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
+    Frame,
     JacobianWrtVariable,
     Joint,
     JointActuator,
@@ -80,8 +81,9 @@ def change_robot(
         _drive_joints(robot.actuators, plant, leaders, of_joints.get("effort", {}), armatures)
     add_payloads("robot.payloads", robot.payloads, plant)
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
+    movable = _movable(plant)  # Without those that are locked.
     for name, armature in armatures.items() if ARMATURE not in robot.leave_out else ():
-        if joint_names(plant)[name].index() not in driven:
+        if name in movable and movable[name].index() not in driven:
             raise ModelError(
                 f"joint '{name}' has an armature of {armature:g} and no motor, and Drake gives "
                 "only motors one; name it under robot.actuators, or write leave_out: "
@@ -106,21 +108,7 @@ def add_payloads(key: str, payloads: Sequence[Payload], plant: MultibodyPlant) -
 @at("robot.base.weld")
 def _weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
     """Welds a frame of a body without a joint to the world."""
-    attached = _joints_to_parents(plant)
-    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-    free = unique_names(plant, [body for body in bodies if body.index() not in attached])
-    try:
-        frame = GetScopedFrameByName(plant, base.weld)
-    except RuntimeError:
-        raise ModelError(unknown_name("free body or frame on it", base.weld, free)) from None
-    body = frame.body()
-    if body == plant.world_body():
-        raise ModelError("the world needs no base; name a frame of the robot")
-    if joint := attached.get(body.index()):
-        raise ModelError(
-            f"body '{body.name()}' is attached already, by joint '{joint.name()}'; unattached "
-            f"bodies: {', '.join(free) or 'none'}"
-        )
+    frame = _unattached(base.weld, plant)
     rotation = RollPitchYaw(np.deg2rad(base.pose.rpy_deg))
     plant.WeldFrames(plant.world_frame(), frame, RigidTransform(rotation, base.pose.translation))
 
@@ -129,13 +117,27 @@ def _weld_base(base: RobotPlacement, plant: MultibodyPlant) -> None:
 def _add_free_joints(bodies: Sequence[str], plant: MultibodyPlant) -> None:
     """Adds floating joints in roll, pitch and yaw to bodies without a joint."""
     for name in bodies:
-        try:
-            body = GetScopedFrameByName(plant, name).body()
-            if joint := _joints_to_parents(plant).get(body.index()):
-                raise ModelError(f"'{name}' is not free: joint '{joint.name()}' holds it")
-            plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
-        except RuntimeError as error:
-            raise ModelError(f"'{name}' is no body that can be free: {error}") from None
+        body = _unattached(name, plant).body()
+        plant.AddJoint(RpyFloatingJoint(body.name(), plant.world_frame(), body.body_frame()))
+
+
+def _unattached(name: str, plant: MultibodyPlant) -> Frame:
+    """A frame of a body without a joint to a parent."""
+    holding = {joint.child_body().index(): joint for joint in reversed(joints_of(plant))}
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    free = unique_names(plant, [body for body in bodies if body.index() not in holding])
+    try:
+        frame = GetScopedFrameByName(plant, name)
+    except RuntimeError:
+        raise ModelError(unknown_name("free body or frame on it", name, free)) from None
+    if frame.body() == plant.world_body():
+        raise ModelError("the world is no part of the robot; name a frame of the robot")
+    if joint := holding.get(frame.body().index()):
+        raise ModelError(
+            f"'{name}' is attached already, by joint '{joint.name()}'; unattached bodies: "
+            f"{', '.join(free) or 'none'}"
+        )
+    return frame
 
 
 @at("robot.locked")
@@ -150,9 +152,12 @@ def _lock_joints(
     for _ in leaders:  # As often as the longest chain needs.
         for follower, (leader, ratio, offset) in leaders.items():
             if leader in positions:
-                positions.setdefault(follower, ratio * positions[leader] + offset)
-            if follower in locked:
-                raise ModelError(f"'{follower}' follows '{leader}', which can be locked instead")
+                coupled = ratio * positions[leader] + offset
+                if abs(positions.setdefault(follower, coupled) - coupled) > 1e-9:
+                    text = f"'{follower}' follows '{leader}', which makes it {coupled:g}"
+                    raise ModelError(f"{text}, and not {positions[follower]:g}; lock one of them")
+            elif follower in positions and ratio != 0.0:
+                positions[leader] = (positions[follower] - offset) / ratio
     for name, value in positions.items():
         joint = _named(name, joints)
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
@@ -245,11 +250,6 @@ def _leaders(plant: MultibodyPlant, follows: Mapping[str, _Leader]) -> dict[str,
         if leading := names.get((int(joints[name].model_instance()), leader)):
             leaders[name] = leading, ratio, offset
     return leaders
-
-
-def _joints_to_parents(plant: MultibodyPlant) -> dict[BodyIndex, Joint]:
-    """Index of a body -> the joint by which it is attached."""
-    return {joint.child_body().index(): joint for joint in reversed(joints_of(plant))}
 
 
 class CutJoint(NamedTuple):

@@ -228,11 +228,16 @@ class Mender:
         root.attrib.setdefault("name", file.stem)
         for link in root.iterfind("link"):
             self._mend_shapes(link, file, model)
-        colours = set()  # Drake refuses several of a name, which other parsers take.
-        for material in root.findall("material"):
-            if material.get("name") in colours:
-                root.remove(material)
-            colours.add(material.get("name"))
+        # Drake refuses names of several colours, of none, or of one that is defined later.
+        colours: dict[Any, list[Element]] = {}
+        for material in root.iter("material"):
+            if len(material):
+                colours.setdefault(material.get("name") or material, list(material))
+        for owner in root.iter():
+            for material in owner.findall("material"):
+                material[:] = colours.get(material.get("name") or material, [])
+                if not len(material):
+                    owner.remove(material)
         moving: set[str | None] = set()
         still: set[str | None] = set()  # Joints that Drake drives not: their effort limit is 0.
         for joint in root.findall("joint"):

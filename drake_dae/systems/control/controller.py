@@ -34,8 +34,7 @@ class TrackingController(ParameterizedSystem, Controller):
         tracking_error: e = z - r (29) by the controller's own model, one entry per output.
         integral: The integrals of errors, shape (k,), if the law has any; its state. They start at
             zero, or at the values of `set_integral`. An integral is not updated while its entry of
-            `hold` is not 0, or while it is at its limit and its error would increase it
-            (anti-windup).
+            `hold` is not 0 (anti-windup).
 
     A law with integrals also has an input port `hold`, shape (k,): an error is not integrated while
     its entry is not 0, for example while a drive is at its limit or a contact is lost. Without a
@@ -48,8 +47,6 @@ class TrackingController(ParameterizedSystem, Controller):
     Args:
         law: The law.
         outputs: z at which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
-        integral_limits: The largest |integral| of each error in its unit times s, a number or shape
-            (k,), positive.
         sample_period: The sample period of integrals in s, as for discrete plants; 0 for continuous
             integrals.
 
@@ -57,7 +54,7 @@ class TrackingController(ParameterizedSystem, Controller):
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
 
     Raises:
-        ModelError: A limit or period is not valid.
+        ModelError: The period is not valid.
         SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
         NonFiniteError: A value is not finite on the way, likewise.
     """
@@ -69,17 +66,10 @@ class TrackingController(ParameterizedSystem, Controller):
         self,
         law: TrackingLaw,
         outputs: ArrayLike | None = None,
-        integral_limits: ArrayLike = np.inf,
         *,
         sample_period: float = 0.0,
     ) -> None:
         count = len(law.integral.outputs)
-        largest = np.asarray(integral_limits, dtype=float)
-        if largest.shape not in ((), (count,)) or not np.all(largest > 0.0):
-            raise ModelError(
-                f"integral_limits must be a positive number or shape ({count},), got "
-                f"{integral_limits!r}"
-            )
         if count and not sample_period >= 0.0:
             raise ModelError(f"sample_period must be 0 s or more, got {sample_period:g} s")
         if law.structure.zero_dynamics_dimension:
@@ -93,7 +83,7 @@ class TrackingController(ParameterizedSystem, Controller):
                     stacklevel=2,
                 )
         self.law, self.sample_period = law, sample_period if count else 0.0
-        block = law_block(law, np.broadcast_to(largest, (count,)), self.sample_period)
+        block = law_block(law, self.sample_period)
         self.equations = law.system
         super().__init__(law.system, block, law.exogenous_degrees, sees_steps=True)
 
@@ -153,7 +143,7 @@ class TrackingController(ParameterizedSystem, Controller):
         return where_finite(rate, valid)
 
 
-def law_block(law: TrackingLaw, limits: FloatArray, sample_period: float) -> Block:
+def law_block(law: TrackingLaw, sample_period: float) -> Block:
     """The law (28) with the integrals of its errors, as a block; see `TrackingController`."""
     system, signals = law.system, law.integral.signals
     named = {"state": "estimated_state"}
@@ -181,10 +171,9 @@ def law_block(law: TrackingLaw, limits: FloatArray, sample_period: float) -> Blo
     )
     if not signals:
         return block
-    sigma, hold, count = inputs.pop("integral"), ca.SX.sym("hold", limits.size), limits.size
-    rate = values["integral_rate"]
-    leaves = ca.logic_and(ca.fabs(sigma) >= ca.DM(limits), rate * sigma > 0)
-    rate = ca.if_else(ca.logic_or(leaves, hold != 0), 0, rate)
+    sigma, count = inputs.pop("integral"), len(signals)
+    hold = ca.SX.sym("hold", count)
+    rate = ca.if_else(hold != 0, 0, values["integral_rate"])
     block = replace(
         block,
         inputs={**inputs, "hold": hold},

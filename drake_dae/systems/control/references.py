@@ -1,7 +1,6 @@
 """References as a LeafSystem.                                                         (28)"""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -15,12 +14,12 @@ from pydrake.systems.framework import Context
 from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial, Trajectory
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, all_finite, numbers, unknown_name, vector
+from drake_dae.arrays import FloatArray, all_finite, numbers, unknown_name
 from drake_dae.blocks.block import TIME, Block, BlockFunction, Requirement, stacked
 from drake_dae.blocks.failures import simulation_error
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
-from drake_dae.errors import DrakeDaeError, ReferenceSignalError
+from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import Reference, ReferenceRows
 from drake_dae.references.reference import with_degrees
 from drake_dae.references.splines import PiecewisePolynomials
@@ -63,30 +62,12 @@ class ReferenceGenerator(TracedSystem):
 
     def reference(self, time: float) -> FloatArray:
         """R(t) at a time in s by the defaults of its parameters, shape (sum (mu_i + 1),)."""
-        return self._at(time, self._base.default("parameters")).copy()
-
-    def along(self, times: ArrayLike, context: Context | None = None) -> FloatArray:
-        """R(t) at many times in s, one row for each; nan without a value.
-
-        Its parameters are those of a context of the block; the defaults if None.
-        """
-        moments = vector("times", times, None, ReferenceSignalError)
-        values = self._base.default("parameters")
-        if context is not None and values.size:
-            values = context.get_numeric_parameter(0).CopyToVector()
-        rows = np.full((moments.size, self.get_output_port().size()), np.nan)
-        for row, time in zip(rows, moments.tolist(), strict=True):
-            with suppress(DrakeDaeError):
-                row[:] = self._at(time, values)
-        return rows
-
-    def _at(self, time: float, parameters: FloatArray) -> FloatArray:
-        given = {"time": np.array([time]), "parameters": parameters}
+        given = {"time": np.array([time]), "parameters": self._base.default("parameters")}
         (values,) = self._function.evaluate(*(given[source] for source in self._function.sources))
         if not self._function.is_valid:
             failure, moment = self._function.failure(), np.zeros(0)
             raise simulation_error(failure, time, moment, {})
-        return values
+        return values.copy()
 
     @cached_property
     def _function(self) -> BlockFunction:

@@ -177,6 +177,18 @@ def test_what_does_not_fit_is_refused_with_its_key(settings, words, tmp_path):
     assert not re.search(r"plant\.\w+\(|Finalize", message)
 
 
+@pytest.mark.parametrize("name", ["panda_finger_joint1", "panda_finger_joint2"])
+def test_either_of_two_coupled_joints_locks_the_other(name, tmp_path):
+    """A file and Drake may name either one as the one that follows."""
+    file = write_panda(tmp_path)
+    plant, _ = read_robot(Robot(str(file), locked={name: 0.03}))
+    finalize(plant)
+    for finger in ("panda_finger_joint1", "panda_finger_joint2"):
+        weld = plant.GetJointByName(finger).X_FM()
+        np.testing.assert_allclose(np.linalg.norm(weld.translation()), 0.03, rtol=1e-12)
+    assert plant.num_constraints() == 0
+
+
 def test_an_effort_limit_of_0_is_unknown(tmp_path):
     file = tmp_path / "robot.urdf"
     text = robot("one", link("a", 1), link("b", 1), joint("j", "a", "b", "0 0 1"))

@@ -174,3 +174,27 @@ def test_a_dae_is_drawn_in_its_unit_and_its_colors_by_films_as_well(unit: float,
     )
     # .gltf has single precision; Drake's box has a margin of its own.
     np.testing.assert_allclose(np.ptp(corners, axis=1), unit * np.array([200, 200, 300]), rtol=1e-3)
+
+
+def test_names_of_colours_mean_what_other_parsers_take_them_for(tmp_path: Path):
+    """One has two colours in two links, of which the first counts, one is defined later, one not.
+
+    Drake refuses each of these.
+    """
+    box = '<visual><geometry><box size="1 1 1"/></geometry><material name="{}">{}</material>'
+    red = '<color rgba="{} 0 0 1"/>'
+    one = f"{box.format('two', red.format(1.0))}</visual>{box.format('later', '')}</visual>"
+    other = f"{box.format('two', red.format(0.5))}</visual>{box.format('none', '')}</visual>"
+    text = (
+        f'<robot name="r"><link name="a">{one}</link><link name="b">{other}</link>'
+        f'<material name="later">{red.format(0.2)}</material></robot>'
+    )
+    (tmp_path / "robot.urdf").write_text(text)
+    read(tmp_path / "robot.urdf", scene_graph := SceneGraph())
+    inspector = scene_graph.model_inspector()
+    found = []
+    for geometry in inspector.GetAllGeometryIds(Role.kIllustration):
+        properties = inspector.GetIllustrationProperties(geometry)
+        has = properties.HasProperty("phong", "diffuse")
+        found.append(properties.GetProperty("phong", "diffuse").r() if has else None)
+    assert sorted(found, key=str) == [0.2, 1.0, 1.0, None]

@@ -221,12 +221,6 @@ def test_an_impossible_inertia_is_named_and_the_nearest_taken(name, entries, is_
         plant_of(file, **own)
 
 
-# What a URDF means.
-
-
-# Meshes.
-
-
 # Where robots stand.
 
 HELD = {
@@ -341,9 +335,6 @@ def test_a_floating_joint_moves_as_drakes_quaternion_does(name, tmp_path):
         np.testing.assert_allclose(*found, atol=1e-9)
 
 
-# A robot in the place of a scenario.
-
-
 # MJCF with defaults.
 
 CLASSES = """<mujoco><compiler angle="degree" autolimits="true"/>
@@ -375,3 +366,18 @@ def test_defaults_and_rotors_of_mjcf_are_those_of_mujoco(tmp_path):
     low = plant.GetPositionLowerLimits()
     np.testing.assert_allclose(low, [-np.inf, -np.pi / 6, -np.inf])
     assert [plant.GetJointByName(f"j{k}").default_damping() for k in (1, 2, 3)] == [0.3] * 3
+
+
+def test_a_rotor_of_a_joint_that_is_locked_is_no_loss(tmp_path):
+    """What it added to the joint's own row of M(q) goes with the row."""
+    file = written(tmp_path, CLASSES, "arm.xml")
+    plant = plant_of(file, actuators="all", locked={"j2": 0.1})
+    rotors = {
+        plant.get_joint_actuator(index).joint().name(): (
+            plant.get_joint_actuator(index).default_rotor_inertia()
+        )
+        for index in plant.GetJointActuatorIndices()
+    }
+    assert rotors == {"j1": 0.2, "j3": 0.2}
+    with pytest.raises(ModelError, match=r"'j3'.* 0\.2 .*\[joint/armature\]"):
+        plant_of(file, actuators=["j1"], locked={"j2": 0.1})

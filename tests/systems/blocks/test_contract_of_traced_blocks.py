@@ -156,7 +156,7 @@ BLOCKS = {
         measured_law(("wall.force",), 0.0)
     ),
     "TrackingController with a sampled integral": lambda: TrackingController(
-        measured_law(("tool.z", "wall.force"), 0.0), integral_limits=1.0, sample_period=0.01
+        measured_law(("tool.z", "wall.force"), 0.0), sample_period=0.01
     ),
     "ControlLimits": lambda: ControlLimits([0.5, 2.0]),
     "ForceSensor with a lag": lambda: ForceSensor(2, 0.01, bias=0.1),

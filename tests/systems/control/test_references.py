@@ -210,8 +210,6 @@ def test_parameters_stand_in_the_context():
     generator.set_parameter(context, "push", [2.0, 4.0])
     wanted = [0.1 * np.sin(1.0), 0.2 * np.cos(1.0), 0.1 + 2.0 + 4.0 * 0.5]
     np.testing.assert_allclose(port.Eval(context), wanted, rtol=1e-15)
-    np.testing.assert_allclose(generator.along([0.0, 0.5], context)[1], wanted, rtol=1e-15)
-    np.testing.assert_allclose(generator.along([0.5])[0], generator.reference(0.5), rtol=0)
 
 
 def test_wrong_parameters_are_refused():

@@ -50,6 +50,7 @@ from drake_dae.systems.plants.contact.contact_forces import (
     contact_block,
     contact_force_signals,
 )
+from drake_dae.systems.plants.contact.contact_laws import touching
 from drake_dae.systems.plants.contact.contact_material import (
     ContactMaterial,
     ball_properties,
@@ -291,16 +292,11 @@ def check_model(model: RobotModel, material: ContactMaterial) -> None:
             f"{model.name} has springs, motors or valves at its joints, which Drake's contact does "
             "not step: take a CompliantPlant (`plant: !CompliantContact`)"
         )
-    if not model.constraints:
-        raise ModelError("the robot has no constraints, so there is nothing to touch")
-    for constraint in model.constraints:
+    for constraint, _ in touching(model):
         values = own_values(constraint, model.dae, model.dae.parameter_values)
         surface = constraint.surface_at(values)
-        if surface is None or constraint.touch(model.links) is None:
-            raise ModelError(
-                f"'{constraint.name}' is no contact with a surface: use an ideal plant"
-            )
-        if material.contact_model != "hydroelastic" and not surface.solids():
+        is_point = material.contact_model == "point"
+        if surface is None or (is_point and not surface.solids()):
             raise ModelError(
                 f"'{constraint.name}' has no solid for Drake's point contact, as a "
                 "PointOnSurface has on a Plane, or on the outside of a Sphere or a "

@@ -35,7 +35,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, OutputPortSelection
 from pydrake.systems.primitives import ConstantVectorSource, FirstOrderTaylorApproximation
-from runs import run_scenario, scenario, some
+from runs import some
 
 from drake_dae import (
     CoincidentPoints,
@@ -50,7 +50,7 @@ from drake_dae import (
     rollout,
     simulate,
 )
-from drake_dae.errors import ModelError, ScenarioError, SimulationError
+from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running import start_values
 from drake_dae.scenario.shipped import FOLDER
 from drake_dae.systems import PointMaterial
@@ -395,14 +395,6 @@ def test_a_constraint_that_is_no_contact_is_refused():
     model = RobotModel(links, [pin], [PointCoordinates("tool", "z")])
     with pytest.raises(ModelError, match="'pin'"):
         CompliantPlant(model, PointMaterial())
-
-
-def test_gains_of_a_continuous_contact_need_a_period():
-    found = scenario(
-        "wall_point_contact", "plant=!CompliantContact {time_step: 0}", "sampling=null"
-    )
-    with pytest.raises(ScenarioError, match="sampling"):
-        run_scenario(found)
 
 
 def test_the_continuous_plant_has_the_linear_model_of_differences():
