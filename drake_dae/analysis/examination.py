@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike
 from drake_dae.analysis.report import Analysis, Assumption, Finding
 from drake_dae.analysis.tables import count_of
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, check_whole_number, numbers, unknown_name
+from drake_dae.arrays import FloatArray, check_whole_number, numbers
 from drake_dae.dae import (
     ConstraintStructure,
     DaeSystem,
     Manifold,
     RankMargin,
-    Region,
     Stability,
     Violation,
     ZeroDynamics,
@@ -51,15 +50,11 @@ COUNT, SEED = 50, 0
 NEIGHBOURS = 5
 """How many states are added close to the first given one, which may be a zero of a function."""
 
-Bounds = Mapping[str, tuple[float, float]]
-"""A region: state name -> (lowest, highest)."""
-
 
 @checked(ModelError)
 def analyze(
     system: DaeSystem,
     *,
-    region: Bounds | None = None,
     states: ArrayLike | None = None,
     reference: Callable[[float], FloatArray] | None = None,
     times: ArrayLike | None = None,
@@ -72,11 +67,11 @@ def analyze(
     """Examines relative degrees, index, Assumptions (1)-(5) and 2.2, also along a reference.
 
     Numbers are decided at consistent states with the default parameters: at those given, or at
-    random ones in a region or around `system.nominal_state`. Degrees must be the same for all
+    random ones around `system.nominal_state`. Degrees must be the same for all
     numbers that parameters may have, see `DaeSystem.with_bounds`. A determinant that changes its
     sign between the first state and another one is zero on the way. From the worst of the random
-    ones the smallest singular values of A(x) and B(x) are also followed downhill, inside the region
-    or the box that the random states span, so that a singular state between them is found as a
+    ones the smallest singular values of A(x) and B(x) are also followed downhill, inside
+    the box that the random states span, so that a singular state between them is found as a
     rule. There is no proof that none was missed.
 
     Where friction acts on contacts that can only push, the margin of A(x) is that without friction,
@@ -85,7 +80,6 @@ def analyze(
 
     Args:
         system: The system (1)-(3).
-        region: State name -> (lowest, highest); other states are drawn around the nominal one.
         states: Consistent states to examine instead, shape (k, n). Degrees are decided also at a
             few others close to the first, since an expression may vanish at a single state.
         reference: The function t -> R(t), as for `TrackingLaw`; the margins are also taken along
@@ -104,13 +98,11 @@ def analyze(
         The report. An assumption that is violated is part of it, with what is known before.
 
     Raises:
-        InconsistentStateError: There is no consistent state in the region or around the nominal
-            state, or given states are not consistent.
+        InconsistentStateError: There is no consistent state around the nominal state, or given
+            states are not consistent.
         ModelError: Arguments make no sense, or the system has a function that is not finite, or a
             mass matrix that is not symmetric and positive definite.
     """
-    if region is not None and states is not None:
-        raise ModelError(f"{system.name}: give a region or states, not both")
     if (reference is None) != (times is None):
         raise ModelError(f"{system.name}: a reference needs times, and times need a reference")
     for name, value in (("start", start), ("period", period)):
@@ -120,7 +112,7 @@ def analyze(
     check_whole_number(f"{system.name}: seed", seed, 0)
     random = np.random.default_rng(seed)
     chosen = (
-        ExaminedStates.drawn(system, region, count, random)
+        ExaminedStates.drawn(system, count, random)
         if states is None
         else ExaminedStates.given(system, states, random)
     )
@@ -133,31 +125,22 @@ def analyze(
 def examine(system: DaeSystem, chosen: ExaminedStates | None = None) -> Analysis:
     """Examines degrees, Assumptions (1)-(5) and margins, without zero dynamics."""
     if chosen is None:
-        chosen = ExaminedStates.drawn(system, None, COUNT, np.random.default_rng(SEED))
+        chosen = ExaminedStates.drawn(system, COUNT, np.random.default_rng(SEED))
     given_states = chosen.guesses[: chosen.num_given]
     try:
         check_system(system)
-        constrained, around = examine_constraints(system, chosen.guesses, chosen.region)
+        constrained, around = examine_constraints(system, chosen.guesses)
     except AssumptionError as error:
         where = chosen.describe(len(chosen.guesses), "state")
         tried = given_states if chosen.num_given else chosen.guesses
         return Analysis(system, where, tried, _assumptions((), [error.violation]))
-    except InconsistentStateError as error:
-        if chosen.region is None:
-            raise
-        raise InconsistentStateError(
-            f"{system.name}: no consistent state found with {chosen.describe_region()}; choose "
-            "another region",
-            error.residual,
-        ) from error
     samples = around
     if chosen.num_given:
         # Degrees are decided also at states around them, margins only at them.
         samples = Samples(around.manifold, given_states)
         _check_consistent(samples.manifold, given_states, samples.states)
     where = chosen.describe(len(samples.states), "consistent state")
-    analysis = _examine(constrained, around, samples, where, search=not chosen.num_given)
-    return replace(analysis, region=chosen.region)
+    return _examine(constrained, around, samples, where, search=not chosen.num_given)
 
 
 def _at_rest(analysis: Analysis) -> Analysis:
@@ -297,25 +280,14 @@ class ExaminedStates:
 
     guesses: FloatArray
     num_given: int
-    bounds: Bounds
-    region: Region | None
 
     @classmethod
-    def drawn(
-        cls, system: DaeSystem, bounds: Bounds | None, count: int, random: np.random.Generator
-    ) -> ExaminedStates:
+    def drawn(cls, system: DaeSystem, count: int, random: np.random.Generator) -> ExaminedStates:
         nominal = system.nominal_state
         drawn = nominal + system.spread_around(nominal) * random.standard_normal(
             (count, nominal.size)
         )
-        if bounds is None:
-            return cls(np.vstack([nominal, drawn]), 0, {}, None)
-        region = _box(system, bounds)
-        named = np.isfinite(region.low)
-        low, high = region.low[named], region.high[named]
-        drawn[:, named] = random.uniform(low, high, (count, low.size))
-        guesses = np.vstack([np.clip(nominal, region.low, region.high), drawn])
-        return cls(guesses, 0, bounds, region)
+        return cls(np.vstack([nominal, drawn]), 0)
 
     @classmethod
     def given(
@@ -329,18 +301,14 @@ class ExaminedStates:
                 f"got {states!r}"
             )
         around = system.spread_around(rows[0]) * random.standard_normal((NEIGHBOURS, shape[1]))
-        return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows), {}, None)
+        return cls(np.vstack([rows, rows[0] + 0.1 * around]), len(rows))
 
     def describe(self, count: int, noun: str) -> str:
         if self.num_given:
             return f"{count_of(self.num_given, noun)} as given"
-        region = f"with {self.describe_region()}" if self.bounds else "around the nominal one"
         left_out = len(self.guesses) - count
         missing = f"; {left_out} more were outside the domain or off N*" if left_out else ""
-        return f"{count_of(count, noun)} {region}{missing}"
-
-    def describe_region(self) -> str:
-        return ", ".join(f"{name} in [{a:g}, {b:g}]" for name, (a, b) in self.bounds.items())
+        return f"{count_of(count, noun)} around the nominal one{missing}"
 
 
 def _check_consistent(manifold: Manifold, states: FloatArray, projected: FloatArray) -> None:
@@ -362,19 +330,3 @@ def _check_consistent(manifold: Manifold, states: FloatArray, projected: FloatAr
                 f"{name}: states[{number}] is outside the domain: functions of (1)-(3) are not "
                 "finite there"
             )
-
-
-def _box(system: DaeSystem, bounds: Bounds) -> Region:
-    low, high = np.full(system.num_states, -np.inf), np.full(system.num_states, np.inf)
-    names = [signal.name for signal in system.state_signals]
-    for name, interval in bounds.items():
-        if name not in names:
-            raise ModelError(f"{system.name}: region: {unknown_name('state', name, names)}")
-        pair = numbers(f"{system.name}: region: the bounds of '{name}'", interval)
-        if pair[0] > pair[1]:
-            raise ModelError(
-                f"{system.name}: region: '{name}' needs the lowest and the highest value, got "
-                f"{interval!r}"
-            )
-        low[names.index(name)], high[names.index(name)] = pair
-    return Region(low, high)

@@ -19,7 +19,6 @@ from drake_dae.dae import (
     DerivativeLayout,
     PinnedMotion,
     RankMargin,
-    Region,
     Signal,
     Stability,
     StabilityAlong,
@@ -88,7 +87,6 @@ class Analysis:
         structure: The structure, for laws and blocks; None if A(x) or B(x) is singular at an
             examined state. If it is singular only between them, the assumption is violated but
             there is a structure.
-        region: The requested region; None if there is none.
     """
 
     system: DaeSystem
@@ -105,7 +103,6 @@ class Analysis:
     contact_margin_along: ContactMargin | None = None
     constraint_structure: ConstraintStructure | None = None
     structure: Structure | None = None
-    region: Region | None = None
 
     @property
     def output_order(self) -> tuple[int, ...] | None:
@@ -140,17 +137,6 @@ class Analysis:
         return None if dimension is None or degrees is None else dimension - sum(degrees)
 
     @property
-    def unstable_inside(self) -> tuple[Stability, ...]:
-        """Other unstable equilibria inside the requested region."""
-        region, judged = self.region, self.zero_dynamics
-        return tuple(
-            one
-            for one in (() if region is None else self.equilibria)
-            if one.verdict is Verdict.UNSTABLE and one is not judged and one.state is not None
-            if region is not None and region.holds(one.state)
-        )
-
-    @property
     def zero_dynamics_finding(self) -> Finding:
         """The verdict on Assumption 2.2.
 
@@ -160,7 +146,7 @@ class Analysis:
         judged = [one.verdict for one in (self.zero_dynamics_along, self.zero_dynamics) if one]
         if not judged:
             return Finding.NOT_EXAMINED
-        if Verdict.UNSTABLE in judged or self.unstable_inside:
+        if Verdict.UNSTABLE in judged:
             return Finding.VIOLATED
         return Finding.SATISFIED if judged[0] is Verdict.STABLE else Finding.UNDECIDED
 
@@ -185,12 +171,6 @@ class Analysis:
         for place, one in judged:
             if one is not None and one.verdict is Verdict.UNSTABLE:
                 sentences.append(f"Assumption 2.2: {place}{one.reason}")
-        for equilibrium in self.unstable_inside:
-            if equilibrium.state is not None:
-                place = named_values(signals, equilibrium.state)
-                sentences.append(
-                    f"Assumption 2.2: inside the region, at rest at {place}: {equilibrium.reason}"
-                )
         if self.motion is not None and self.motion.ending is not None:
             sentences.append(str(self.motion.ending))
         return tuple(sentences)

@@ -45,7 +45,6 @@ from .pinned_motion import MotionEnd as MotionEnd
 from .pinned_motion import PinnedMotion as PinnedMotion
 from .redundancy import drop_constraints as drop_constraints
 from .redundancy import share_forces as share_forces
-from .samples import Region as Region
 from .signals import DerivativeLayout as DerivativeLayout
 from .signals import Indices as Indices
 from .signals import Parameter as Parameter

@@ -166,16 +166,6 @@ def without_dynamics(structure: Structure) -> Stability:
     return Stability(Verdict.STABLE, "no zero dynamics: the reference alone determines the motion")
 
 
-@dataclass(frozen=True, eq=False)
-class Rest:
-    """Where a search for an equilibrium ends."""
-
-    state: FloatArray
-    rate: FloatArray  # x' there.
-    unrest: str  # Why it is not at rest; empty if it is.
-    degenerate: int  # The number of directions in which its Jacobian is singular.
-
-
 class Equilibria:
     """The equilibria on Z(R)."""
 
@@ -207,22 +197,15 @@ class Equilibria:
                 reference[direct] = nearest
         return reference
 
-    def find(self, pinned: PinnedSet, guess: FloatArray, regular: bool = True) -> Rest:
-        """Returns the state at rest at which a search from a guess ends."""
-        rest = self._search(pinned, guess)
-        unrest = rest.unrest
-        if regular and rest.degenerate and not unrest:
-            unrest = "the Jacobian is singular"
-        if unrest:
-            raise InconsistentStateError(
-                f"{self.pinned.system.name}: {pinned.describe()} have no regular state at rest "
-                f"near the given one: the search ends at x = {show(rest.state)}, where {unrest}",
-                rest.rate,
-            )
-        return rest
+    def find(
+        self, pinned: PinnedSet, guess: FloatArray, regular: bool = True
+    ) -> tuple[FloatArray, int]:
+        """Returns a state at rest, by Newton's method for C(x) = 0 and T^T x' = 0 from a guess.
 
-    def _search(self, pinned: PinnedSet, guess: FloatArray) -> Rest:
-        """Searches by Newton's method for C(x) = 0 and T^T x' = 0."""
+        T spans the tangent space of Z(R), which contains x'. Where the Jacobian is singular, the
+        shortest step is taken. Also returns the number of directions in which it is singular at the
+        state; none if it must be regular.
+        """
         system, scale = self.pinned.system, self.pinned.system.scale
         if self._clocks.any():
             running = ", ".join(
@@ -260,7 +243,15 @@ class Equilibria:
         if not converged:
             unrest = unrest or "the rates are small and do not vanish"
         degenerate = 0 if unrest else self._degenerate(pinned, point.state)
-        return Rest(point.state, point.rate, unrest, degenerate)
+        if regular and degenerate:
+            unrest = "the Jacobian is singular"
+        if unrest:
+            raise InconsistentStateError(
+                f"{system.name}: {pinned.describe()} have no regular state at rest near the given "
+                f"one: the search ends at x = {show(point.state)}, where {unrest}",
+                point.rate,
+            )
+        return point.state, degenerate
 
     def unrest(self, pinned: PinnedSet, point: PinnedPoint) -> str:
         """Returns why a point is no regular state at rest, as text; empty if it is one."""

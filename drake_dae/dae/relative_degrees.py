@@ -18,7 +18,7 @@ from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivativ
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.family import VISIBLE, Family
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.samples import Region, Samples, as_matrix, fields_at
+from drake_dae.dae.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import nonzeros
@@ -32,9 +32,7 @@ Row = Callable[[FloatArray, FloatArray], Sized]
 before cancellation."""
 
 
-def constraint_chains(
-    system: DaeSystem, guesses: FloatArray, region: Region | None
-) -> tuple[list[list[ca.SX]], Samples]:
+def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list[ca.SX]], Samples]:
     """k_i, L_f k_i, ..., L_f^(r_i - 1) k_i of each constraint, by Assumptions (1) and (3)."""
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
@@ -44,7 +42,7 @@ def constraint_chains(
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, explicit.g, x)
         by_control = lie_derivative_along(last, explicit.h, x)
-        samples = Samples(Manifold(system, chains), guesses, region)
+        samples = Samples(Manifold(system, chains), guesses)
         actions, following, stuck = InputActions(samples), list[int](), list[int]()
         force_acts = actions.acts(by_force, actions.along(last, "g"))
         control_acts = actions.acts(by_control, actions.along(last, "h"))
@@ -81,7 +79,7 @@ def constraint_chains(
                 derivative += system.exogenous.rate(chains[i][-1])
             chains[i].append(derivative)
         undecided = following
-    return chains, Samples(Manifold(system, chains), guesses, region)
+    return chains, Samples(Manifold(system, chains), guesses)
 
 
 def output_chains(

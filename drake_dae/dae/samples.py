@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -31,8 +30,8 @@ class Region:
 
     def holds(self, state: FloatArray) -> bool:
         """Returns whether a state is in the region."""
-        bounds = np.where(np.isfinite([self.low, self.high]), [self.low, self.high], 0.0)
-        slack = SLACK * np.maximum(np.abs(bounds).max(axis=0), bounds[1] - bounds[0])
+        largest = np.maximum(np.abs(self.low), np.abs(self.high))
+        slack = SLACK * np.maximum(largest, self.high - self.low)
         return bool(np.all((state >= self.low - slack) & (state <= self.high + slack)))
 
     def project(self, manifold: Manifold, guess: FloatArray) -> FloatArray:
@@ -51,19 +50,6 @@ class Region:
             )
         return state
 
-    def draw(self, manifold: Manifold, guess: FloatArray) -> FloatArray:
-        """Returns a consistent state with the bounded states of a guess, if there is one.
-
-        So random values cover the region, although the projection changes other states.
-        """
-        bounded = np.isfinite(self.low)
-        pinned = Region(np.where(bounded, guess, -np.inf), np.where(bounded, guess, np.inf))
-        try:
-            state = manifold.project(pinned._newton(manifold, guess))
-        except InconsistentStateError:
-            return self.project(manifold, guess)
-        return state if self.holds(state) else self.project(manifold, guess)
-
     def descend(
         self,
         manifold: Manifold,
@@ -74,7 +60,7 @@ class Region:
 
         Zeros are found in a few steps. A positive minimum is only approached.
         """
-        width = np.where(np.isfinite(self.high - self.low), self.high - self.low, manifold.scale)
+        width = self.high - self.low
         state, (value, gradient) = start, function(start)
         for _ in range(40):
             direction = self._downhill(manifold.gradients(state) * width, state, gradient, width)
@@ -155,17 +141,14 @@ def _bounded_step(
 class Samples:
     """Consistent states near guesses, with the default parameters."""
 
-    def __init__(
-        self, manifold: Manifold, guesses: FloatArray, region: Region | None = None
-    ) -> None:
-        self.manifold, self.system, self.region = manifold, manifold.system, region
-        draw = manifold.project if region is None else partial(region.draw, manifold)
+    def __init__(self, manifold: Manifold, guesses: FloatArray) -> None:
+        self.manifold, self.system = manifold, manifold.system
         self.fields: list[dict[str, FloatArray]] = []
         states: list[FloatArray] = []
         failure = None
         for number, guess in enumerate(guesses):
             try:
-                state = draw(guess)
+                state = manifold.project(guess)
             except InconsistentStateError as error:
                 failure = failure or error
                 continue
@@ -206,14 +189,8 @@ class Samples:
         return all(are_dependent(significant(gradient * self.scale)) for (gradient,) in gradients)
 
     def surroundings(self) -> Region:
-        """The box that the states span, within the region from which they were drawn."""
-        low, high = self.states.min(axis=0), self.states.max(axis=0)
-        if self.region is not None:
-            # States without bounds may lie slightly beyond the random ones.
-            more = 0.5 * (high - low)
-            low = np.where(np.isfinite(self.region.low), self.region.low, low - more)
-            high = np.where(np.isfinite(self.region.high), self.region.high, high + more)
-        return Region(low, high)
+        """The box that the states span."""
+        return Region(self.states.min(axis=0), self.states.max(axis=0))
 
 
 def fields_at(

@@ -26,7 +26,7 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.margins import RankMargin, find_margin
 from drake_dae.dae.redundancy import all_constraints_hold
 from drake_dae.dae.relative_degrees import InputActions, constraint_chains, output_chains
-from drake_dae.dae.samples import Region, Samples, draw
+from drake_dae.dae.samples import Samples, draw
 from drake_dae.dae.signals import DerivativeLayout
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
@@ -325,11 +325,11 @@ def _is_positive_definite(matrix: FloatArray) -> bool:
 
 
 def examine_constraints(
-    system: DaeSystem, guesses: FloatArray, region: Region | None = None
+    system: DaeSystem, guesses: FloatArray
 ) -> tuple[ConstraintStructure, Samples]:
     """Finds r_1, ..., r_m and A(x) of a system that `check_system` accepts."""
     try:
-        chains, samples = constraint_chains(system, guesses, region)
+        chains, samples = constraint_chains(system, guesses)
     except AssumptionError as error:
         if error.violation is not None:
             raise _as_redundant(system, error.violation).error() from None

@@ -141,7 +141,7 @@ class ZeroDynamics:
                 states, but no equilibrium: `residual` is then x', shape (n,).
         """
         start, p = self._guess(guess), self.system.parameter_vector(parameters)
-        return self._equilibria.find(self._resting(start, outputs, p), start).state
+        return self._equilibria.find(self._resting(start, outputs, p), start)[0]
 
     @checked(ModelError)
     def eigenvalues(
@@ -201,13 +201,12 @@ class ZeroDynamics:
         start = self.structure.manifold.project(self._guess(state), p)
         pinned = self._resting(start, outputs, p)
         try:
-            rest = self._equilibria.find(pinned, start, regular=False)
+            rest, degenerate = self._equilibria.find(pinned, start, regular=False)
         except InconsistentStateError as error:
             return Stability(Verdict.UNDECIDED, str(error))
-        values, errors = linearized_eigenvalues(pinned, self._equilibria.sizes, rest.state)
-        where = "at rest" if rest.degenerate else "at the equilibrium"
-        place = f"{where} with {pinned.describe()}"
-        return judge(values, errors, rest.state, place, rest.degenerate)
+        values, errors = linearized_eigenvalues(pinned, self._equilibria.sizes, rest)
+        where = "at rest" if degenerate else "at the equilibrium"
+        return judge(values, errors, rest, f"{where} with {pinned.describe()}", degenerate)
 
     @checked(ModelError)
     def equilibria(
@@ -236,7 +235,7 @@ class ZeroDynamics:
         distinct = np.zeros((0, self.system.num_states))
         for start in starts:
             try:
-                rest = self._equilibria.find(pinned, start).state
+                rest, _ = self._equilibria.find(pinned, start)
             except InconsistentStateError:
                 continue
             sizes = np.maximum(self._equilibria.sizes, np.abs(rest))

@@ -89,8 +89,7 @@ class StaticPlacement:
 class StaticBalance:
     """The equations 0 = f + g lambda + h u at v = 0, S lambda = z_2, for the stages' s, u, lambda.
 
-    S is without redundant constraints. Entries of lambda that are outputs themselves (a row of the
-    identity) are not unknowns. Without stages any state of the links is one at rest.
+    S is without redundant constraints. Without stages any state of the links is one at rest.
     """
 
     def __init__(self, dae: DaeSystem, robot: Links, S: ca.SX) -> None:
@@ -101,23 +100,15 @@ class StaticBalance:
         load = ca.SX.sym("z_2", S.shape[0])
         balance = dae.f + ca.mtimes(dae.g, force) + ca.mtimes(dae.h, control)
         balance = ca.substitute(balance[q.numel() :], v, ca.SX.zeros(v.numel()))
-        alone = [_unit_row(S[i, :]) for i in range(S.shape[0])]
-        determined = {place: i for i, place in enumerate(alone) if place is not None}
-        forces = ca.SX(force)
-        for place, i in determined.items():
-            forces[place] = load[i]
-        combined = [i for i, place in enumerate(alone) if place is None]
-        rows = (ca.mtimes(S, force) - load)[combined]
-        balance = ca.substitute(ca.vertcat(balance, rows), force, forces)
-        all_forces = ca.substitute(dae.forces(forces), v, ca.SX.zeros(v.numel()))
-        free = [i for i in range(dae.num_constraints) if i not in determined]
-        unknown = ca.vertcat(dae.state[links:], control, force[free])
+        balance = ca.vertcat(balance, ca.mtimes(S, force) - load)
+        all_forces = ca.substitute(dae.forces(force), v, ca.SX.zeros(v.numel()))
+        unknown = ca.vertcat(dae.state[links:], control, force)
         self._unknowns = unknown.numel()
         self._robot, self._stages = dae.name, dae.num_states - links
         self._still = np.zeros(v.numel())
         self._function = TracedFunction(
             f"{dae.name} equilibrium",
-            {"q": q, "z_2": load, "s, u, free forces": unknown, "parameters": dae.parameter_symbol},
+            {"q": q, "z_2": load, "s, u, lambda": unknown, "parameters": dae.parameter_symbol},
             {
                 "balance": balance,
                 "gradient": ca.jacobian(balance, unknown),
@@ -160,10 +151,3 @@ class StaticBalance:
         residuals, _, constraint_force = self._function(q, forces, solution, parameters)
         state = np.concatenate([q, self._still, solution[: self._stages]])
         return state, constraint_force, float(np.max(np.abs(residuals), initial=0.0))
-
-
-def _unit_row(row: ca.SX) -> int | None:
-    """The index of the 1 in a row of the identity; None for any other row."""
-    row = ca.sparsify(row)
-    place = row.sparsity().get_triplet()[1]
-    return place[0] if len(place) == 1 and row[place[0]].is_one() else None

@@ -1,6 +1,7 @@
 """Runs that diverge: a state, a control or a tracking error leaves all measure, and since when."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,33 +29,31 @@ MEANINGFUL = 1e-6
 judged: their size may be round-off."""
 
 
+@dataclass
 class _Growth:
     """Ratios of signals to their sizes, and since when they are above the usual ones."""
 
-    def __init__(
-        self,
-        signals: Sequence[Signal],
-        time: float,
-        usual: float,
-        most: float,
-        lasting: float = np.inf,
-        window: float = np.inf,
-    ) -> None:
-        self.signals, self._time = signals, time
-        self._usual, self._most, self._lasting, self._window = usual, most, lasting, window
-        self._mean, self.since = np.zeros(len(signals)), np.full(len(signals), time)
+    signals: Sequence[Signal]
+    time: float
+    usual: float
+    most: float
+    lasting: float = np.inf
+    window: float = np.inf
+
+    def __post_init__(self) -> None:
+        self._mean, self.since = np.zeros(len(self.signals)), np.full(len(self.signals), self.time)
 
     def beyond(self, times: FloatArray, ratios: FloatArray) -> tuple[int, int] | None:
         """The first row with a ratio beyond all measure, and the signal; None if there is none."""
-        if not ratios.size or (ratios <= self._usual).all():
-            self._mean *= np.exp((self._time - times[-1]) / self._window)
-            self.since[:] = self._time = float(times[-1])
+        if not ratios.size or (ratios <= self.usual).all():
+            self._mean *= np.exp((self.time - times[-1]) / self.window)
+            self.since[:] = self.time = float(times[-1])
             return None
         for row, (time, ratio) in enumerate(zip(times.tolist(), ratios, strict=True)):
-            weight = -np.expm1((self._time - time) / self._window)
+            weight = -np.expm1((self.time - time) / self.window)
             self._mean += weight * (np.log(np.maximum(ratio, 1.0)) - self._mean)
-            self.since[ratio <= self._usual] = self._time = time
-            is_beyond = (ratio > self._most) | (self._mean > np.log(self._lasting))
+            self.since[ratio <= self.usual] = self.time = time
+            is_beyond = (ratio > self.most) | (self._mean > np.log(self.lasting))
             if is_beyond.any():
                 return row, int(np.argmax(np.where(is_beyond, ratio, 0.0)))
         return None

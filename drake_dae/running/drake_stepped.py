@@ -92,7 +92,12 @@ def run_stepped(program: RolloutProgram, problem: RunProblem, settings: StepSett
     chosen = [[i for i, p in enumerate(rate.places) if p not in own] for rate in rates]
     held, times, noise = problem.held.copy(), problem.times, problem.noise
     rows, count, none = list[FloatArray](), 0, np.zeros(problem.noise.shape[1])
-    ending, error, moment = RunEnding.DONE, None, float(times[0])
+    moment = float(times[0])
+
+    def ended(ending: RunEnding, error: Exception | None = None) -> Run:
+        record = np.array(rows).reshape(-1, program.functions.row.numel_out(0))
+        state = np.zeros(program.functions.size)
+        return Run(record, ending, moment, state, held, count, error=error)
 
     def update(is_unrestricted: bool) -> bool:
         after, due = held.copy(), int(problem.due[count])
@@ -105,21 +110,20 @@ def run_stepped(program: RolloutProgram, problem: RunProblem, settings: StepSett
         held[:] = after
         return True
 
-    while len(rows) < times.size:
-        at = problem.events[count] if count < problem.events.size else np.inf
+    while True:
+        at = float(problem.events[count]) if count < problem.events.size else np.inf
         # A row has the values before the updates of its time.
         while len(rows) < times.size and times[len(rows)] <= at:
-            (values,) = row.evaluate(times[len(rows)], held, parameters, none)
+            moment = float(times[len(rows)])
+            (values,) = row.evaluate(moment, held, parameters, none)
             if not row.is_valid:
-                moment = float(times[len(rows)])
-                return _ended(program, rows, RunEnding.INVALID, moment, held, count)
+                return ended(RunEnding.INVALID)
             rows.append(values.copy())
         if len(rows) == times.size:
-            break
+            return ended(RunEnding.DONE)
         if count % LOOKED == 0 and settings.look(lambda: np.array(rows)):
-            ending = RunEnding.PAUSED
-            break
-        moment = float(at)
+            return ended(RunEnding.PAUSED)
+        moment = at
         try:
             (given,) = control.evaluate(moment, held, parameters, none)
             is_valid = control.is_valid and update(True)
@@ -127,30 +131,11 @@ def run_stepped(program: RolloutProgram, problem: RunProblem, settings: StepSett
                 drake.step(moment, given)
                 for part, port, local in reads:
                     held[part] = port.Eval(local)
-            is_valid = is_valid and update(False)
+            if not (is_valid and update(False)):
+                return ended(RunEnding.INVALID)
         except SimulationError as failure:
-            ending, error = RunEnding.STUCK, failure
-            break
+            return ended(RunEnding.STUCK, failure)
         except RuntimeError as failure:  # Of Drake, as where its contact solver finds no step.
-            state = held[program.drake_state]
-            ending, error = RunEnding.STUCK, cannot_go_on(moment, state, str(failure))
-            break
-        if not is_valid:
-            ending = RunEnding.INVALID
-            break
+            error = cannot_go_on(moment, held[program.drake_state], str(failure))
+            return ended(RunEnding.STUCK, error)
         count += 1
-    return _ended(program, rows, ending, moment, held, count, error)
-
-
-def _ended(
-    program: RolloutProgram,
-    rows: Sequence[FloatArray],
-    ending: RunEnding,
-    time: float,
-    held: FloatArray,
-    steps: int,
-    error: Exception | None = None,
-) -> Run:
-    width = program.functions.row.numel_out(0)
-    record = np.array(rows).reshape(-1, width)
-    return Run(record, ending, time, np.zeros(program.functions.size), held, steps, error=error)

@@ -18,6 +18,7 @@ from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
+    JacobianWrtVariable,
     Joint,
     PrismaticJoint,
     QuaternionFloatingJoint,
@@ -134,7 +135,7 @@ def new_scenario(
     read = robot_links(robot, SceneGraph(), drawn=False)
     links, tried = read[0], list[str]()
     names = [signal.name for signal in links.position_signals]
-    if not any(point) and len(names) <= 3 and (far := _far_end(links, tip, last)):
+    if not any(point) and (far := _far_end(links, tip, last)):
         point, why["point"] = far, "m, in that frame: its far end, where no frame of the file is"
     progress("looking for a place")
     places = _places(links, tip, point)
@@ -328,6 +329,13 @@ def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
     near = 0.01 * float(np.linalg.norm(np.ptp(origins, axis=0)))
     if distance(frame.GetFixedPoseInBodyFrame().translation()) > near:
         return None
+    # A wrist may roll about an axis through the tool, if the joints before it move that anywhere.
+    step = np.random.default_rng(0).uniform(-1.0, 1.0, plant.num_positions())
+    plant.SetPositions(context, plant.GetPositions(context) + step)
+    world, wrt = plant.world_frame(), JacobianWrtVariable.kV
+    J = plant.CalcJacobianTranslationalVelocity(context, wrt, frame, np.zeros(3), world, world)
+    if np.linalg.matrix_rank(J, tol=1e-6) >= min(3, J.shape[1]):
+        return None
     for places in choices:
         farthest = max(places, key=distance)
         if distance(farthest) > near:
@@ -421,7 +429,8 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
             inverse = np.linalg.pinv(best.gradients[rows_at])[:, 1 : 1 + len(free)]
             fastest = np.max(np.abs(inverse) / speeds[:, None], initial=1e-9)
             torque = np.max(np.abs(best.gradients[axis]) / efforts, initial=1e-9)
-            why = f"where {len(rows_at)} directions of motion are free of each other there"
+            ways_out = f"{len(rows_at)} directions of motion are free of each other there"
+            why = f"where {ways_out} by {score / len(rows_at):.2g} (1 is best, 0 singular)"
             x, y, z = (round(float(value), decimals) + 0.0 for value in best.rows[:3])
             i, j, k = (sign * (n == axis) + 0.0 for n in range(3))
             of_limits = _SHARE / fastest, _SHARE / 2 / torque

@@ -41,7 +41,7 @@ from drake_dae.scenario.parts import (
 )
 from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.shipped import shipped_scenarios
+from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 from drake_dae.scenario.typed_yaml import (
     MOST_TEXT,
     TAG,
@@ -292,14 +292,14 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
         ScenarioError: There is no such file, its YAML is broken, or keys are unknown, missing or
             given twice, or values are not valid; all problems are listed, with their lines.
     """
-    shipped = shipped_scenarios()
-    path = shipped.get(str(path), Path(path))
+    path = find_scenario(str(path))
     try:
         text = read_text(path, 4 * MOST_TEXT)
-        folder = Path().absolute() if path in shipped.values() else path.absolute().parent
+        is_shipped = path in shipped_scenarios().values()
+        folder = Path().absolute() if is_shipped else path.absolute().parent
     except UnicodeDecodeError:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
-    except (OSError, ValueError) as error:  # A null byte in the path.
+    except (OSError, ValueError) as error:  # It is larger.
         raise ScenarioError((str(path), getattr(error, "strerror", None) or str(error))) from None
     if _is_robot(text):
         problem = (

@@ -1,4 +1,4 @@
-"""Regions and given states at which a system is analyzed."""
+"""Given states at which a system is analyzed, and the way downhill between random ones."""
 
 import casadi as ca
 import numpy as np
@@ -6,25 +6,10 @@ import pytest
 from problems import (
     PROBLEMS,
 )
-from problems.found import NO, findings
 
 from drake_dae.analysis import analyze
-from drake_dae.dae import DaeSystem, Manifold, Region
-
-
-def test_a_region_bounds_all_states():
-    """The pendulum with y in [-0.5, -0.2]: x follows from the rod, the velocities are free."""
-    system = PROBLEMS["pendulum"]().system
-    analysis = analyze(system, region={"y": (-0.5, -0.2), "x": (0.0, 1.0)})
-    x, y = analysis.states[:, 0], analysis.states[:, 1]
-    assert len(y) > 40
-    np.testing.assert_array_less(np.abs(y + 0.35), 0.15 + 1e-6)
-    assert np.ptp(y) > 0.2
-    np.testing.assert_allclose(x, np.sqrt(0.64 - y**2), rtol=1e-5)
-    # B = y^2 / (m L^2) is least at the upper edge.
-    margin = analysis.assumptions[4].margin
-    assert margin.singular_value == pytest.approx(0.04 / (2.0 * 0.64), rel=1e-4)
-    assert analysis.where.endswith("with y in [-0.5, -0.2], x in [0, 1]")
+from drake_dae.dae import DaeSystem, Manifold
+from drake_dae.dae.samples import Region
 
 
 def test_given_states():
@@ -37,23 +22,6 @@ def test_given_states():
     least = min(problem.known(x).control_matrix.item() for x in states)
     assert analysis.assumptions[4].margin.singular_value == pytest.approx(least, rel=1e-10)
     assert analysis.where == "4 consistent states as given"
-
-
-def test_a_region_is_covered_whatever_the_constraints_move():
-    """A point on a circle: B = -y vanishes at (-1, 0) and (1, 0)."""
-    circle = DaeSystem.from_functions(
-        ["x", "y"],
-        f=lambda s: [0, 0],
-        g=lambda s: [2 * s[0], 2 * s[1]],
-        h=lambda s: [-s[1], s[0]],
-        k=lambda s: [s[0] ** 2 + s[1] ** 2 - 1],
-        l=lambda s: [s[0]],
-        m=lambda s: [[0]],
-        nominal_state=[0.6, 0.8],
-    )
-    analysis = analyze(circle, region={"x": (-1.1, 1.1)})
-    assert np.ptp(analysis.states[:, 0]) > 1.8
-    assert NO in findings(analysis)
 
 
 def circle() -> Manifold:

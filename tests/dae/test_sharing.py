@@ -1,7 +1,6 @@
 """Forces of redundant constraints by least squares: one split of many, and one motion."""
 
 from dataclasses import replace
-from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -9,24 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 from problems import system_of
 from problems.tables import TABLE, plate
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    JacobianWrtVariable,
-    RevoluteJoint,
-    SpatialInertia,
-    UnitInertia,
-)
 
-from drake_dae import (
-    CoincidentPoints,
-    DaeSystem,
-    RobotModel,
-    RobotPlant,
-    drop_constraints,
-    share_forces,
-)
+from drake_dae import DaePlant, DaeSystem, drop_constraints, share_forces
 from drake_dae.errors import ModelError
 
 
@@ -76,109 +59,34 @@ def test_constraints_that_move_apart_are_not_redundant():
     assert share_forces(walls("both")).num_constraints == 1
 
 
-CRANK, PLACES = 0.5, (0.0, 0.4, 1.0)
-"""Length of three parallel cranks, and where their pivots stand; the platform's pins likewise."""
-
-
-@cache
-def platform():
-    """A platform on three parallel cranks in the x-z plane: two pins too many rows by one."""
-    plant = MultibodyPlant(0.0)
-    down = [0.0, -1.0, 0.0]
-
-    def rod(name, mass, length):
-        unit = UnitInertia.ThinRod(length, [1.0, 0.0, 0.0])
-        centre = np.array([length / 2, 0.0, 0.0])
-        inertia = SpatialInertia(mass, centre, unit.ShiftFromCenterOfMass(centre))
-        return plant.AddRigidBody(name, inertia)
-
-    for i, place in enumerate(PLACES):
-        pivot = FixedOffsetFrame(f"pivot{i}", plant.world_frame(), RigidTransform([place, 0, 0]))
-        body = rod(f"crank{i}", 0.5 + 0.1 * i, CRANK)
-        plant.AddJoint(RevoluteJoint(f"joint{i}", plant.AddFrame(pivot), body.body_frame(), down))
-    tip = plant.AddFrame(
-        FixedOffsetFrame("tip", plant.GetFrameByName("crank0"), RigidTransform([CRANK, 0.0, 0.0]))
-    )
-    table = rod("table", 3.0, PLACES[-1])
-    plant.AddJoint(RevoluteJoint("table", tip, table.body_frame(), down))
-    plant.Finalize()
-    return plant
-
-
-def pins():
-    return [
-        CoincidentPoints("table", (place, 0, 0), f"crank{i}", (CRANK, 0, 0), "xz", f"pin{i}")
-        for i, place in enumerate(PLACES[1:], start=1)
-    ]
-
-
-PARALLEL = np.array([1.0, -1.0, 1.0, 1.0])
-"""Rates of the first crank, the table on it, and the other cranks."""
-
-
-@cache
-def cranks(compliant=False):
-    compliances = {"pin1.fx": 4.0} if compliant else {}
-    return RobotModel.from_multibody(
-        platform(), pins(), [], 0.8 * PARALLEL, "cranks", forces=[], compliances=compliances
-    )
-
-
-def by_hand(q, v, compliances):
-    """All forces of the pins: M, H and J of MultibodyPlant, then NumPy's least squares."""
-    plant = platform()
+@pytest.mark.parametrize("compliances", [{}, {"v0": 4.0, "v2": 0.3}])
+def test_forces_are_those_of_weighted_least_squares(compliances):
+    """The load of a plate on four legs, by NumPy: columns over the roots of the compliances."""
+    plant = DaePlant(share_forces(plate(TABLE), compliances=compliances))
     context = plant.CreateDefaultContext()
-    plant.SetPositions(context, q)
-    plant.SetVelocities(context, v)
-    rows, bias = [], []
-    for pin in pins():
-        for frame, point, sign in (
-            (pin.frame_b, pin.point_b, 1.0),
-            (pin.frame_a, pin.point_a, -1.0),
-        ):
-            arguments = (
-                context,
-                JacobianWrtVariable.kV,
-                plant.GetFrameByName(frame),
-                np.array(point, dtype=float),
-                plant.world_frame(),
-                plant.world_frame(),
-            )
-            rows.append(sign * plant.CalcJacobianTranslationalVelocity(*arguments)[[0, 2]])
-            bias.append(sign * plant.CalcBiasTranslationalAcceleration(*arguments)[[0, 2], 0])
-    jacobian = np.vstack([rows[0] + rows[1], rows[2] + rows[3]])
-    drift = np.concatenate([bias[0] + bias[1], bias[2] + bias[3]])
-    mass = plant.CalcMassMatrix(context)
-    force = plant.CalcGravityGeneralizedForces(context) - plant.CalcBiasTerm(context)
-    free = np.linalg.solve(mass, force)
-    scale = np.sqrt(compliances)
-    matrix = jacobian @ np.linalg.solve(mass, jacobian.T) / scale
-    return np.linalg.lstsq(matrix, -(jacobian @ free + drift), rcond=1e-10)[0] / scale
+    plant.GetInputPort("control").FixValue(context, [0.0])
+    found = plant.GetOutputPort("constraint_force").Eval(context)
+    scale = np.sqrt([compliances.get(f"v{i}", 1.0) for i in range(4)])
+    balance = np.array([[1.0, *corner] for corner in TABLE]).T
+    wanted = np.linalg.lstsq(balance / scale, [9.81 * 4.0, -0.3, 0.2])[0] / scale
+    assert_allclose(found, wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize("compliant", [False, True])
-def test_forces_of_a_robot_are_those_of_least_squares(compliant):
-    """At random states of the motion, to 1e-10 of forces of 30 N, J by MultibodyPlant."""
-    model = cranks(compliant)
-    plant = RobotPlant(model)
+def test_a_split_that_depends_on_the_state():
+    """A rod held by c = 0 and by (2 + x) c = 0: of v = g y - |v|^2 they bear 1 : 2 + x."""
+    system = DaeSystem.from_functions(
+        ["x", "y", "vx", "vy"],
+        f=lambda s: [s[2], s[3], 0.0, -9.81],
+        g=lambda s: [[0, 0], [0, 0], [s[0], (2 + s[0]) * s[0]], [s[1], (2 + s[0]) * s[1]]],
+        k=lambda s: [c := (s[0] ** 2 + s[1] ** 2 - 1) / 2, (2 + s[0]) * c],
+        nominal_state=[0.6, -0.8, 0.0, 0.0],
+    )
+    plant = DaePlant(share_forces(system))
     context = plant.CreateDefaultContext()
-    random = np.random.default_rng(2)
-    assert [s.name for s in model.dae.force_signals] == [
-        f"pin{i}.f{axis}" for i in (1, 2) for axis in "xz"
-    ]
-    assert model.dae.num_constraints == 3
-    for _ in range(8):
-        angle, rate = random.uniform(0.3, 2.8), random.uniform(-4.0, 4.0)
-        q, v = angle * PARALLEL, rate * PARALLEL
-        plant.set_state(context, [*q, *v])
+    for angle, speed in ((0.3, 1.2), (-1.1, 0.5), (2.4, -2.0)):
+        x, y = np.sin(angle), -np.cos(angle)
+        plant.set_state(context, [x, y, -speed * y, speed * x])
+        ratio = np.array([1.0, 2.0 + x])
+        wanted = (9.81 * y - speed**2) * ratio / (ratio @ ratio)
         found = plant.GetOutputPort("constraint_force").Eval(context)
-        wanted = by_hand(q, v, [4.0 if compliant else 1.0, 1.0, 1.0, 1.0])
-        assert_allclose(found, wanted, atol=1e-10 * np.abs(wanted).max())
-        # The wrenches are those of all pins.
-        wrenches = plant.GetOutputPort("constraint_wrenches").Eval(context).reshape(-1, 6)
-        on_cranks = {
-            s.name.split(".")[0]: w[[3, 5]]
-            for s, w in zip(plant.wrench_signals[::6], wrenches, strict=True)
-            if "crank" in s.name
-        }
-        assert_allclose(np.concatenate([on_cranks["pin1"], on_cranks["pin2"]]), found, rtol=1e-12)
+        assert_allclose(found, wanted, rtol=1e-11)

@@ -1,4 +1,4 @@
-"""Zero dynamics: eigenvalues against pencils and closed loops, and verdicts on stability."""
+"""Zero dynamics: eigenvalues against pencils, and verdicts on stability."""
 
 import casadi as ca
 import numpy as np
@@ -6,18 +6,15 @@ import pytest
 import scipy.linalg
 from problems.zero_systems import (
     GRAVITY,
-    NON_MINIMUM_PHASE,
     Array,
-    aircraft,
     assert_same_numbers,
     cart_pendulum,
-    quadruple_tank,
     spring_masses,
     zero_dynamics,
 )
 from runs import some
 
-from drake_dae.dae import DaeSystem, TrackingLaw, Verdict, poles
+from drake_dae.dae import DaeSystem, Verdict
 
 
 def finite_zeros(system: DaeSystem) -> Array:
@@ -104,58 +101,3 @@ def test_a_center_is_undecided_and_the_least_damping_is_not(damping):
     )
     expected = {0.0: Verdict.UNDECIDED, -1e-6: Verdict.UNSTABLE}
     assert stability.verdict is expected.get(damping, Verdict.STABLE)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("system", "chosen"),
-    [
-        (cart_pendulum(0.5), [-2.0, -3.0]),
-        (aircraft(), [-2.0, -3.5]),
-        (quadruple_tank(**NON_MINIMUM_PHASE), [-0.7]),
-    ],
-)
-def test_the_closed_loop_has_the_poles_the_zero_dynamics_and_the_constraints(system, chosen):
-    """The spectrum of f* + h* u(x) in all of R^n, with u of the law (28).
-
-    It is that on N* - roots of (32) and zero dynamics - and, across N*, where L_f*^(r_i) k_i = 0,
-    r_i zeros for each constraint.
-    """
-    dynamics = zero_dynamics(system)
-    structure, degrees = dynamics.structure, dynamics.structure.output_degrees
-    law = TrackingLaw(system, poles(chosen), structure=structure)
-    rest = dynamics.stability()
-    elimination = structure.elimination
-    fields = ca.Function(
-        "fields",
-        [system.state, system.parameter_symbol],
-        [ca.densify(elimination.f_star), ca.densify(elimination.h_star)],
-    )
-    held = [chain[0] for chain in structure.output_chains]
-    outputs = ca.Function("outputs", [system.state], [ca.vertcat(*held)])
-    values = np.array(outputs(rest.state))[:, 0]
-    reference = np.concatenate(
-        [[value, *np.zeros(degree)] for value, degree in zip(values, degrees, strict=True)]
-    )
-
-    def rate(x: Array) -> Array:
-        f, h = (np.array(e) for e in fields(x, system.parameter_values))
-        return f[:, 0] + h @ law.control(x, reference)
-
-    step = 1e-4
-    slope = np.array(
-        [
-            8 * (rate(rest.state + step * e) - rate(rest.state - step * e))
-            - (rate(rest.state + 2 * step * e) - rate(rest.state - 2 * step * e))
-            for e in np.eye(system.num_states)
-        ]
-    ).T / (12 * step)
-    expected = np.concatenate(
-        [
-            np.repeat(chosen, len(degrees)),
-            rest.eigenvalues,
-            np.zeros(sum(structure.constraint_degrees)),
-        ]
-    )
-    # Characteristic polynomials, as multiple roots are sensitive; differences are good to 1e-10.
-    np.testing.assert_allclose(np.poly(slope), np.poly(expected).real, rtol=1e-6, atol=1e-7)

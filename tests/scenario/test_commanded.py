@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from by_inputs import parameter_names, set_inputs
 from pydrake.systems.analysis import SimulatorConfig
-from runs import run, scenario
+from runs import run, scenario, some
 
 from drake_dae import build_scenario
 from drake_dae.scenario import build_commanded
@@ -23,14 +23,7 @@ def jumped(built, duration, **changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "two_link_wall",
-        pytest.param("two_link_flexible", marks=pytest.mark.thorough),
-        pytest.param("seven_joint_moving_plate", marks=pytest.mark.thorough),
-    ],
-)
+@pytest.mark.parametrize("name", some(["two_link_wall", "seven_joint_moving_plate"]))
 def test_without_commands_it_is_the_scenario(name):
     plain = run(*build_scenario(scenario(name)), 0.5, FIXED)
     built = build_commanded(scenario(name))
@@ -42,15 +35,7 @@ def test_without_commands_it_is_the_scenario(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("two_link_wall", marks=pytest.mark.thorough),
-        "two_link_flexible",
-        pytest.param("two_link_motors", marks=pytest.mark.thorough),
-        pytest.param("two_link_hydraulics", marks=pytest.mark.thorough),
-    ],
-)
+@pytest.mark.parametrize("name", some(["two_link_flexible", "two_link_hydraulics"]))
 def test_errors_stay_as_predicted_whatever_is_commanded(name):
     """The wall moves by as many lags for the plant as for the law, which needs more derivatives."""
     built = build_commanded(scenario(name, "start.errors={tool.z: 0.01}"))

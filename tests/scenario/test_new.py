@@ -121,6 +121,19 @@ def test_fingers_and_wheels_are_locked_and_what_mimics_follows(tmp_path):
     assert set(mobile.robot.locked) == {"left_axle", "right_axle"}
 
 
+@pytest.mark.slow
+def test_an_arm_ends_where_a_hand_branches_whatever_its_joints_are_called(tmp_path):
+    """Two chains of two joints each on the last link of six; one of them would be the longest."""
+    text = (Path(__file__).parents[2] / "examples/tasks/six_joint_arm.urdf").read_text()
+    ends = [("polisher", "p1"), ("p1", "p2"), ("polisher", "q1"), ("q1", "q2")]
+    parts = [link(child, 0.05) for _, child in ends]
+    parts += [joint(f"{child}_turn", *pair, "0 1 0") for pair in ends for child in pair[1:]]
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", "".join(parts) + "</robot>"))
+    found = new_scenario(str(tmp_path / "arm.urdf"))[0]
+    assert [*found.start.positions] == [f"joint{k}" for k in range(1, 7)]
+    assert {*found.robot.locked} == {f"{child}_turn" for _, child in ends}
+
+
 @pytest.mark.parametrize(
     ("count", "is_drawn"), [(2, True), pytest.param(3, False, marks=pytest.mark.slow)]
 )

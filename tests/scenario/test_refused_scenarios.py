@@ -121,6 +121,8 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ),
         # Outputs.
         ("outputs.0.axes=xz", ["outputs: ", "1", "2", "(tool.x, tool.z)"]),
+        ("judgement.tolerances={tool.z: -1}", ["judgement: ", "tool.z", "-1"]),
+        ("judgement.tolerances={tool.q: 1}", ["judgement.tolerances: ", "'tool.q'"]),
         # Gains.
         ("law.gains.all=[1]", ["gains: ", "Hurwitz"]),
         ("law.gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),

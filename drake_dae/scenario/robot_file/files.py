@@ -36,12 +36,8 @@ class RobotFiles:
     """The file of a robot, and those that it names.
 
     A package is a folder above the file that names it, or a folder of its name in one of these,
-    if it has a package.xml with the name; or it is in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH.
-
-    Attributes:
-        main: The file.
-        packages: The packages of Drake's parser; those that are found are added.
-        missing: The packages that are not found.
+    if it has a package.xml with the name; or it is in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH. What
+    is found is added to the `packages` of Drake's parser.
     """
 
     def __init__(self, robot: Robot, packages: PackageMap) -> None:

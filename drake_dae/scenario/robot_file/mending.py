@@ -33,35 +33,38 @@ class Floating(NamedTuple):
     origin: str
 
 
+_ROUND = {"radius": 1, "length": 1}
+
+_SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "capsule": _ROUND}
+_SIZES |= {"ellipsoid": {}, "mesh": {}}
+"""Shape -> how many numbers its sizes have, in URDF and SDFormat."""
+
+_FLAT = 1e-8
+"""A scale of a mesh up to which Drake takes none."""
+
+
 class Mender:
     """Makes mended copies of files. A "model" is the name of a model instance, "" for a lone robot.
 
-    Attributes:
-        told: Category of a warning and its text -> what it concerns.
-        lost: Part of the files that is lost -> where.
-        originals: Copy -> its file.
-        joints: "effort" limit, "armature", "follows" (leader, ratio, offset), position at which it
-            "stands", "parent" of SDFormat -> (model, joint) -> value.
-        floating: The floating joints.
-        crossed: (model, link) of which visual geometry is left out.
+    `folder` is an empty one for the copies, None to make none; `shapes` has "read" if geometry is
+    read, and "drawn" if it is converted to be drawn.
     """
 
     def __init__(
         self, files: RobotFiles, robot: Robot, folder: Path | None, shapes: Collection[str] = ()
     ) -> None:
-        """`folder` is an empty one for the copies, None to make none.
-
-        `shapes` has "read" if geometry is read, and "drawn" if it is converted to be drawn.
-        """
         self.files, self.leave_out, self.folder = files, robot.leave_out, folder
         self.drives = robot.actuators is None  # Else the file's motors do not count.
         self.has_geometry, self.drawn = "read" in shapes, "drawn" in shapes
+        # Category of a warning and its text -> what it concerns; part that is lost -> where.
         self.told: dict[tuple[type[Warning], str], list[str]] = defaultdict(list)
         self.lost: dict[str, list[str]] = defaultdict(list)
-        self.originals: dict[Path, Path] = {}
+        self.originals: dict[Path, Path] = {}  # Copy -> its file.
+        # "effort" limit, "armature", "follows" (leader, ratio, offset), position at which it
+        # "stands", "parent" of SDFormat -> (model, joint) -> value.
         self.joints: dict[str, dict[tuple[str, str], Any]] = defaultdict(dict)
         self.floating: list[Floating] = []
-        self.crossed: set[tuple[str, str]] = set()
+        self.crossed: set[tuple[str, str]] = set()  # (model, link) without a visual shape.
 
     def copy(
         self,
@@ -181,14 +184,9 @@ class Mender:
             if not self.has_geometry:
                 link.remove(shape)
                 continue
-            sizes = [
-                size
-                for form in shape.iterfind("geometry/*")
-                for key in ("size", "radius", "length", "radii")
-                for size in (form.get(key) or form.findtext(key) or "1").split()
-            ]
-            if any((number_in(size) or 0.0) <= 0.0 for size in sizes):
-                self._leave_out("has size 0", f"of '{name}'")
+            faults = (_fault(form, file.suffix) for form in shape.iterfind("geometry/*"))
+            if fault := next(filter(None, faults), ""):
+                self._leave_out(fault, f"of '{name}'")
                 link.remove(shape)
                 continue
             for mesh in shape.iterfind("geometry/mesh"):
@@ -324,14 +322,18 @@ class Mender:
             weighs = moves and number_in(geom.get("mass", "1")) != 0.0
             weighs &= mjcf.weighs_by_geometry(root) or body.find("inertial") is None
             is_seen = self.has_geometry and (self.drawn or mjcf.collides(geom))
-            is_shape = "mesh" not in geom.attrib and geom.get("type", "sphere") != "plane"
-            size = number_in((geom.get("size", "").split() or ["1"])[0])
+            fault = mjcf.fault(geom)
             if mesh in meshes and mesh not in used and (weighs or is_seen):
                 own = meshes[mesh].get("file", "")
                 is_hull = self.has_geometry and mesh in colliding
                 used[mesh] = self._mesh(own, folder / own, is_hull, (".obj",))
                 meshes[mesh].set("file", used[mesh])
             is_refused = mesh in used and not used[mesh]
+            if weighs and fault and (fault == mjcf.UNREAD or "mass" in geom.attrib):
+                raise ModelError(
+                    f"body '{name}' has its mass from geometry that {fault}; give the body an "
+                    "<inertial>"
+                )
             if weighs and (is_refused or mesh in shells):
                 raise ModelError(
                     f"body '{name}' has its mass from the mesh '{mesh}', which Drake cannot read, "
@@ -340,9 +342,9 @@ class Mender:
                 )
             if is_seen and is_refused:
                 self.crossed.add((model, name))
-            elif is_seen and is_shape and size == 0.0:
-                self._leave_out("has size 0", f"of '{name}'")
-            if is_refused or (is_shape and size == 0.0) or not (weighs or is_seen):
+            elif is_seen and fault:
+                self._leave_out(fault, f"of '{name}'")
+            if is_refused or fault or not (weighs or is_seen):
                 body.remove(geom)
         for owner in root.iterfind("asset"):
             for asset in owner.findall("mesh"):
@@ -357,6 +359,22 @@ class Mender:
                 self.lost[mjcf.ARMATURE].append(f"{file.name}: of a joint that no motor can drive")
         for name, joint in mjcf.floating_bodies(root, placed):
             self.floating.append(Floating(model, joint, name, "world"))
+
+
+def _fault(form: Element, kind: str) -> str:
+    """Why Drake takes no such shape of URDF or SDFormat; "" if it does."""
+    sizes = _SIZES.get(form.tag.removeprefix("drake:"))
+    if sizes is None and not (kind == ".sdf" and form.tag in ("plane", "empty")):
+        return mjcf.UNREAD
+    for key in ("size", "radius", "length", "radii", "a", "b", "c", "scale"):
+        words = (form.get(key) or form.findtext(key) or "").split()
+        count = (sizes or {}).get(key, len(words))
+        if len(words) != count and (words or kind == ".urdf"):
+            return mjcf.UNREAD
+        numbers = [number_in(word) or 0.0 for word in words]
+        if any(abs(number) <= _FLAT if key == "scale" else number <= 0.0 for number in numbers):
+            return mjcf.EMPTY
+    return ""
 
 
 @cache

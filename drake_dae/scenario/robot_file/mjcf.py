@@ -15,6 +15,11 @@ ARMATURE = "joint/armature"
 _MOST_INCLUDED = 1000
 """The largest number of files that an MJCF file includes: each may include another one twice."""
 
+EMPTY, UNREAD = "has size 0", "has a shape that Drake does not read"
+
+_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
+"""Type of a geom -> how many sizes it has."""
+
 _TURNS = {"quat", "axisangle", "euler", "xyaxes", "zaxis"}
 
 _ONE_DEFAULT = {
@@ -142,6 +147,20 @@ def weighs_by_geometry(root: Element) -> bool:
 def collides(geom: Element) -> bool:
     """Whether a geometry collides, and is not only drawn."""
     return {geom.get("contype", "1"), geom.get("conaffinity", "1")} != {"0"}
+
+
+def fault(geom: Element) -> str:
+    """Why Drake takes no such shape; "" if it does, or if it is a mesh."""
+    kind = "mesh" if "mesh" in geom.attrib else geom.get("type", "sphere")
+    if kind in ("mesh", "plane"):
+        return ""
+    if kind not in _SIZES:
+        return UNREAD
+    sizes = [number_in(word) or 0.0 for word in geom.get("size", "").split()]
+    ends = geom.get("fromto", "").split()
+    count = 1 if ends else _SIZES[kind]
+    is_empty = len(sizes) < count or min(sizes[:count]) <= 0.0
+    return EMPTY if is_empty or (ends and ends[:3] == ends[3:]) else ""
 
 
 def bodies(owner: Element, moves: bool = False) -> Iterator[tuple[Element, bool]]:

@@ -6,13 +6,14 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 import pytest
+from pydrake.geometry import SceneGraph
 from pydrake.multibody.inverse_kinematics import AddMultibodyPlantConstraints
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import FrameIndex
 from pydrake.solvers import MathematicalProgram
 
-from drake_dae.errors import ModelError
+from drake_dae.errors import GeometryWarning, ModelError
 from drake_dae.scenario.robot_file.read_by_drake import READ_BY_DRAKE
 from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
@@ -334,3 +335,59 @@ def test_changes_of_an_included_model_are_not_lost(tmp_path: Path):
     )
     (tmp_path / "robot.sdf").write_text(merged)
     assert read_robot(Robot(str(tmp_path / "robot.sdf")))[0].HasJointNamed("j")
+
+
+SHAPES = {
+    ".urdf": ("</link>", "<{0}><geometry>{1}</geometry></{0}></link>"),
+    ".sdf": ("</link>", "<{0} name='v'><geometry>{1}</geometry></{0}></link>"),
+}
+FAULTY = {
+    ".urdf": [
+        "<box/>",
+        '<box size="1 1"/>',
+        '<box size="0 1 1"/>',
+        '<capsule radius="1" length="0"/>',
+        '<sphere radius="nan"/>',
+        "<cone/>",
+    ],
+    ".sdf": [
+        "<box><size>1 1</size></box>",
+        "<ellipsoid><radii>1 1 0</radii></ellipsoid>",
+        "<heightmap/>",
+        "<foo/>",
+    ],
+}
+
+
+@pytest.mark.parametrize("tag", ["visual", "collision"])
+@pytest.mark.parametrize(
+    ("kind", "shape"), [(kind, shape) for kind, some in FAULTY.items() for shape in some]
+)
+def test_no_shape_stops_a_robot(kind: str, shape: str, tag: str, tmp_path: Path):
+    old, new = SHAPES[kind]
+    text = WHOLE[kind].replace(old, new.format(tag, shape), 1)
+    (tmp_path / f"robot{kind}").write_text(text)
+    with pytest.warns(GeometryWarning, match="of 'base'|of 'a'"):
+        plant = read_robot(Robot(str(tmp_path / f"robot{kind}")), scene_graph=SceneGraph())[0]
+    assert plant.num_collision_geometries() == 0
+
+
+@pytest.mark.parametrize(
+    "geom",
+    [
+        'type="ellipsoid" size="1 1 0"',
+        'type="cylinder" size="1"',
+        'type="capsule" fromto="0 1 0 0 1 0" size="1"',
+        'type="box" size="1 -1 1"',
+        'size="nan"',
+        'type="hfield" hfield="h"',
+    ],
+)
+def test_no_geom_of_mjcf_stops_a_robot_and_none_with_a_mass_is_lost(geom: str, tmp_path: Path):
+    file = tmp_path / "robot.xml"
+    file.write_text(MJCF.replace("<worldbody>", f"<worldbody><geom {geom}/>", 1))
+    with pytest.warns(GeometryWarning, match="of ''"):
+        read_robot(Robot(str(file)), scene_graph=SceneGraph())
+    file.write_text(MJCF.replace("</body>", f'<geom {geom} mass="2"/></body>', 1))
+    with pytest.raises(ModelError, match=r"'d'.* mass"):
+        read_robot(Robot(str(file)), scene_graph=SceneGraph())

@@ -56,30 +56,6 @@ def cart_pendulum(damping: float = 0.0, angle: float = 0.0) -> DaeSystem:
     )
 
 
-def aircraft(epsilon: float = 0.25) -> DaeSystem:
-    """Vertical take-off (Hauser, Sastry and Meyer, 1992), z = (x, y):
-
-    x'' = -sin(a) u1 + eps cos(a) u2, y'' = cos(a) u1 + eps sin(a) u2 - 1, a'' = u2. At a fixed
-    position u1 = cos a, u2 = sin(a)/eps: eps a'' = sin a.
-    """
-    return DaeSystem.from_functions(
-        ["x", "y", "a", "x'", "y'", "a'"],
-        f=lambda x, p: [x[3], x[4], x[5], 0, -1, 0],
-        h=lambda x, p: [
-            [0, 0],
-            [0, 0],
-            [0, 0],
-            [-ca.sin(x[2]), p.epsilon * ca.cos(x[2])],
-            [ca.cos(x[2]), p.epsilon * ca.sin(x[2])],
-            [0, 1],
-        ],
-        l=lambda x, p: [x[0], x[1]],
-        parameters={"epsilon": epsilon},
-        output_signals=["x", "y"],
-        name="aircraft",
-    )
-
-
 TANK_AREAS, HOLES = np.array([28.0, 32.0, 28.0, 32.0]), np.array([0.071, 0.057, 0.071, 0.057])
 
 

@@ -310,16 +310,3 @@ def test_a_system_that_cannot_be_traced_is_named():
     builder.ExportOutput(system.get_output_port(0), "out")
     with pytest.raises(ModelError, match="'my block'"):
         RolloutProgram(builder.Build())
-
-
-def test_an_input_without_connection_or_value_is_named():
-    builder = DiagramBuilder()
-    gain = builder.AddNamedSystem("my gain", Gain(0.5, 2))
-    builder.ExportInput(gain.get_input_port(), "in")
-    builder.ExportOutput(gain.get_output_port(), "out")
-    diagram = builder.Build()
-    program, context = RolloutProgram(diagram), diagram.CreateDefaultContext()
-    with pytest.raises(ModelError, match="'u0' of 'my gain'"):
-        program.values_in(context)
-    diagram.get_input_port().FixValue(context, [1.0, -2.0])
-    np.testing.assert_array_equal(program.values_in(context)[2], [1.0, -2.0])

@@ -200,13 +200,6 @@ def test_friction_stands_still_where_the_contact_is_taken_for_lost():
     assert np.abs(record["disturbance"][-1]).max() > 0.5
 
 
-def test_handing_over_to_friction_moves_nothing():
-    """r + c mu is the same for each k_f except the friction force, which grows with lambda."""
-    wanted = [SinusoidReference(0.3, 0.1, 2.0), ConstantReference(20.0)]
-    ends = [slide(wanted, 0.15, Observing(20.0, rate))[1]["control"][-1] for rate in (1e-6, 8.0)]
-    assert_allclose(*ends, atol=0.2)
-
-
 def test_wanted_velocities_are_those_of_the_reference_on_the_constraints():
     """v of P v = r' + t r'', J v = 0, with P and J of the tool by MultibodyPlant; t = 20 ms."""
     _, dae = frictional(0.3)
@@ -335,18 +328,6 @@ def test_what_pulls_across_the_sliding_is_no_friction(count):
         assert_allclose(evaluated(shares, *given, d), wanted[0], rtol=1e-8)
         assert_allclose(evaluated(shares, *given, 0.3 * friction), 0.3, rtol=1e-8)
         assert_allclose(evaluated(shares, *given, columns[-1]), 2.0 - count, atol=1e-8)
-
-
-def test_law_cancels_a_disturbance_that_acts_as_a_known_torque():
-    """A torque d at the joints is cancelled by -d of the motors, whatever the state."""
-    _, dae = frictional(0.3)
-    law = TrackingLaw(dae, poles(-4.0))
-    state = law.structure.states[0]
-    reference = np.linspace(0.2, 0.7, law.layout.reference_size)
-    values = dae.parameter_values
-    values[dae.parameter_slice("disturbance")] = [1.5, -0.7]
-    change = law.control(state, reference, parameters=values) - law.control(state, reference)
-    assert_allclose(change, [-1.5, 0.7], rtol=1e-10)
 
 
 @pytest.mark.slow

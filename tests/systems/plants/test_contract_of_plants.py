@@ -38,9 +38,6 @@ from drake_dae.studies.runs import Outcome
 from drake_dae.systems import PointMaterial
 from drake_dae.systems.plants.contract import Plant
 
-FINE = 1e-10
-"""Round-off of a few hundred operations on forces of some 10 N."""
-
 
 def contact():
     found = arm("two_link")
