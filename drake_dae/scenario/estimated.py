@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_dae.robots import JointFriction, PointOnSurface, RobotModel, velocities_are_rates
+from drake_dae.robots import JointFriction, Plane, PointOnSurface, RobotModel, velocities_are_rates
 from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario
 
@@ -15,6 +15,9 @@ _LOAD, _TILT, _COULOMB, _VISCOUS = 0.2, 0.15, 0.1, 0.25
 """The largest load relative to the robot's mass, the largest tilt in rad, and the largest friction
 of a joint in N m, and in N m per rad/s, relative to its largest effort."""
 
+_PLACE = 0.01
+"""The largest displacement of a plane in m."""
+
 _EFFORT = 100.0
 """The largest effort in N m of drives without limits in the file."""
 
@@ -24,7 +27,10 @@ def estimates_all(scenario: Scenario, model: RobotModel) -> bool:
     estimator, material = scenario.estimator, scenario.plant.material
     if estimator is None or estimator.parameters is not None or material is None:
         return False
-    return not (model.stages or scenario.exogenous) and velocities_are_rates(model.links)
+    surfaces = [c.surface for c in scenario.constraints if isinstance(c, PointOnSurface)]
+    is_plain = all(isinstance(surface, Plane) for surface in surfaces)  # On a sphere it got worse.
+    is_rigid = not model.stages and velocities_are_rates(model.links)
+    return is_plain and is_rigid and not scenario.exogenous
 
 
 def with_friction_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
@@ -35,7 +41,7 @@ def with_friction_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
 
 
 def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
-    """The scenario of a law whose estimator knows loads, tilts of surfaces, and friction.
+    """The scenario of a law whose estimator knows loads, places of planes, and friction.
 
     A load is on each frame in contact, which may be at any place; the friction is that of contacts,
     and Coulomb and viscous friction of all driven joints. Their bounds, from which their estimation
@@ -55,6 +61,7 @@ def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
             if scenario.compliances is None:  # Surfaces of redundant constraints are not estimated.
                 constraint = replace(constraint, rpy=constraint.rpy or (0.0, 0.0, 0.0))
                 ranges[f"{constraint.name}.rpy"] = _TILT
+                ranges[f"{constraint.name}.position"] = _PLACE
             if constraint.frame not in loads:
                 name = constraint.frame.replace("::", "_") + "_load"
                 loads[constraint.frame] = Payload(constraint.frame, LEAST_MASS, name=name)

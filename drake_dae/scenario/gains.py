@@ -25,6 +25,7 @@ from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, velocities_are_rates
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
+from drake_dae.scenario.estimated import estimates_all
 from drake_dae.scenario.form import at
 from drake_dae.scenario.model import references_of
 from drake_dae.scenario.parts import ScenarioTask
@@ -140,6 +141,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             else list(dict.fromkeys([*frictional, *estimator.parameters])),
             state_rate=None if fast is None else _rounded(fast),
         )
+    if not estimates_all(replace(scenario, estimator=estimator), model):
+        named = frictional if estimator.parameters is None else estimator.parameters
+        estimator = replace(estimator, parameters=named)
     task = scenario.task
     if task is not None and task.gains is None:
         task = replace(task, gains=_free_gains(scenario, model, contact))

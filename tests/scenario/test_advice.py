@@ -67,7 +67,7 @@ def test_an_estimator_estimates_what_it_can_unless_parameters_are_named():
             signal.name for signal in loop.observer.further_signals.get("identified", ())
         }
     joints = {f"joint{i}.{kind}" for i in (1, 2) for kind in ("coulomb", "viscous")}
-    tilts = {f"wall.rpy[{i}]" for i in range(3)}
+    tilts = {f"wall.{key}[{i}]" for key in ("rpy", "position") for i in range(3)}
     assert named == {
         (): {*joints, *tilts, "tool_load.mass", "wall.friction"},
         ("estimator.parameters=[]",): set(),
