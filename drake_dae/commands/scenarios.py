@@ -67,6 +67,8 @@ def _new(options: argparse.Namespace) -> int:
     """
     out = options.out or Path(f"{Path(options.robot).name.split('.')[0]}_{options.surface}.yaml")
     check_unwritten([out], options.force)
+    if out.exists() and Path(options.robot).exists() and out.samefile(options.robot):
+        raise ModelError(f"'{out}' is the robot's own file; name another file for the scenario")
     # The simulation reports what it leaves out, and Drake's parser warns of every tag.
     logging.getLogger("drake").setLevel(logging.ERROR)
     began, used = time.perf_counter(), time.process_time()

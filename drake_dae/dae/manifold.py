@@ -118,7 +118,7 @@ class Manifold:
             solved = normal.solve(self.residual_expression / sizes)
             step = regular - ca.mtimes(scaled.T, solved)
         inputs = {"other": other}
-        return self.system.trace("step to the manifold", {"step": step}, inputs, often=False)
+        return self.system.trace("step to the manifold", {"step": step}, inputs)
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
     def _relative_size(self, state: FloatArray, parameters: FloatArray) -> float:
@@ -176,14 +176,19 @@ class Manifold:
         length = norm(step)
         if length <= ROUNDING and (length > 0.0 or not self.residual(start, p).any()):
             return start
-        moved = start + scale * step
+        moved, unit = start + scale * step, np.maximum(scale, np.abs(start))
+        size = norm(scale * step / unit)
         step = step_from(moved, start, p)[0]
-        left = norm(step)
-        if left * left <= PRECISION * length:  # The test of `newton`, without its overhead.
-            while ROUNDING < left < 0.5 * length:
-                moved, length = moved + scale * step, left
+        left = norm(scale * step / unit)
+        if left * left <= PRECISION * size:  # The test of `newton`, without its overhead.
+            length = norm(step)
+            while length > 0.0:
+                moved = moved + scale * step
                 step = step_from(moved, start, p)[0]
-                left = norm(step)
+                following = norm(step)
+                if not following < 0.5 * length:
+                    break
+                length = following
             return moved
 
         def linearize(z: FloatArray) -> NewtonModel:
@@ -195,7 +200,7 @@ class Manifold:
         if not converged:
             # Gradients are dependent or steps diverge: least squares with decreasing residual.
             z, converged = newton(first, lambda z: self._downhill(scale * z, p))
-        found: FloatArray = start + scale * (z - first)
+        found: FloatArray = scale * z
         # Otherwise the residual is round-off in coarse units, or no state changes it.
         if not converged and not self._relative_size(found, p) <= CONSISTENT:
             residual = self.residual(found, p)

@@ -71,8 +71,7 @@ class KnownForce(Load):
         return (Parameter(f"{self.name}.force", np.zeros(3), "N"),)
 
     def reaction(self, kinematics: Kinematics) -> Reaction:
-        velocity = kinematics.velocity(self.frame, self.point)
-        return kinematics.reaction(ca.dot(self.parameters[0].symbol, velocity))
+        return kinematics.push(self.frame, self.parameters[0].symbol, self.point)
 
 
 @checked(ModelError)
@@ -88,10 +87,8 @@ class KnownWrench(KnownForce):
         return force, Parameter(f"{self.name}.moment", np.zeros(3), "N m")
 
     def reaction(self, kinematics: Kinematics) -> Reaction:
-        force, moment = (parameter.symbol for parameter in self.parameters)
-        velocity = kinematics.velocity(self.frame, self.point)
-        turning = kinematics.angular_velocity(self.frame)
-        return kinematics.reaction(ca.dot(force, velocity) + ca.dot(moment, turning))
+        moment, spin = self.parameters[1].symbol, kinematics.angular_velocity(self.frame)
+        return super().reaction(kinematics) + kinematics.reaction(ca.dot(moment, spin))
 
 
 @dataclass(frozen=True)
@@ -108,8 +105,7 @@ class ScaledForce(KnownForce):
 
     def reaction(self, kinematics: Kinematics) -> Reaction:
         force, course = (parameter.symbol for parameter in self.parameters)
-        velocity = kinematics.velocity(self.frame, self.point)
-        return kinematics.reaction(course * ca.dot(force, velocity))
+        return kinematics.push(self.frame, course * force, self.point)
 
 
 @checked(ModelError)

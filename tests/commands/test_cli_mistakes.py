@@ -27,6 +27,14 @@ def test_files_of_others_are_never_overwritten(name, tmp_path, capsys):
     assert (tmp_path / name).read_text() == "mine"
 
 
+def test_a_robot_is_not_replaced_by_its_scenario(tmp_path, capsys):
+    robot = tmp_path / "arm.urdf"
+    robot.write_text("<robot/>")
+    assert main(["new", str(robot), "--out", str(robot), "--force"]) == 1
+    assert "arm.urdf" in error_line(capsys)
+    assert robot.read_text() == "<robot/>"
+
+
 @pytest.mark.parametrize(
     "words",
     [

@@ -30,7 +30,7 @@ from referee.reference import MOTIONS, STATES, lines_of, load
 from referee.vectors import add, apply, dot, exact, scaled, sub, transposed
 from runs import some
 
-WIDE = ("stewart", "delta", "two_arms", "grasp", "humanoid")
+WIDE = ("stewart", "delta", "two_arms", "humanoid")
 """Those that take more than half a second to build."""
 
 MOVING = [name for name, mechanism in MECHANISMS.items() if mechanism.duration]

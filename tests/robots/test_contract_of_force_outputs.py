@@ -82,6 +82,29 @@ def test_rows_of_names_and_combinations_are_their_weights():
     np.testing.assert_array_equal(rows(MEMBERS["name"], q), np.eye(bound().size)[[5]])
 
 
+@pytest.mark.parametrize("name", ["squeeze", "squeeze of the fingers"])
+def test_a_squeeze_is_half_the_force_toward_the_other_contact(name):
+    """e_ij / 2 of what acts on the frame at i and the opposite at j, places by Drake."""
+    output, plant = MEMBERS[name], robot().links.plant
+    q = np.random.default_rng(1).uniform(-0.5, 0.5, robot().links.q.numel())
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, q)
+    places, signs, columns = [], [], []
+    for constraint, part in bound().parts():
+        if constraint.name in (output.first, output.second):
+            model, _, own = constraint.frame_b.rpartition("::")
+            instance = [plant.GetModelInstanceByName(model)] if model else []
+            frame = plant.GetFrameByName(own, *instance)
+            places.append(frame.CalcPoseInWorld(context) @ np.array(constraint.point_b))
+            signs.append(1.0 if constraint.frame_b == output.frame else -1.0)
+            columns.append(part)
+    along = (places[1] - places[0]) / np.linalg.norm(places[1] - places[0])
+    expected = np.zeros((1, bound().size))
+    expected[0, columns[0]] = signs[0] * along / 2.0
+    expected[0, columns[1]] = -signs[1] * along / 2.0
+    np.testing.assert_allclose(rows(output, q), expected, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("output", "message"),
     [

@@ -1,6 +1,7 @@
 """What a scenario refuses: the key, the value and what would be right, all problems at once."""
 
 import pytest
+from runs import scenario
 from scenario_texts import two_link
 
 from drake_dae import build_scenario, load_scenario
@@ -201,3 +202,25 @@ def test_a_file_that_is_not_there(tmp_path):
         find_scenario(str(tmp_path))
     with pytest.raises(ScenarioError, match=r"gone\.yaml"):
         load_scenario(tmp_path / "gone.yaml")
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "words"),
+    [
+        (
+            "two_link_wall",  # A stretched arm that touches the wall.
+            "start={positions: {joint1: 0.927295218, joint2: 0}}",
+            ["outputs: Assumption (4)", "start.positions"],
+        ),
+        (
+            "seven_joint_wall",
+            "start={positions: {joint1: 0}}",
+            ["outputs: Assumption (5)", "start.positions"],
+        ),
+    ],
+)
+def test_a_robot_that_cannot_start_is_sent_to_its_keys(name, setting, words):
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(scenario(name, setting))
+    message = str(caught.value)
+    assert [word for word in words if word not in message] == [], message

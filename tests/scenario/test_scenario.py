@@ -4,6 +4,8 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 from scenario_texts import lever, run, two_link
 from two_arms import GRASP
@@ -33,8 +35,9 @@ from drake_dae import (
     Torus,
     build_scenario,
     load_scenario,
+    shipped_model,
 )
-from drake_dae.errors import ScenarioError
+from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.robots import Blade, RollingBall
 from drake_dae.scenario import parts as forms
 from drake_dae.scenario.robot_file.robot import Pose, Robot
@@ -204,3 +207,43 @@ def test_weld():
         ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
     )
     assert plain.constraints[0] == forms.WeldedFramesForm("left::tool", "right::tool", Pose())
+
+
+TILTED = (
+    "constraints=[{name: wall, frame: tool, surface: !ImplicitSurface "
+    "{function: 'a * (1.2 - x) + (1 - a) * y', parameters: {a: 1.0}}}]"
+)
+
+
+def test_bounds_of_parameters_are_those_at_which_the_structure_is_looked_at():
+    """At a = 0 the wall is y = 0, along which the whole arm moves: A(x) is zero."""
+    loop, _ = build_scenario(two_link(TILTED, "bounds={wall.a: [0.5, 2]}"))
+    for system in (loop.plant.dae, loop.controller.law.system):
+        assert {p.name: p.bounds for p in system.parameters if p.bounds} == {"wall.a": (0.5, 2.0)}
+    with pytest.raises(ScenarioError, match=r"A\(x\).*'wall\.a'"):
+        build_scenario(two_link(TILTED, "bounds={wall.a: [0, 2]}"))
+
+
+@pytest.mark.parametrize(
+    ("bounds", "words"),
+    [
+        ("{link2.mass: [12, 6]}", r"bounds: .*'link2\.mass'"),
+        ("{link2.mass: [8, 9]}", r"bounds: .*'link2\.mass'"),
+        ("{link2.mas: [6, 9]}", r"bounds: .*'link2\.mas'"),
+        ("{link2.mass: [6]}", r"bounds\.link2\.mass: .*\[6\]"),
+    ],
+)
+def test_bounds_that_make_no_sense_are_refused(bounds, words):
+    with pytest.raises(ScenarioError, match=words):
+        build_scenario(two_link(f"bounds={bounds}"))
+
+
+def test_a_model_is_found_by_its_name():
+    plant = MultibodyPlant(0.0)
+    (arm,) = Parser(plant).AddModels(str(shipped_model("two_link_arm.urdf")))
+    assert plant.GetModelInstanceName(arm) == "two_link_arm"
+
+
+def test_a_name_that_is_none_is_reported_with_those_that_are():
+    with pytest.raises(ModelError, match=r"two_link_arm\.urdf"):
+        shipped_model("two_link_arm")

@@ -88,29 +88,21 @@ class FlexibleJoints(Stage):
         q_2, rate = ca.SX.sym("q2", p), ca.SX.sym("q2'", p)
         drag = ca.SX(p, 1)
         if self.friction is not None:
-            given = np.asarray(self.friction, dtype=float)
-            if given.shape not in ((), (p,)) or not np.all(given >= 0):
-                raise ModelError(
-                    f"flexible_joints.friction must be 0 or more, a number or shape ({p},), got "
-                    f"{self.friction!r}"
-                )
-            coefficients = Parameter(
-                "flexible_joints.friction",
-                np.broadcast_to(given, (p,)).copy(),
-                "N m" if rotary else "",
-                nonnegative=True,
-            )
+            unit = "N m" if rotary else ""
+            name = "flexible_joints.friction"
+            coefficients, F_c = diagonal_parameter(name, self.friction, p, unit, nonnegative=True)
             slow = np.array([self.stiction_tolerance])
             creep = Parameter("flexible_joints.stiction_tolerance", slow, positive=True)
             parameters += [coefficients, creep]
-            drag = coefficients.symbol * rate / ca.sqrt(rate**2 + creep.symbol**2)
+            drag = F_c * rate / ca.sqrt(rate**2 + creep.symbol**2)
 
         def force(position: ca.SX, velocity: ca.SX) -> ca.SX:
             return ca.mtimes(k, q_2 - position) + ca.mtimes(d, rate - velocity)  # (64)
 
-        kinds = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
-        positions = [Signal(f"{n}.position", unit) for n, unit in zip(names, kinds, strict=True)]
-        rates = [Signal(f"{n}.velocity", f"{unit}/s") for n, unit in zip(names, kinds, strict=True)]
+        units_of = ["m" if signal.unit == "N" else "rad" for signal in links.actuator_signals]
+        kinds = list(zip(names, units_of, strict=True))
+        positions = [Signal(f"{name}.position", unit) for name, unit in kinds]
+        rates = [Signal(f"{name}.velocity", f"{unit}/s") for name, unit in kinds]
         return AttachedStage(
             state=ca.vertcat(q_2, rate),
             state_signals=(*positions, *rates),

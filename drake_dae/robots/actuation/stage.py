@@ -156,7 +156,12 @@ def full_matrix(name: str, value: ArrayLike, size: int) -> FloatArray:
 
 
 def diagonal_parameter(
-    name: str, value: ArrayLike, size: int, unit: str, positive: bool = False
+    name: str,
+    value: ArrayLike,
+    size: int,
+    unit: str,
+    positive: bool = False,
+    nonnegative: bool = False,
 ) -> tuple[Parameter, ca.SX]:
     """A parameter of one number per actuator, and its symbol, shape (size, 1)."""
     array = numbers(name, value)
@@ -164,7 +169,7 @@ def diagonal_parameter(
         array = np.full(size, float(array))
     if array.shape != (size,) or not np.all(np.isfinite(array)):
         raise ModelError(f"{name} must be a finite number or shape ({size},), got {value!r}")
-    parameter = Parameter(name, array, unit, positive)
+    parameter = Parameter(name, array, unit, positive, nonnegative=nonnegative)
     return parameter, parameter.symbol
 
 

@@ -61,8 +61,7 @@ class Constraint(ABC):
        the frames are not known. Pictures show the first. If the constraint holds and does not move,
        their power is zero where `is_ideal`, and not positive otherwise.
     6. `coordinates` are free coordinates along it, one row for each of `coordinate_signals`, if
-       any, and `coordinate_rate` their rate where it holds. A `joint` is that of a closed loop: its
-       power is force times rate.
+       any. A `joint` is that of a closed loop: its power is force times the rate of its coordinate.
     7. With friction, `friction_parameter` names the coefficient, and `sliding` is the velocity
        relative to the other object.
     8. `touch` is the contact point, if there is a free side; `residual` is its clearance.
@@ -148,10 +147,6 @@ class Constraint(ABC):
         raise ModelError(
             f"'{self.name}' has no coordinates along it; use PointCoordinates or an expression"
         )
-
-    def coordinate_rate(self, kinematics: Kinematics) -> ca.SX:
-        """The rates of the coordinates, shape (k, 1)."""
-        return kinematics.derivative(self.coordinates(kinematics))
 
     @property
     def joint(self) -> Joint | None:

@@ -189,7 +189,7 @@ class LoopState:
         members, kinematics = constraints.joints, links.kinematics()
         joints = [joint for _, joint in members]
         coordinates = [c.coordinates(kinematics) for c, _ in members]
-        rates = [c.coordinate_rate(kinematics) for c, _ in members]
+        rates = [kinematics.derivative(c) for c in coordinates]
         position = kinematics.value(ca.vertcat(ca.SX(0, 1), *coordinates))
         rate = kinematics.value(ca.vertcat(ca.SX(0, 1), *rates))
         self.state = ca.vertcat(position, rate)

@@ -236,11 +236,6 @@ class RevoluteLoopJoint(LoopJoint):
         s, k = np.sin(self._middle), np.cos(self._middle)
         return self._middle + ca.atan2(sine * k - cosine * s, cosine * k + sine * s)
 
-    def coordinate_rate(self, kinematics: Kinematics) -> ca.SX:
-        along = self._base(kinematics)[0][:, self._own]
-        spins = [kinematics.angular_velocity(frame) for frame in (self.frame_a, self.frame_b)]
-        return ca.dot(along, spins[1] - spins[0])
-
 
 @checked(ModelError)
 @dataclass(frozen=True)
@@ -286,14 +281,6 @@ class PrismaticLoopJoint(LoopJoint):
 
     def coordinates(self, frames: Frames) -> ca.SX:
         return self._relative(frames)[1][self._own]
-
-    def coordinate_rate(self, kinematics: Kinematics) -> ca.SX:
-        R_WF, origin = self._base(kinematics)
-        apart = kinematics.position(self.frame_b, self.point_b) - origin
-        carried = kinematics.velocity(self.frame_a, self.point_a)
-        carried = carried + ca.cross(kinematics.angular_velocity(self.frame_a), apart)
-        moving = kinematics.velocity(self.frame_b, self.point_b)
-        return ca.dot(R_WF[:, self._own], moving - carried)
 
 
 def _rotation(rpy: Vector) -> ca.SX:

@@ -59,21 +59,6 @@ FOUR_BAR = Mechanism(
     duration=0.5,
 )
 
-SLIDER_CRANK = Mechanism(
-    "slider_crank",
-    (
-        rod("crank", 0.1, 0.6),
-        rod("rod", 0.3, 0.9, parent="crank", at=(0.1, 0.0, 0.0)),
-        Body("slider", (("slide", (1.0, 0.0, 0.0)),), mass=1.5),
-    ),
-    (pin("gudgeon", "slider", (0.0, 0.0), "rod", (0.3, 0.0)),),
-    q=(0.7, -0.9, 0.37),
-    v={0: 12.0},
-    free=(0,),
-    gravity=DOWN,
-    torques={0: 0.3, 2: -4.0},
-    duration=0.2,
-)
 
 PARALLEL_BARS = Mechanism(
     "parallel_bars",
@@ -138,39 +123,6 @@ SQUEEZER = Mechanism(
     duration=0.01,
 )  # fmt: skip
 
-LINKS = 12
-
-CHAIN = Mechanism(
-    "hanging_chain",
-    tuple(
-        rod(f"link{i}", 0.25, 0.4 + 0.1 * (i % 3),
-            **({"parent": f"link{i - 1}", "at": (0.25, 0.0, 0.0)} if i else {}))
-        for i in range(LINKS)
-    ),
-    (pin("end", "world", (2.0, 0.3), f"link{LINKS - 1}", (0.25, 0.0)),),
-    q=(-1.4, 0.24, 0.28, 0.25, 0.27, 0.26, 0.25, 0.27, 0.24, 0.28, 0.27, 0.27),
-    v={1: 0.5, 3: -1.0, 7: 0.8},
-    free=(1, 2, 3, 4, 5, 7, 8, 9, 10, 11),
-    gravity=DOWN,
-)  # fmt: skip
-
-SLIDING_ARM = Mechanism(
-    "sliding_arm",
-    (
-        rod("upper", 0.5, 2.0),
-        rod("lower", 0.4, 1.5, parent="upper", at=(0.5, 0.0, 0.0)),
-    ),
-    (
-        Closure("wall", "plane", "world", (0.7, 0.0, 0.0), "lower", (0.4, 0.0, 0.0),
-                direction=(-1.0, 0.0, 0.0), friction=0.3),
-    ),
-    q=(0.5, -1.2),
-    v={0: 0.8},
-    free=(0,),
-    gravity=DOWN,
-    torques={0: 9.0, 1: 6.0},
-    duration=0.04,
-)  # fmt: skip
 
 SLIDING_ROD = Mechanism(
     "sliding_rod",
@@ -217,11 +169,8 @@ PLANAR_MECHANISMS = (
     PENDULUM,
     TWO_RODS,
     FOUR_BAR,
-    SLIDER_CRANK,
     PARALLEL_BARS,
     SQUEEZER,
-    CHAIN,
-    SLIDING_ARM,
     SLIDING_ROD,
     CAR_AXIS,
 )

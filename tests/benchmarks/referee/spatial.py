@@ -179,37 +179,6 @@ TWO_ARMS = Mechanism(
     torques={1: -20.0, 2: -8.0, 8: 15.0, 9: 6.0, 4: 1.0},
 )  # fmt: skip
 
-FINGER_BASES = ((-0.35, 0.0, 0.0), (0.35, 0.06, 0.0), (0.35, -0.06, 0.0))
-FINGER_TIPS = ((-0.05, 0.0, 0.01), (0.05, 0.04, 0.0), (0.05, -0.04, -0.01))
-
-
-def finger(i: int) -> list[Body]:
-    """Three joints; at zero the finger reaches along x."""
-    found, parent, at = [], "world", FINGER_BASES[i]
-    for k, (axis, length, mass) in enumerate(((Z, 0.05, 0.2), (Y, 0.2, 0.15), (Y, 0.18, 0.1))):
-        about = round(mass * length**2 / 12, 8)
-        found.append(Body(f"finger{i}{k}", (("turn", axis),), parent, at, mass,
-                          (length / 2, 0.0, 0.0), (0.00002, about, about)))  # fmt: skip
-        parent, at = f"finger{i}{k}", (length, 0.0, 0.0)
-    return found
-
-
-GRASP = Mechanism(
-    "grasp",
-    (
-        Body("box", FREE, mass=0.5, inertia=(0.0006, 0.0007, 0.0008)),
-        *(body for i in range(3) for body in finger(i)),
-    ),
-    tuple(
-        Closure(f"tip{i}", "point", f"finger{i}2", (0.18, 0.0, 0.0), "box", FINGER_TIPS[i])
-        for i in range(3)
-    ),
-    q=(0.01, 0.005, 0.02, 0.1, -0.05, 0.08, 0.0, -0.6, 1.3, 3.1, -0.6, 1.3, 3.1, -0.6, 1.3),
-    v={0: 0.1, 1: -0.05, 2: 0.2, 3: 0.4, 4: -0.3, 5: 0.2},
-    free=(0, 1, 2, 3, 4, 5),
-    torques={7: 0.9, 8: -0.7, 10: 1.1, 11: -0.9, 13: 1.0, 14: -0.8},
-)
-
 
 def biped_leg(side: str, y: float) -> list[Body]:
     """Hip about z, x and y, knee about y, ankle about y and x; the foot is the last body."""
@@ -296,7 +265,6 @@ SPATIAL_MECHANISMS = (
     STEWART,
     DELTA,
     TWO_ARMS,
-    GRASP,
     HUMANOID,
     TABLE,
     ROLLING_BALL,

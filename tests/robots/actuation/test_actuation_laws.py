@@ -1,13 +1,12 @@
 """The laws behind actuation stages: the paper's own formulas, and errors known in advance."""
 
-from itertools import product
 from math import comb
 
 import numpy as np
 import pytest
 from actuated import (
-    ARMS,
     DEGREES,
+    EACH,
     MOSTLY_TWO_LINK,
     actuated,
     at_rest,
@@ -134,8 +133,10 @@ def explicit_actuator(name, kind, x, reference, gains, force_gains):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("full", [False, True], ids=["poles", "Lambda"])
-@pytest.mark.parametrize("kind", ["flexible", "motor", "hydraulic"])
+@pytest.mark.parametrize(
+    ("kind", "full"),
+    [("flexible", True), ("motor", False), ("motor", True), ("hydraulic", True)],
+)
 @pytest.mark.parametrize("name", MOSTLY_TWO_LINK)
 @pytest.mark.equation(39, 64, 65, 66, 67, 68, 69, 70, 74, 75, 76, 77, 78, 79, 80)
 def test_law_is_the_explicit_law(name, kind, full):
@@ -209,17 +210,8 @@ def track(name, kind, step, duration):
     return relative, record
 
 
-DEAR = [("seven_joint", kind) for kind in DEGREES if kind not in ("flexible", "flexible motor")]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        pytest.param(*case, marks=[pytest.mark.thorough] * (case in DEAR))
-        for case in product(ARMS, DEGREES)
-    ],
-)
+@pytest.mark.parametrize(("name", "kind"), EACH)
 @pytest.mark.equation(72, 73, 82, 83)
 def test_errors_are_their_closed_forms(name, kind):
     """(72)-(73), (82)-(83) and their kin at 1 ms, relative to the errors at the start.

@@ -39,8 +39,6 @@ SLIDES = {2, 6}
 """Joints that slide; the others turn."""
 DRIVEN = {3, 6}
 DAMPING = np.array([0.2, 0.3, 0.4, 0.25, 0.15, 0.35, 0.5, 0.1])
-LIMITS = -0.01, 0.02
-"""Of joint 3, where it has limits: it leaves them."""
 SPRING = {2: (30.0, 0.05), 3: (2.0, -0.3)}
 """Stiffness, and where it is slack, by joint."""
 
@@ -59,7 +57,7 @@ PLACES = list(places())
 
 
 @cache
-def ring(cut: int, limited: bool = False) -> RobotModel:
+def ring(cut: int) -> RobotModel:
     """The ring as a tree with its joint number `cut` as the constraint.
 
     Link i lies between joints i - 1 and i; links 0 and 8 are the ground. At the coordinates 0 all
@@ -84,8 +82,7 @@ def ring(cut: int, limited: bool = False) -> RobotModel:
             for side, frame in enumerate(frames[i : i + 2][:: 1 if forward else -1])
         )
         axis = np.array([0.0, 0.0, 1.0 if forward else -1.0])
-        bounds = LIMITS if limited and i == 3 else (-np.inf, np.inf)
-        joint = plant.AddJoint(kind(f"joint{i}", parent, child, axis, *bounds, damping=DAMPING[i]))
+        joint = plant.AddJoint(kind(f"joint{i}", parent, child, axis, damping=DAMPING[i]))
         if i in SPRING:
             stiffness, rest = SPRING[i]
             spring = PrismaticSpring if i in SLIDES else RevoluteSpring
@@ -104,7 +101,6 @@ def ring(cut: int, limited: bool = False) -> RobotModel:
     where = {"point_a": tuple(place), "rpy_a": tuple(rpy), "point_b": tuple(place)}
     names = ["world", *(f"link{i}" for i in range(1, COUNT)), "world"]
     stiffness, rest = SPRING.get(cut, (0.0, 0.0))
-    limits = dict(zip(("lower", "upper"), LIMITS, strict=True)) if limited and cut == 3 else {}
     motor = {"motor": True, "effort_limit": 40.0} if cut in DRIVEN else {}
     loop = kind(
         names[cut],
@@ -114,7 +110,6 @@ def ring(cut: int, limited: bool = False) -> RobotModel:
         damping=float(DAMPING[cut]),
         stiffness=stiffness,
         rest=rest,
-        **limits,
         **motor,
     )
     outputs = ["joint1", "joint5"]

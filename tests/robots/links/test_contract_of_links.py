@@ -35,13 +35,19 @@ def turned(angle):
     return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
 
 
+def tilted(angle):
+    c, s = ca.cos(angle), ca.sin(angle)
+    return ca.vertcat(ca.horzcat(1, 0, 0), ca.horzcat(0, c, -s), ca.horzcat(0, s, c))
+
+
 def textbook_arm():
+    """The tool turns about the second link, so that its angular velocity has all components."""
     q, v = ca.SX.sym("q", 2), ca.SX.sym("v", 2)
     c, s = ca.cos(q[1]), ca.sin(q[1])
     mass = ca.vertcat(ca.horzcat(12 + 6 * c, 2 + 3 * c), ca.horzcat(2 + 3 * c, 2))
     bias = ca.vertcat(-3 * s * (2 * v[0] * v[1] + v[1] ** 2), 3 * s * v[0] ** 2)
     far = ca.vertcat(ca.cos(q[0]) + ca.cos(q[0] + q[1]), ca.sin(q[0]) + ca.sin(q[0] + q[1]), 0)
-    return LinkExpressions(q, v, mass, bias, frames={"tool": (turned(q[0] + q[1]), far)})
+    return LinkExpressions(q, v, mass, bias, frames={"tool": (turned(q[0]) @ tilted(q[1]), far)})
 
 
 def sled():

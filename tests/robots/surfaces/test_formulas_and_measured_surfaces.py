@@ -36,13 +36,6 @@ def derivatives(surface, order):
             lambda p: (1.44 - p[0] ** 2) / (2 * abs(p[0])),
             [(1.2, 0, 0), (-1.2, 0, 0)],
         ),
-        ("exp(-y) - 0.5", lambda p: 1 - 0.5 * np.exp(p[1]), [(0, np.log(2), 0)]),
-        ("z**3 - 8", lambda p: (p[2] ** 3 - 8) / (3 * p[2] ** 2), [(0, 0, 2)]),
-        (
-            "sin(3*x)",
-            lambda p: np.sin(3 * p[0]) / abs(3 * np.cos(3 * p[0])),
-            [(0, 0, 0), (np.pi / 3, 0, 0)],
-        ),
         (
             "(x + 2*y)**2 - 1",
             lambda p: ((p[0] + 2 * p[1]) ** 2 - 1) / (5**0.5 * 2 * abs(p[0] + 2 * p[1])),
@@ -331,7 +324,7 @@ def test_overhangs_and_holes_are_refused_with_the_place(tmp_path):
         (lambda f: MeasuredSurface((0.4, 0.3), file=f / "hole.csv"), "row 2, column 1"),
         *(
             (lambda f, kind=kind: MeasuredSurface((0.4, 0.3), file=f / f"words.{kind}"), kind)
-            for kind in ("csv", "npy", "npz", "png", "zip", "obj", "stl")
+            for kind in ("csv", "npy", "zip", "obj")
         ),
         (lambda f: MeasuredSurface(file=f / "none.stl"), "none.stl"),
         (lambda f: MeasuredSurface(file=f / "wide.obj"), "wide.obj"),
