@@ -25,6 +25,7 @@ from drake_dae.dae import (
     outputs_named,
     with_disturbance,
 )
+from drake_dae.dae.beyond.disturbance import estimated_within
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
@@ -32,6 +33,11 @@ from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
+from drake_dae.scenario.estimated import (
+    estimates_all,
+    with_all_estimated,
+    with_friction_estimated,
+)
 from drake_dae.scenario.form import at, each
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import (
@@ -108,7 +114,18 @@ def build_completed(
         plant = make_plant(scenario, model, structure)
 
     # The law, of a model with a disturbance if there is an estimator of it; and what it follows.
-    law, references, exogenous = tracking_law(scenario, model, structure), list[Reference](), []
+    of_law, references, exogenous = scenario, list[Reference](), []
+    if estimates_all(scenario, model):
+        of_law = with_all_estimated(scenario, model)
+        try:
+            law = tracking_law(of_law, completed_model(of_law)[1], structure)
+        except (AssumptionError, ScenarioError) as error:  # No run is refused for it.
+            of_law = with_friction_estimated(scenario, model)
+            law = tracking_law(of_law, model, structure)
+            note = f"only friction of contacts is estimated, no loads, tilts and joints: {error}"
+            completed = Completed(completed.scenario, (*completed.notes, note))
+    else:
+        law = tracking_law(scenario, model, structure)
     if task is None:
         names = [signal.name for signal in law.system.output_signals]
         references = references_of(scenario, names, law.layout.reference_degrees)
@@ -130,7 +147,7 @@ def build_completed(
         encoders=sensors.encoders,
         sampling=scenario.sampling,
         control_limits=limits,
-        observer=scenario.estimator,
+        observer=of_law.estimator,
         exogenous=exogenous,
         plant_exogenous=plant_exogenous,
         signals={} if task is None or commanded else task.signals,
@@ -192,14 +209,18 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             if scenario.exogenous:
                 raise ModelError("not beside exogenous signals, whose port it feeds")
             known = [parameter.name for parameter in model.dae.parameters]
-            for name in estimator.identify:
+            names = estimator.parameters or []
+            for name in names:
                 if name not in known:
                     hint = "; give the constraint friction: 0.0 if it is unknown"
                     text = unknown_name("parameter", name, known)
-                    raise ModelError(f"identify: {text}{hint * name.endswith('.friction')}")
+                    raise ModelError(f"parameters: {text}{hint * name.endswith('.friction')}")
             velocities = [signal.name for signal in model.links.velocity_signals]
-            with at("estimator.identify"):
-                observed = with_disturbance(model.dae, velocities, estimator.identify)
+            with at("estimator.parameters"):
+                observed = with_disturbance(model.dae, velocities, names)
+                friction = {contact.friction for contact in model.dae.contacts}
+                others = [p for p in model.dae.parameters if p.name in {*names} - friction]
+                estimated_within(others, estimator.ranges)
             structure = find_structure(observed)
     # The mean time from a sample to the moment when its control acts, for rigid joints. A plant
     # that steps by h damps with the speed at the end of each step: h / 2 later than the mean, and h

@@ -25,7 +25,9 @@ from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, velocities_are_rates
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
+from drake_dae.scenario.estimated import estimates_all
 from drake_dae.scenario.form import at
+from drake_dae.scenario.model import references_of
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact
@@ -134,9 +136,14 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             rate=_rounded(contact.observer_rate),
             force_rate=_rounded(contact.observer_force_rate),
             friction_rate=_rounded(contact.friction_rate),
-            identify=list(dict.fromkeys([*frictional, *estimator.identify])),
+            parameters=None
+            if estimator.parameters is None
+            else list(dict.fromkeys([*frictional, *estimator.parameters])),
             state_rate=None if fast is None else _rounded(fast),
         )
+    if not estimates_all(replace(scenario, estimator=estimator), model):
+        named = frictional if estimator.parameters is None else estimator.parameters
+        estimator = replace(estimator, parameters=named)
     task = scenario.task
     if task is not None and task.gains is None:
         task = replace(task, gains=_free_gains(scenario, model, contact))
@@ -160,13 +167,17 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             gains=gains,
             integral=integral,
             constraint_damping=damping,
+            contact_stiffness=_fed_ahead(scenario, structure, stiffness),
             largest_roughness=None,
             largest_errors=None,
         ),
         estimator=estimator,
         sensors=replace(sensors, force=force),
     )
-    identified = ", ".join(name for name in estimator.identify if name in frictional) or "none"
+    named = estimator.parameters or []
+    identified = ", ".join(name for name in named if name in frictional) or "none"
+    if estimator.parameters is None:
+        identified = "friction, loads and tilts"
     estimated = "" if fast is None else f", and an estimate of the state of {_rounded(fast):g} 1/s"
     note = (
         f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "
@@ -179,6 +190,28 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"{touch_note}"
     )
     return Completed(chosen, (note,))
+
+
+def _fed_ahead(scenario: Scenario, structure: Structure, stiffness: float) -> float | None:
+    """The stiffness by which the deflection of contacts is fed ahead, if the references allow it.
+
+    All constraint forces are outputs then, with references that have two derivatives.
+    """
+    system, given = structure.system, scenario.law.contact_stiffness
+    if given is not None or scenario.task is not None:
+        return given
+    names, degrees = [s.name for s in system.output_signals], list(structure.output_degrees)
+    forces = [s.name for s in system.constraint_input_signals]
+    of_forces = [i for i, name in enumerate(names) if name in forces]
+    is_fit = len(of_forces) == len(forces) and {*structure.constraint_degrees} == {2}
+    if not is_fit or any(degrees[i] for i in of_forces):
+        return None
+    degrees = [2 if i in of_forces else degree for i, degree in enumerate(degrees)]
+    try:
+        references_of(scenario, names, degrees)
+    except ScenarioError:
+        return None
+    return _rounded(stiffness)
 
 
 def _check_bounds(scenario: Scenario) -> None:

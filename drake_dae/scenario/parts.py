@@ -183,14 +183,17 @@ class Estimator(Observing):
     Attributes:
         rate: k_o in 1/s, the rate of disturbances along the free directions; it is computed with
             the gains if it is left out.
-        identify: Names of parameters that are estimated while the robot moves: coefficients of
+        parameters: Names of parameters that are estimated while the robot moves: coefficients of
             friction of contacts, as "wall.friction", whose initial value is that of the constraint
             (write 0 if it is unknown); and, each with a standard deviation and within `bounds`,
-            masses and places of payloads, friction of joints, "wall.rpy" of a surface.
+            masses and places of payloads, friction of joints, "wall.rpy" of a surface. If they are
+            left out, on contact that gives way: friction of contacts and joints, the mass of a load
+            "<frame>_load" at each contact, and tilts of surfaces.
     """
 
     rate: float | None = None  # type: ignore[assignment]
-    identify: list[str] = field(default_factory=list)
+    parameters: list[str] | None = None
+    ranges: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.rate is not None:

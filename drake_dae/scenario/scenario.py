@@ -95,7 +95,7 @@ class Scenario:
         actuation: Stages from the joints toward the motor; none for rigid joints.
         parameters: Parameter name -> its value for law and plant; one for all entries, or a list.
         bounds: Parameter name -> lowest and highest value, numbers or lists. Relative degrees hold
-            within them; they restrict what `estimator.identify` names, and nothing else of a run.
+            within them; they restrict what `estimator.parameters` names, and nothing else of a run.
         exogenous: Parameter name, as "wall.position" -> references that law and plant know.
         plant: What is simulated: ideal constraints, contact that gives way, or Drake's own contact;
             and how it differs from the law's model.

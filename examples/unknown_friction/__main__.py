@@ -77,7 +77,7 @@ DIFFERENCES = ("sensors.encoders={resolution: 1.0e-4, velocity_bandwidth: 200}",
 GAINS_ALONE = (
     *NOISY,
     "law.largest_roughness=2",
-    "estimator={rate: 10.7, force_rate: 1.88, friction_rate: 2.67, identify: [wall.friction]}",
+    "estimator={rate: 10.7, force_rate: 1.88, friction_rate: 2.67, parameters: [wall.friction]}",
 )
 
 

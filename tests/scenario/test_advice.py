@@ -12,9 +12,10 @@ from runs import scenario
 from drake_dae import build_scenario, contact_gains, load_scenario
 from drake_dae.cli import main
 from drake_dae.errors import ScenarioError
+from drake_dae.scenario import build, plants
 from drake_dae.scenario import parts as parts
-from drake_dae.scenario import plants
 from drake_dae.scenario.build import build_completed
+from drake_dae.scenario.estimated import with_all_estimated
 from drake_dae.scenario.gains import advised, sensed_contact
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model, scenario_structure
@@ -41,7 +42,7 @@ def test_what_is_left_out_is_advised_and_reported():
     completed, loop = build_completed(found)
     assert len(completed.notes) == 1
     assert "1e+05 N/m" in completed.notes[0]
-    assert "identifies: wall.friction" in completed.notes[0]
+    assert "identifies: friction, loads and tilts" in completed.notes[0]
     model = scenario_model(found)
     structure = scenario_structure(model)
     mobility = structure.constraint_matrix(structure.states[0]).item()
@@ -55,6 +56,32 @@ def test_what_is_left_out_is_advised_and_reported():
     assert run.estimator.force_rate == pytest.approx(wanted.observer_force_rate, rel=1e-2)
     assert run.sensors.force == parts.MeasuredForce(sample_period=1e-3)
     assert loop.observer is not None
+    assert loop.observer.friction_signals[0].name == "wall.friction"
+
+
+def test_an_estimator_estimates_what_it_can_unless_parameters_are_named():
+    named = {}
+    for settings in ((), ("estimator.parameters=[]",)):
+        _, loop = build_completed(two_link("constraints.0.friction=0.0", *settings))
+        named[settings] = {
+            signal.name for signal in loop.observer.further_signals.get("identified", ())
+        }
+    joints = {f"joint{i}.{kind}" for i in (1, 2) for kind in ("coulomb", "viscous")}
+    tilts = {f"wall.{key}[{i}]" for key in ("rpy", "position") for i in range(3)}
+    assert named == {
+        (): {*joints, *tilts, "tool_load.mass", "wall.friction"},
+        ("estimator.parameters=[]",): set(),
+    }
+    assert loop.observer.friction_signals[0].name == "wall.friction"
+
+
+def test_what_cannot_be_estimated_refuses_no_run(monkeypatch):
+    def impossible(scenario, model):
+        return replace(with_all_estimated(scenario, model), bounds={"tool_load.mass": (2.0, 3.0)})
+
+    monkeypatch.setattr(build, "with_all_estimated", impossible)
+    completed, loop = build_completed(two_link("constraints.0.friction=0.0"))
+    assert any("tool_load.mass" in note for note in completed.notes)
     assert loop.observer.friction_signals[0].name == "wall.friction"
 
 
@@ -123,12 +150,12 @@ def test_run_reports_its_advice_and_what_it_identified(tmp_path, capsys):
     out = tmp_path / "run"
     write = "write={record: false, plots: false, animation: false}"
     command = ["simulate", "wall_point_contact", "--out", str(out)]
-    assert main([*command, "--set", "duration=0.01", "--set", write]) == 0
+    assert main([*command, "--set", "duration=0.1", "--set", write]) == 0
     assert "recommended for a contact of 1e+05 N/m" in capsys.readouterr().out
     told = (out / "summary.txt").read_text()
     assert "recommended for a contact of 1e+05 N/m" in told
     assert "identified           wall.friction = " in told
-    assert load_scenario(out / "scenario.yaml").estimator.identify == ["wall.friction"]
+    assert load_scenario(out / "scenario.yaml").estimator.parameters is None
 
 
 def test_what_is_said_stays():
@@ -199,10 +226,10 @@ def parameters(loop, wall):
     [
         (["estimator={rate: -1}"], "rate"),
         (
-            ["estimator={rate: 5, identify: [wal.friction]}"],
+            ["estimator={rate: 5, parameters: [wal.friction]}"],
             "'wal.friction'",
         ),
-        (["estimator={rate: 5, identify: [wall.friction]}"], "friction"),
+        (["estimator={rate: 5, parameters: [wall.friction]}"], "friction"),
         (["estimator={rate: 5}", "law.gains={all: [-9]}"], "measured force"),
         (
             ["estimator={rate: 5}", "sampling=", "plant=!IdealConstraints {}"],

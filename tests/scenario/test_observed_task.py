@@ -25,7 +25,7 @@ sampling: {period: 0.001, delay: 0.001}
 sensors:
   force: {sample_period: 0.001, noise_deviation: 0.3}
 plant: !CompliantContact {radius: 1.0e-5, friction: 0.3}
-estimator: {rate: 60, identify: [wall.friction]}
+estimator: {rate: 60, parameters: [wall.friction]}
 task:
   gains: {outputs: {wall.distance: [-8], "*": [-25]}}
   phases:
@@ -128,7 +128,7 @@ def test_gains_of_a_task_are_advised(file, tmp_path, capsys):
         "law:\n  gains: {all: [-25]}\n  constraint_damping: {all: [-250]}\n", ""
     )
     text = text.replace('  gains: {outputs: {wall.distance: [-8], "*": [-25]}}\n', "")
-    text = text.replace("estimator: {rate: 60, identify: [wall.friction]}\n", "")
+    text = text.replace("estimator: {rate: 60, parameters: [wall.friction]}\n", "")
     file.write_text(text.replace(", noise_deviation: 0.3", ""))
     found = rolled(file, tmp_path, "duration=2.5", "task.phases.0.speed=0.03")
     errors = late(found, after=2.0)

@@ -15,7 +15,7 @@ def found_off(
     """
     dae = loop.controller.law.system
     distance = dae.trace("distance", {"value": dae.k})
-    own, sought = chosen.plant.parameters, chosen.estimator.identify
+    own, sought = chosen.plant.parameters, chosen.estimator.parameters
     places = {name: np.array(own[name]) for name in sought if name in own}
     truth = dae.with_values(places).parameter_values
     names = [signal.name.partition("[")[0] for signal in record.signals["identified"].signals]

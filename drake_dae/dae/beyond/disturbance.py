@@ -1,6 +1,6 @@
 """Model errors as a disturbance: an exogenous signal of a law, and its observation."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -57,9 +57,6 @@ def with_disturbance(
         )
     if DISTURBANCE in [p.name for p in system.parameters]:
         raise ModelError(f"{system.name} has a parameter '{DISTURBANCE}' already")
-    frictional = [contact.friction for contact in system.contacts]
-    estimated = set(frictions).difference(frictional)
-    check_bounded(system, [p for p in system.parameters if p.name in estimated])
     parameter = Parameter(DISTURBANCE, np.zeros(len(rows)), exogenous=True)
     force = ca.SX(system.num_states, 1)
     force[rows] = parameter.symbol
@@ -79,15 +76,30 @@ def with_disturbance(
     ).with_exogenous(frictions)
 
 
-def check_bounded(system: DaeSystem, parameters: Sequence[Parameter]) -> None:
-    """Raises ModelError if a parameter has no bounds, from which its estimation starts."""
-    for parameter in parameters:
-        if parameter.bounds is None or not np.all(parameter.low < parameter.high):
+def estimated_within(
+    parameters: Sequence[Parameter], ranges: Mapping[str, float]
+) -> tuple[FloatArray, FloatArray]:
+    """The lowest and highest values between which estimation starts: bounds, or a deviation.
+
+    Raises:
+        ModelError: A parameter has neither.
+    """
+    low, high = [np.zeros(0)], [np.zeros(0)]
+    for p in parameters:
+        if p.bounds is not None and np.all(p.low < p.high):
+            low.append(p.low)
+            high.append(p.high)
+        elif p.name in ranges:
+            least = 1e-3 * p.value if p.positive else np.where(p.nonnegative, 0.0, -np.inf)
+            low.append(np.maximum(p.value - ranges[p.name], least))
+            high.append(p.value + ranges[p.name])
+        else:
             raise ModelError(
-                f"{system.name}: '{parameter.name}' has no bounds. Besides a disturbance and "
-                "coefficients of friction of contacts, an observer estimates parameters with a "
-                "lowest and a highest value, which differ (`bounds`)"
+                f"'{p.name}' has no bounds. Besides a disturbance and coefficients of friction of "
+                "contacts, an estimator estimates parameters with a lowest and a highest value, "
+                "which differ (`bounds`), or with a largest deviation (`ranges`)"
             )
+    return np.concatenate(low), np.concatenate(high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +129,6 @@ class IdentifiedTerms:
         inputs: dict[str, ca.SX],
     ) -> "IdentifiedTerms":
         """Derives the functions from p, its rate without inputs, and the part from the inputs."""
-        check_bounded(system, parameters)
         theta = ca.vertcat(ca.SX(0, 1), *(parameter.symbol for parameter in parameters))
         pressed = tuple(i for i in range(system.k.numel()) if ca.depends_on(system.k[i], theta))
         if pressed and system.sharing is not None:
@@ -138,16 +149,6 @@ class IdentifiedTerms:
     def signals(self) -> tuple[Signal, ...]:
         """Names and units of theta."""
         return tuple(signal for parameter in self.parameters for signal in parameter.signals)
-
-    @property
-    def low(self) -> FloatArray:
-        """The lowest values, shape (c,)."""
-        return np.concatenate([np.zeros(0), *(p.low for p in self.parameters)])
-
-    @property
-    def high(self) -> FloatArray:
-        """The highest values, shape (c,)."""
-        return np.concatenate([np.zeros(0), *(p.high for p in self.parameters)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """The rates and thresholds of an observer."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import positive
@@ -22,6 +23,8 @@ class Observing:
         largest_friction: The upper bound of coefficients of friction.
         least_speed: The speed in m/s below which a contact may stick, so that its friction is not
             identified.
+        ranges: Parameter name -> the largest deviation from its value, of estimated parameters that
+            have no bounds.
         least_force: The force in N below which a contact counts as lost: its coefficient and
             integrals are not updated.
     """
@@ -33,8 +36,11 @@ class Observing:
     least_force: float = 1.0
     force_rate: float | None = None
     state_rate: float | None = None
+    ranges: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for each in fields(Observing):  # A form may have more.
-            if (value := getattr(self, each.name)) is not None:
-                positive(each.name, value)
+            value = getattr(self, each.name)
+            for number in value.values() if each.name == "ranges" else [value]:
+                if number is not None:
+                    positive(each.name, number)

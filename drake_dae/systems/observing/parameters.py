@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 
+from drake_dae.arrays import FloatArray
 from drake_dae.dae import IdentifiedTerms
 
 GAP = 1e-5
@@ -59,6 +60,7 @@ class ParameterFilter:
 
     Args:
         identified: The parameters.
+        within: Their lowest and highest values.
         frictions: The number of coefficients of friction, which follow these in theta.
         largest_friction: Their upper bound.
         rate: k_o in 1/s.
@@ -68,14 +70,15 @@ class ParameterFilter:
     def __init__(
         self,
         identified: IdentifiedTerms,
+        within: tuple[FloatArray, FloatArray],
         frictions: int,
         largest_friction: float,
         rate: float,
         period: float,
     ) -> None:
         self._period, self._samples = period, max(2.0 / (rate * period), 1.0)
-        self._low = np.concatenate([identified.low, np.zeros(frictions)])
-        self._high = np.concatenate([identified.high, np.full(frictions, largest_friction)])
+        self._low = np.concatenate([within[0], np.zeros(frictions)])
+        self._high = np.concatenate([within[1], np.full(frictions, largest_friction)])
         self._num, self._contacts = self._low.size, len(identified.pressed)
         deviations = (self._high - self._low) / 12.0**0.5
         self._prior = np.concatenate([deviations, *self._contacts * [COMPLIANCE]]) ** 2

@@ -1,5 +1,6 @@
 """The equations of a `StateEstimator` at a sample, as expressions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Self
@@ -11,7 +12,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import TIME, where_finite
 from drake_dae.dae import Lags, Observation, TrackingLaw
 from drake_dae.dae.beyond.chain_filter import ChainFilter
-from drake_dae.dae.beyond.disturbance import DISTURBANCE
+from drake_dae.dae.beyond.disturbance import DISTURBANCE, estimated_within
 from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.contacts import LITTLE, Contacts, ContactTerms
@@ -137,7 +138,12 @@ class EstimatorSample:
         known, values = len(self._places), system.parameter_values
         self._ratio = max(round(PARAMETER_PERIOD / period), 1)
         self.filter = ParameterFilter(
-            identified, c, observing.largest_friction, rates[0], self._ratio * period
+            identified,
+            estimated_within(identified.parameters, observing.ranges),
+            c,
+            observing.largest_friction,
+            rates[0],
+            self._ratio * period,
         )
         exact = 0 if estimates else k
         self.sizes = {
@@ -515,7 +521,8 @@ class EstimatorSample:
         system, rows = self._system, list(self.observation.rows)
         u, v = (ca.SX.sym("u", n) for n in (system.num_controls, system.num_constraints))
         push = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
-        dry, speed = self._dry(system.state, system.parameter_symbol), system.state[rows]
+        dry = self._made_by(system.dry, system.state, system.parameter_symbol)
+        speed = system.state[rows]
         smooth, turning = (
             [-ca.jacobian(force[i], speed[i]) for i in range(len(rows))]
             for force in (system.f[rows] - dry, dry)
@@ -541,7 +548,7 @@ class EstimatorSample:
                 for state in (x, self._contacts.faster(goal))
             )
             r = r + ca.mtimes(goal_friction - friction, mu)
-            r = r + self._dry(goal, parameters) - self._dry(x, parameters)
+            r = r + self._rubbing(goal, parameters) - self._rubbing(x, parameters)
         size, rates = r.numel(), known.rates
         rows = {DISTURBANCE: [[r[i], *rates[i::size].elements()] for i in range(size)]}
         for name, value in zip(observation.frictions, mu.elements(), strict=True):
@@ -556,13 +563,23 @@ class EstimatorSample:
                 stacked += [*row, *[ca.SX(0.0)] * degree][: 1 + degree]  # Others are constant.
         return where_finite(ca.vertcat(*stacked), valid)
 
-    def _dry(self, state: ca.SX, parameters: ca.SX) -> ca.SX:
-        """The generalized force of Coulomb friction in joints, shape (k, 1)."""
+    def _rubbing(self, state: ca.SX, parameters: ca.SX) -> ca.SX:
+        """The generalized force of Coulomb and of estimated viscous friction in joints.
+
+        A law that compensated too much of them at the actual velocities would be unstable.
+        """
+        estimated = {p.name for p in self.observation.identified.parameters}
+        viscous = (f"{name.rpartition('.')[0]}.viscous" for name in self._system.dry)
+        names = (*self._system.dry, *(name for name in viscous if name in estimated))
+        return self._made_by(names, state, parameters)
+
+    def _made_by(self, names: Sequence[str], state: ca.SX, parameters: ca.SX) -> ca.SX:
+        """The part of the generalized force that is zero without these parameters, shape (k, 1)."""
         rows = list(self.observation.rows)
-        if not self._system.dry:
+        if not names:
             return ca.SX(len(rows), 1)
         without = ca.SX(parameters)
-        for name in self._system.dry:
+        for name in names:
             without[self._system.parameter_slice(name)] = 0.0
         symbols = [self._system.state, self._system.parameter_symbol]
         f = ca.Function("f", symbols, [self._system.f[rows]])

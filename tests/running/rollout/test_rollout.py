@@ -514,7 +514,7 @@ PARTS = {
     "estimator of friction": (
         *OBSERVED,
         "constraints.0.friction=0.0",
-        "estimator.identify=[wall.friction]",
+        "estimator.parameters=[wall.friction]",
     ),
     "estimator and limits": (
         *OBSERVED,

@@ -14,7 +14,7 @@ GAINS = (  # As they were computed for wall_point_contact at 77bdd245, with twic
     "joint7: [1030, 45.4], wall.force: [19.7]}}",
     "law.integral=[tool.y, tool.z, wall.force]",
     "law.constraint_damping=!Poles {all: [-49.2]}",
-    "estimator={rate: 42.8, friction_rate: 10.7, force_rate: 21.4, identify: [wall.friction]}",
+    "estimator={rate: 42.8, friction_rate: 10.7, force_rate: 21.4, parameters: [wall.friction]}",
     "sensors.force={sample_period: 0.001}",
 )
 """Of the seven joints on a wall that gives way, at 1 kHz."""
@@ -101,7 +101,7 @@ PUSHED = (
 SEEN = (
     "bounds={wall.position: [[0.69, -0.01, -0.01], [0.71, 0.01, 0.01]], wall.rpy: [-0.15, 0.15]}",
     "constraints.0.rpy=[0, 0, 0]",
-    "estimator.identify=[wall.friction, wall.position, wall.rpy]",
+    "estimator.parameters=[wall.friction, wall.position, wall.rpy]",
     "plant.parameters={wall.position: [0.701, 0, 0], wall.rpy: [0, 0.02, -0.01]}",
 )
 
@@ -134,7 +134,7 @@ CASES = {
         (
             *GAINS[:3],
             "estimator={rate: 30.0, friction_rate: 7.0, force_rate: 15.0, state_rate: 300.0, "
-            "identify: [wall.friction]}",
+            "parameters: [wall.friction]}",
             GAINS[4],
             SOFT,
             "sensors.encoders={resolution: 1.0e-5}",

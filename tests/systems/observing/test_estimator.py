@@ -191,7 +191,7 @@ def test_without_a_force_sensor_the_force_is_that_of_the_model():
             "sensors.encoders={resolution: 1.0e-5}",
             f"law.gains=!Coefficients {{outputs: {{{points}, {others}}}}}",
             "law.integral=[tool.y, tool.z]",
-            "estimator={rate: 33, friction_rate: 8, state_rate: 333, identify: [wall.friction]}",
+            "estimator={rate: 33, friction_rate: 8, state_rate: 333, parameters: [wall.friction]}",
             "duration=4",
         )
     )

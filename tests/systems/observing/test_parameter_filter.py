@@ -6,6 +6,7 @@ import pytest
 
 from drake_dae import DaeSystem
 from drake_dae.dae import IdentifiedTerms, Parameter
+from drake_dae.dae.beyond.disturbance import estimated_within
 from drake_dae.systems.observing.parameters import FADING, ParameterFilter, _pushes
 
 RATE, PERIOD, PLACE = 20.0, 0.002, 3e-3
@@ -21,7 +22,9 @@ def filter_of(place, distance):
     motion = dict.fromkeys(("momentum", "drift", "inputs"), still)
     terms = IdentifiedTerms.of(body, (place,), motion, {"constraint_input": force})
     size = place.value.size
-    estimator, theta = ParameterFilter(terms, 0, 1.0, RATE, PERIOD), ca.SX.sym("theta", size)
+    within = estimated_within((place,), {})
+    estimator = ParameterFilter(terms, within, 0, 1.0, RATE, PERIOD)
+    theta = ca.SX.sym("theta", size)
     gap = distance(theta, x)
     gaps = gap, ca.jacobian(gap, theta), ca.hessian(gap, theta)[0]
     still, one = (ca.SX.zeros(1, 1), ca.SX.zeros(1, size)), ca.SX.ones(1, 1)
