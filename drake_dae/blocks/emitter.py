@@ -1,4 +1,4 @@
-"""CasADi functions as C on `real`: a number, or several side by side; see lanes.h."""
+"""CasADi functions as C on `real`: a number, or several side by side; see real.h."""
 
 from math import copysign, inf
 
@@ -45,7 +45,7 @@ _OPERATIONS: dict[int, str] = {
     ca.OP_ATAN2: "each_atan2({0}, {1})",
     ca.OP_COPYSIGN: "each_copysign({0}, {1})",
 }
-"""CasADi's operations, by the functions of lanes.h."""
+"""CasADi's operations, by the functions of real.h."""
 
 _TURNS = (ca.OP_SIN, ca.OP_COS)
 """Both are computed together, since most angles need both."""

@@ -103,7 +103,6 @@ class StepFunctions:
             for rate, names in block.rates().items()
         ]
         self.projects = block.projection is not None
-        self._begin: ca.Function | None = None
 
     def _function(
         self, name: str, values: list[ca.SX], more: list[ca.SX] | None = None

@@ -219,7 +219,7 @@ def find_dependence(
 
 
 def redundant_constraints(samples: Samples) -> tuple[Combination, ...]:
-    """Returns the constraints whose gradients depend on those of earlier ones at all samples."""
+    """If gradients depend at all samples, the rows that do so at the first."""
     system = samples.system
     if not samples.dependent(system.k):
         return ()

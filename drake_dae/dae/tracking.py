@@ -47,7 +47,8 @@ class TrackingLaw:
         integral: The names of the outputs whose errors are integrated as well, positions or
             measured forces: see `IntegralAction`. They have one more pole.
         latency: The mean time in s from the measurement of x to the moment when its control acts,
-            for a sampled law delay + period / 2: by it damping is compensated: see `acting_late`.
+            for a sampled law delay + period / 2, and half a step more of a stepped plant: by it
+            damping is compensated: see `acting_late`.
 
     `function` is the law as (state, reference, measured_force, integral, parameters) -> control,
     tracking_error and integral_rate, without what the law does not have, and with the parameters of

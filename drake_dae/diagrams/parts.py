@@ -70,10 +70,10 @@ class LoopSettings:
         return step if self.sampling is None else self.sampling.period
 
 
-Block = TypeVar("Block", bound=System)
+AnySystem = TypeVar("AnySystem", bound=System)
 
 
-def add_block(builder: DiagramBuilder, block: Block) -> Block:
+def add_block(builder: DiagramBuilder, block: AnySystem) -> AnySystem:
     """Adds a block of the caller, or refuses one that belongs to another diagram."""
     taken = WiringError(
         f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
@@ -272,7 +272,7 @@ def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
     return replace(sampling, delay=max(sampling.delay - step, 0.0))
 
 
-def add_hold(
+def connect_hold(
     builder: DiagramBuilder, controller: Controller, sources: Sequence[OutputPort]
 ) -> None:
     """Connects what stops the integrals of a controller while it is not 0: for all, or for each."""

@@ -14,11 +14,11 @@ from drake_dae.diagrams.parts import (
     LoopSettings,
     add_block,
     add_exogenous,
-    add_hold,
     add_noise,
     add_signals,
     check_force_loop,
     check_parts,
+    connect_hold,
     hold_before,
     make_observer,
     make_sensor,
@@ -194,7 +194,7 @@ def wire_loop(
             state = observer.GetOutputPort("estimated_state")
             named["estimated_state"] = (state, dae.state_signals)
     connect(state, controller, "estimated_state")
-    add_hold(builder, controller, [] if is_limited is None else [is_limited])
+    connect_hold(builder, controller, [] if is_limited is None else [is_limited])
     add_signals(builder, controller, parts.signals)
     if limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)

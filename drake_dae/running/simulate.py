@@ -60,7 +60,7 @@ def simulate(
 ) -> RunStatistics:
     """Runs a diagram from a context; afterwards the context has the final state, on the manifold.
 
-    If the states or errors of a `Plant` diverge, an exception ends the run: see `DiagramWatch`.
+    If the states or errors of a `Plant` diverge, an exception ends the run: see `DivergenceWatch`.
 
     In runs of many steps all traced blocks are composed to one, so that Drake calls Python once for
     each derivative and sample; see `compile_diagram`. A live view or a real-time rate need each

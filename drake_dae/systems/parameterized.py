@@ -113,7 +113,7 @@ def with_exogenous(block: Block, places: Sequence[int]) -> Block:
 
 
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:
-    """All parameters of a robot, some of surfaces, masses and stages changed for its plant."""
+    """All parameters of a robot, some of surfaces, masses and loads changed for its plant."""
     values = model.dae.parameter_values
     known = [p.name for p in model.links.parameters]
     known += [p.name for constraint in model.constraints for p in constraint.parameters]
@@ -122,7 +122,7 @@ def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -
     for name, value in parameters.items():
         if name not in known:
             raise ModelError(
-                f"of Drake's contact as the plant {unknown_name('parameter', name, known)}; give "
+                f"of this plant {unknown_name('parameter', name, known)}; give "
                 "the law's model others instead"
             )
         put(model.dae, values, name, value)

@@ -1,4 +1,4 @@
-"""Products of numbers in which entries that are only round-off are zero."""
+"""What counts as zero, as dependent and as singular, where numbers have round-off."""
 
 import numpy as np
 

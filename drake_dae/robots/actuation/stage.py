@@ -63,7 +63,7 @@ class Stage(ABC):
 class ActuationChain:
     """Stages attached to a robot, from the joints toward the motor: E s' = drift + drive u."""
 
-    stages: tuple[AttachedStage, ...]  # None for rigid joints.
+    stages: tuple[AttachedStage, ...]  # Empty for rigid joints.
     joint_force: ca.SX  # tau(q, v, s), shape (p, 1); 0 for rigid joints.
     direct: ca.SX  # Of u on the joints, shape (p, p): 1 for rigid joints, otherwise 0.
     mass: ca.SX  # E, shape (k, k).

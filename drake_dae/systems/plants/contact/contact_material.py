@@ -101,7 +101,7 @@ class ContactMaterial(PointMaterial):
 
     The robot touches with a ball; the surfaces are those of its constraints. With point contact the
     force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
-    the pressure modulus times depth / thickness; curved surfaces are meshes, see `Layer`. Where the
+    the pressure modulus times depth / thickness; curved surfaces are meshes. Where the
     robot tilts, the ball rolls: see `PointMaterial`.
 
     Attributes:
