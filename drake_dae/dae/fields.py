@@ -50,7 +50,8 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
             raise ModelError(f"{name}: {unknown_name('parameter', contact.friction, known)}")
     metric, free = given["control_metric"], given["free_control"]
     optional = ("mass_matrix", "control_metric", "free_control")
-    functions = {key: given[key] for key in (*"fghklm", *optional) if given[key] is not None}
+    functions = {key: given[key] for key in "fghklm"}
+    functions |= {key: given[key] for key in optional if given[key] is not None}
     functions.setdefault("mass_matrix", ca.SX.eye(state.numel()))
     expressions = _expressions(name, functions, state, parameter_symbol(parameters))
     fields = {"state": state, "parameters": parameters, **expressions}

@@ -491,6 +491,11 @@ def _meaning(
             chosen = of_point or [others[k] for k in denoted(name, others, [2] * len(others))]
             return [signals.index(signal) for signal in chosen]
         outputs += others
+    for constraint in rows.bound.constraints:
+        if name in [signal.name for signal in constraint.coordinate_signals]:
+            text = f"no output '{name}', a coordinate along the constraint '{constraint.name}'"
+            form = f"!SurfaceCoordinates {{constraint: {constraint.name}}}"
+            raise ScenarioError((key, f"{text}: add {form} to outputs"))
     raise ScenarioError((key, unknown_name("output", name, outputs)))
 
 

@@ -261,11 +261,13 @@ def judge_run(
     remedies, dae, law = list[str](), model.dae, loop.controller.law
     is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
     if is_paced and loop.generator is not None and not dae.exogenous.moving:
-        reference = loop.generator.reference
         structure = law.structure if law.system is dae else find_structure(dae)
+        degrees = structure.layout.reference_degrees  # The law's own may be higher.
+        stacked = stack_references(loop.generator.references, degrees)
         times, start = record.time[:: record.time.size // MOST_TIMES + 1], record["state"][0]
-        motion = ZeroDynamics(dae, structure=structure).motion(reference, times, start)
-        found = limits_along(structure, limits, reference, motion)
+        zero_dynamics = ZeroDynamics(dae, structure=structure)
+        motion = zero_dynamics.motion(lambda time: stacked(time).copy(), times, start)
+        found = limits_along(structure, limits, lambda time: stacked(time).copy(), motion)
         remedies.append("the references alone keep all limits" if found is None else found.remedy)
 
     # Approximations, and places beyond the data of surfaces.

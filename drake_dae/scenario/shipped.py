@@ -25,7 +25,9 @@ def find_scenario(name: str) -> Path:
     with suppress(OSError, ValueError):  # Such as a null byte.
         if path.is_file():
             return path
-    raise ScenarioError(("", _unknown("scenario file", name, shipped)))
+    if path.name == name and not path.suffix:
+        raise ScenarioError(("", _unknown("scenario", name, shipped)))
+    raise ScenarioError((name, "there is no such file; `drake-dae list` names shipped scenarios"))
 
 
 def shipped_model(name: str) -> Path:
