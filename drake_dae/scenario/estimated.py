@@ -23,9 +23,11 @@ _EFFORT = 100.0
 
 
 def estimates_all(scenario: Scenario, model: RobotModel) -> bool:
-    """Whether an estimator of rigid joints is free to estimate what it can."""
+    """Whether an estimator of rigid joints with measured velocities may estimate what it can."""
     estimator, material = scenario.estimator, scenario.plant.material
     if estimator is None or estimator.parameters is not None or material is None:
+        return False
+    if estimator.state_rate is not None:  # By encoders alone the force of wall_encoders got worse.
         return False
     surfaces = [c.surface for c in scenario.constraints if isinstance(c, PointOnSurface)]
     is_plain = all(isinstance(surface, Plane) for surface in surfaces)  # On a sphere it got worse.

@@ -208,8 +208,7 @@ def test_without_a_force_sensor_the_force_is_that_of_the_model():
 def test_the_first_break_away_of_encoders_alone_does_not_swing():
     """At most 0.1 mm and 0.3 N, at a friction of 0.45 that the law takes for 0; 0.97 mm without.
 
-    A rest of 1 s, then a line; the force of the sensor has a noise of 0.3 N. Only friction of the
-    contact is estimated: with loads, tilts and friction of joints it is 0.32 N.
+    A rest of 1 s, then a line; the force of the sensor has a noise of 0.3 N.
     """
     line = "!Line {start: [0.0], end: [0.05], limits: {speed: 0.05, acceleration: 0.3}"
     chosen = scenario(
@@ -219,7 +218,6 @@ def test_the_first_break_away_of_encoders_alone_does_not_swing():
         f"references.tool.y={line}, start_time: 1.0}}",
         "references.tool.z=0.7",
         "references.wall.force=!PointToPoint {start: [1], end: [20], start_time: 0, end_time: 0.8}",
-        "estimator={parameters: []}",
         "duration=1.7",
     )
     loop, context = build_scenario(chosen)
