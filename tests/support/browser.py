@@ -110,18 +110,26 @@ def low_contrast(page: Path) -> dict[str, float]:
     """Texts with a contrast that is too low, light or dark; a page of some length is asserted."""
     low: dict[str, float] = {}
     for flags in ((), ("--blink-settings=preferredColorScheme=0",)):
-        has_text, found = json.loads(unescape(shown(page, LOW_CONTRAST, flags)))
+        has_text, found = json.loads(unescape(shown(page, LOW_CONTRAST, flags=flags)))
         assert has_text
         low |= found
     return low
 
 
-def shown(page: Path, script: str, flags: Sequence[str]) -> str:
+def shown(
+    page: Path,
+    script: str = "",
+    fragment: str = "",
+    size: str = "900,700",
+    flags: Sequence[str] = (),
+) -> str:
     """The last text that a script returns which is called again and again.
 
     Args:
         page: The page's file; a copy with the script is made beside it.
         script: The body of a function in JavaScript that returns a text.
+        fragment: The end of the address, "#t=1".
+        size: The window's width and height in pixels.
         flags: Further options of Chromium.
     """
     told = (
@@ -135,8 +143,8 @@ def shown(page: Path, script: str, flags: Sequence[str]) -> str:
     copy = page.with_name(f"told-{page.name}")
     copy.write_text(f"{head}{told}{end}{tail}", "utf-8")
     with tempfile.TemporaryDirectory() as user:
-        command = [CHROMIUM, *OPTIONS, *flags, f"--user-data-dir={user}", "--window-size=900,700"]
-        command += ["--virtual-time-budget=8000", "--dump-dom", copy.as_uri()]
+        command = [CHROMIUM, *OPTIONS, *flags, f"--user-data-dir={user}", f"--window-size={size}"]
+        command += ["--virtual-time-budget=8000", "--dump-dom", copy.as_uri() + fragment]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     (found,) = re.findall(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)
     return found
