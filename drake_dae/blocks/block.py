@@ -200,9 +200,8 @@ class BlockFunction(TracedFunction):
         what: str,
         values: Mapping[str, ca.SX],
         compiled: Compiled = False,
-        columns: Mapping[str, ca.SX] | None = None,
     ) -> None:
-        columns = block.columns() if columns is None else columns
+        columns = block.columns()
         value = stacked([ca.vec(each) for each in values.values()])
         self.sources = tuple(name for name, c in columns.items() if ca.depends_on(value, c))
         inputs = {name.removeprefix("input "): columns[name] for name in self.sources}

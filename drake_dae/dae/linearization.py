@@ -1,6 +1,5 @@
 """Linear models of (1)-(3) and of closed loops: as they stand, and in minimal form on N*."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -33,7 +32,6 @@ class LinearModel:
     C: FloatArray
     D: FloatArray
     state_signals: tuple[Signal, ...]
-    input_signals: tuple[Signal, ...]
     output_signals: tuple[Signal, ...]
 
     def response(self, s: complex) -> ComplexArray:
@@ -91,7 +89,7 @@ def linearize(
     u = np.zeros(p) if control is None else vector(f"{system.name}: control", control, p)
     plant = _PlantModel(structure, state, system.parameter_vector(parameters))
     no_feedback = np.zeros((p, system.num_states + system.num_constraints))
-    return plant.linearization(u, no_feedback, np.eye(p), system.control_signals)
+    return plant.linearization(u, no_feedback, np.eye(p))
 
 
 @checked(ModelError)
@@ -133,7 +131,7 @@ def linearize_loop(
     gains = slope(plant.state, R, *force, values)[0].reshape(p, -1)
     by_force = gains[:, n + R.size :] if force else np.zeros((p, m))
     feedback = np.hstack([gains[:, :n], by_force])
-    return plant.linearization(control, feedback, gains[:, n : n + R.size], law.reference_signals)
+    return plant.linearization(control, feedback, gains[:, n : n + R.size])
 
 
 class _PlantModel:
@@ -171,11 +169,7 @@ class _PlantModel:
         return moved, by_state, by_control
 
     def linearization(
-        self,
-        control: FloatArray,
-        feedback: FloatArray,
-        forward: FloatArray,
-        inputs: Sequence[Signal],
+        self, control: FloatArray, feedback: FloatArray, forward: FloatArray
     ) -> Linearization:
         """The linear models with du = feedback (dx, dv) + forward dw."""
         system, structure, x = self.system, self.structure, self.system.state
@@ -195,9 +189,10 @@ class _PlantModel:
         E = np.zeros((n + m, n + m))
         E[:n, :n] = mass.reshape(n, n)
         unknowns = (*system.state_signals, *system.constraint_input_signals)
-        signals = (tuple(inputs), system.output_signals)
         none = np.zeros((system.num_outputs, forward.shape[1]))
-        descriptor = LinearModel(E, A + B @ feedback, B @ forward, C, none, unknowns, *signals)
+        descriptor = LinearModel(
+            E, A + B @ feedback, B @ forward, C, none, unknowns, system.output_signals
+        )
         # On N*: (dx', dv) = by_state dx + by_control du, and dv out of du.
         of_x, of_v = feedback[:, :n], feedback[:, n:]
         around = np.eye(p) - of_v @ by_control[n:]
@@ -212,7 +207,7 @@ class _PlantModel:
             (C[:, :n] + C[:, n:] @ by_state[n:]) @ basis,
             C[:, n:] @ by_input[n:],
             tuple(system.state_signals[i] for i in free),
-            *signals,
+            system.output_signals,
         )
         at = (self.state, rate, control, force)
         return Linearization(descriptor, minimal, structure.index, free, basis, *at)

@@ -136,7 +136,6 @@ def share_forces(
     split = sum_of.solve(ca.densify(weighted.T)).T
     sharing = ForceSharing(
         split=split,
-        gather=gather,
         signals=system.constraint_input_signals,
         undetermined=_undetermined(samples, gather, split),
         left_out=system.k[left_out],

@@ -27,7 +27,6 @@ class ForceSharing:
     """The distribution of forces among redundant constraints, some of which are removed."""
 
     split: ca.SX
-    gather: ca.SX
     signals: tuple[Signal, ...]
     undetermined: tuple[str, ...]
     left_out: ca.SX

@@ -79,8 +79,8 @@ class ClosedLoop:
         """The generator of references, or a ModelError."""
         if self.generator is None:
             raise ModelError(
-                f"{self.controller.get_name()} plans its references itself and has no generator, "
-                "which rollouts and exports need; run the loop by simulate"
+                f"{self.controller.get_name()} plans its references itself, so that the loop "
+                "has no generator of references"
             )
         return self.generator
 

@@ -248,7 +248,6 @@ class RobotModel:
         outputs: ArrayLike | None,
         guess: ArrayLike,
         parameters: ArrayLike | None = None,
-        output_parameters: ArrayLike | None = None,
     ) -> FloatArray:
         """q = psi(z_1) of (58), shape (nq,): the consistent configuration with given outputs.
 
@@ -257,8 +256,6 @@ class RobotModel:
             guess: Where Newton's method starts, shape (nq,); if the outputs do not determine q, the
                 one next to it is returned.
             parameters: Values of all parameters; the defaults if None.
-            output_parameters: Values of all parameters for z_1, such as those that a law assumes
-                for a wall that its constraint has elsewhere; `parameters` if None.
 
         Raises:
             InconsistentStateError: There is no such configuration near the guess.
@@ -268,8 +265,7 @@ class RobotModel:
         count = 0 if outputs is None else len(self.position_signals)
         wanted = vector(f"{self.name}: outputs", [] if outputs is None else outputs, count)
         values = self.dae.parameter_vector(parameters)
-        given = parameters if output_parameters is None else output_parameters
-        return self.placing.solve(wanted, q, values, self.dae.parameter_vector(given))
+        return self.placing.solve(wanted, q, values, values)
 
     @checked(ModelError)
     def rest_state(

@@ -19,9 +19,7 @@ AGAIN = 1e-3
 
 
 @contextmanager
-def ending_signals(
-    handle: Callable[[signal.Signals], None], *, in_callbacks: bool = False
-) -> Iterator[None]:
+def ending_signals(handle: Callable[[signal.Signals], None]) -> Iterator[None]:
     """Calls a function when a signal asks the process to end, as long as the block lasts.
 
     Python allows this in the main thread only; in other threads nothing changes. A SIGHUP that is
@@ -33,7 +31,7 @@ def ending_signals(
     previous = {}
 
     def received(number: int, frame: FrameType | None) -> None:
-        if not in_callbacks and _is_called_by_casadi(frame):
+        if _is_called_by_casadi(frame):
             # Again, a moment later.
             later = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
             later.daemon = True

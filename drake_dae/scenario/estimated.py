@@ -45,9 +45,9 @@ def with_friction_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
 def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
     """The scenario of a law whose estimator knows loads, places of planes, and friction.
 
-    A load is on each frame in contact, which may be at any place; the friction is that of contacts,
-    and Coulomb and viscous friction of all driven joints. Their bounds, from which their estimation
-    starts, follow from masses and efforts of the robot's file.
+    A load is at each frame in contact, and only its mass is estimated; the friction is that of
+    contacts, and Coulomb and viscous friction of all driven joints. Their bounds, from which their
+    estimation starts, follow from masses and efforts of the robot's file.
     """
     assert scenario.estimator is not None
     robot, frictional = scenario.robot, list[str]()

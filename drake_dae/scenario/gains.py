@@ -179,7 +179,9 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
     named = estimator.parameters or []
     identified = ", ".join(name for name in named if name in frictional) or "none"
     if estimator.parameters is None:
-        identified = "friction, loads and tilts"
+        identified = "friction, loads, tilts and places of planes"
+        if scenario.compliances is not None:
+            identified = "friction and loads"
     estimated = "" if fast is None else f", and an estimate of the state of {_rounded(fast):g} 1/s"
     note = (
         f"recommended for a contact of {stiffness:.2g} N/m and {mobility:.2g} 1/kg, samples of "

@@ -89,6 +89,9 @@ N; and the shortest period, s."""
 _FRACTIONS, _PLACES = (1.0, 0.5, 0.2), 4
 """The fractions of the usual circle and force that are tried, each at so many places."""
 
+_SECONDS = 15.0
+"""The processor time in s after which no further place is tried."""
+
 
 @checked(lambda text: ScenarioError(("", text)))
 def new_scenario(
@@ -98,7 +101,6 @@ def new_scenario(
     point: Vector = (0.0, 0.0, 0.0),
     folder: str | Path | None = None,
     progress: Callable[[str], object] = lambda text: None,
-    seconds: float = 15.0,
 ) -> tuple[Scenario, str]:
     """Makes a scenario in which a robot presses on a surface and moves in a circle on it.
 
@@ -116,7 +118,6 @@ def new_scenario(
         folder: Where the text will be saved: a robot's file below it gets a name relative to it.
             Without one the name is absolute.
         progress: Called with a phrase on each step.
-        seconds: After this processor time no further place is tried.
 
     Returns:
         The scenario, in whose way `complete_scenario` finds nothing, and its text with a comment on
@@ -127,7 +128,7 @@ def new_scenario(
             message lists the places that were tried.
     """
     progress("reading the robot")
-    end = process_time() + seconds
+    end = process_time() + _SECONDS
     is_url = file.startswith("package://")
     with at("robot.file"):
         plant, robot = _read(file if is_url or not file else os.path.realpath(file))

@@ -187,8 +187,10 @@ class Estimator(Observing):
             friction of contacts, as "wall.friction", whose initial value is that of the constraint
             (write 0 if it is unknown); and, each with a standard deviation and within `bounds`,
             masses and places of payloads, friction of joints, "wall.rpy" of a surface. If they are
-            left out, on contact that gives way: friction of contacts and joints, the mass of a load
-            "<frame>_load" at each contact, and tilts of surfaces.
+            left out, on contact that gives way: where all surfaces are planes, the joints rigid
+            and velocities measured (no `state_rate`): friction of contacts and joints, places
+            (within 10 mm) and tilts of planes, and the mass of a load "<frame>_load" at each
+            contact; elsewhere friction of contacts, if gains are computed.
     """
 
     rate: float | None = None  # type: ignore[assignment]

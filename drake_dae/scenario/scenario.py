@@ -263,9 +263,9 @@ def scenario_data(scenario: Scenario) -> dict[str, Any]:
     return dict(scenario_reader().write(scenario))
 
 
-def read_scenario(data: Mapping[str, Any], folder: Path | None = None) -> Scenario:
-    """Makes a scenario from plain data; names of files are relative to a folder."""
-    return scenario_reader().read(data, folder)
+def read_scenario(data: Mapping[str, Any]) -> Scenario:
+    """Makes a scenario from plain data."""
+    return scenario_reader().read(data)
 
 
 def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

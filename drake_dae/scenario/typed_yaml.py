@@ -158,9 +158,8 @@ def first_name(names: Iterable[str], key: str) -> str | None:
     return max(found, key=len, default=None)
 
 
-def dump_yaml(data: Any, on_one_line: bool = False) -> str:
+def dump_yaml(data: Any) -> str:
     """The text of plain data, which `load_yaml` reads back equal."""
-    width, flow = (float("inf"), True) if on_one_line else (100, None)
     return str(
-        yaml.dump(data, Dumper=_Dumper, allow_unicode=True, default_flow_style=flow, width=width)
+        yaml.dump(data, Dumper=_Dumper, allow_unicode=True, default_flow_style=None, width=100)
     )

@@ -42,7 +42,7 @@ def test_what_is_left_out_is_advised_and_reported():
     completed, loop = build_completed(found)
     assert len(completed.notes) == 1
     assert "1e+05 N/m" in completed.notes[0]
-    assert "identifies: friction, loads and tilts" in completed.notes[0]
+    assert "identifies: friction, loads, tilts and places" in completed.notes[0]
     model = scenario_model(found)
     structure = scenario_structure(model)
     mobility = structure.constraint_matrix(structure.states[0]).item()

@@ -1,13 +1,12 @@
 """A loop in C as a library, called through ctypes."""
 
 import ctypes
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from c_controller import compile_c
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import Context, OutputPort
+from pydrake.systems.framework import Context
 
 from drake_dae import ClosedLoop
 from drake_dae.blocks.compose import compose
@@ -15,11 +14,9 @@ from drake_dae.running.export.c_code import BlockCode
 from drake_dae.running.export.loop import check_traced, write_loop
 
 
-def code_of(
-    loop: ClosedLoop, context: Context, more: Mapping[str, OutputPort] | None = None
-) -> BlockCode:
-    """The signals of a loop, and other ports, as functions in C."""
-    ports = {name: loop.diagram.GetOutputPort(name) for name in loop.signals} | dict(more or {})
+def code_of(loop: ClosedLoop, context: Context) -> BlockCode:
+    """The signals of a loop as functions in C."""
+    ports = {name: loop.diagram.GetOutputPort(name) for name in loop.signals}
     composed = compose(loop.diagram, ports, context=context, shares=False)
     check_traced(composed, "the loop")
     return BlockCode.of(composed, context, {}, {})
@@ -41,10 +38,9 @@ class CLoop:
         folder: Path,
         config: SimulatorConfig | None = None,
         *flags: str,
-        time: float = 0.0,
         name: str = "a",
     ) -> None:
-        self.files = write_loop(code, time, name, folder, config)
+        self.files = write_loop(code, 0.0, name, folder, config)
         self.outputs, first = {}, 0
         for port, signals in code.outputs.items():
             self.outputs[port] = slice(first, first + len(signals))

@@ -15,9 +15,9 @@ DRIVE = """
     <joint name="{name}"/><actuator name="{name}_motor"/></transmission>"""
 
 
-def gripper(driven=("arm", "left"), multiplier=-0.7, offset=0.05):
+def gripper(driven=("arm", "left"), multiplier=-0.7):
     """An arm with two fingers; the right one mimics the left one and has no motor of its own."""
-    mimic = f'<mimic joint="left" multiplier="{multiplier}" offset="{offset}"/>'
+    mimic = f'<mimic joint="left" multiplier="{multiplier}" offset="0.05"/>'
     text = '<robot name="gripper"><link name="world"/>'
     for name, x, mass in (("palm", 0.2, 3.0), ("left_pad", 0.1, 0.5), ("right_pad", 0.1, 0.4)):
         text += LINK.format(name=name, x=x, mass=mass)

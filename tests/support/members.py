@@ -127,8 +127,9 @@ class SpringyPlant(LeafSystem, Plant):
 
     __slots__ = ()
 
-    def __init__(self, model, structure, rate=40.0):
+    def __init__(self, model, structure):
         super().__init__()
+        rate = 40.0
         self.model, self.dae, self.structure = model, model.dae, structure
         dae, derivatives = model.dae, structure.derivatives
         control = derivatives.control
@@ -215,13 +216,13 @@ class RestingController(LeafSystem, Controller):
         return self.law.predicted_error(times - times[0], values["state"][0], self._goal)
 
 
-def subclasses(family, package="drake_dae"):
+def subclasses(family):
     """Every class of a family that the package has and that can be made."""
     found, waiting = set(), [family]
     while waiting:
         for cls in waiting.pop().__subclasses__():
             waiting.append(cls)
-            if cls.__module__.startswith(package) and not cls.__abstractmethods__:
+            if cls.__module__.startswith("drake_dae") and not cls.__abstractmethods__:
                 found.add(cls)
     return found
 

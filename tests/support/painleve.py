@@ -32,10 +32,10 @@ def rod(friction, angle=1.0):
     return RobotModel(links, [floor], outputs, nominal)
 
 
-def sliding(angle, turn=0.0, slide=-2.0):
+def sliding(angle, turn=0.0):
     """The rod's state, its end on the floor."""
     height, rise = HALF * np.sin(angle), HALF * np.cos(angle) * turn
-    return np.array([0.0, height, angle, slide - HALF * np.sin(angle) * turn, rise, turn])
+    return np.array([0.0, height, angle, -2.0 - HALF * np.sin(angle) * turn, rise, turn])
 
 
 def critical(angle):

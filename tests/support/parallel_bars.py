@@ -8,8 +8,7 @@ pendulum: I a'' = -g S cos a.
 from functools import cache
 
 import numpy as np
-import scipy.integrate
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
 
@@ -17,29 +16,28 @@ from drake_dae import CoincidentPoints, RobotModel, RobotPlant
 
 
 @cache
-def bars(windows, gravity, tilt=0.0):
-    """The robot and its plant; the pivots stand on a line that rises by an angle."""
+def bars(windows, gravity):
+    """The robot and its plant; the pivots stand on a level line."""
     plant = MultibodyPlant(0.0)
     plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, -gravity])
     unit, centre = UnitInertia.ThinRod(1.0, [1.0, 0.0, 0.0]), np.array([0.5, 0.0, 0.0])
     inertia = SpatialInertia(1.0, centre, unit.ShiftFromCenterOfMass(centre))
-    turned, pins, end = RotationMatrix.MakeYRotation(-tilt), [], None
+    pins, end = [], None
 
-    def rod(name, parent, place, turn):
+    def rod(name, parent, place):
         body = plant.AddRigidBody(name, inertia)
-        frame = FixedOffsetFrame(f"{name}_hinge", parent, RigidTransform(turn, place))
+        frame = FixedOffsetFrame(f"{name}_hinge", parent, RigidTransform(place))
         hinge = plant.AddFrame(frame)
         plant.AddJoint(RevoluteJoint(name, hinge, body.body_frame(), [0.0, -1.0, 0.0]))
         return body.body_frame()
 
     for i in range(windows + 1):
-        pivot = turned.multiply(np.array([float(i), 0.0, 0.0]))
-        bar = rod(f"bar{i}", plant.world_frame(), pivot, turned)
+        bar = rod(f"bar{i}", plant.world_frame(), [float(i), 0.0, 0.0])
         if i:
             pin = (f"coupler{i - 1}", (1, 0, 0), f"bar{i}", (1, 0, 0), "xz", f"pin{i}")
             pins.append(CoincidentPoints(*pin))
         if i < windows:
-            end = rod(f"coupler{i}", bar if i == 0 else end, [1.0, 0.0, 0.0], RotationMatrix())
+            end = rod(f"coupler{i}", bar if i == 0 else end, [1.0, 0.0, 0.0])
     plant.Finalize()
     nominal = parallelogram(plant, 1.0, 0.0)[: plant.num_positions()]
     model = RobotModel.from_multibody(plant, pins, [], nominal, "bars", forces=[])
@@ -56,17 +54,3 @@ def parallelogram(plant, angle, rate):
             name = joint.name()
             q[joint.position_start()] = sign.get(name[:3], sign.get(name, 0.0))
     return np.concatenate([q * angle, q * rate])
-
-
-def swung(windows, gravity, angle, rate, duration, tilt=0.0):
-    """Angle and rate after a while, by DOP853 at 1e-13 in a step."""
-    inertia, lever = (windows + 1) / 3 + windows, (windows + 1) / 2 + windows
-    found = scipy.integrate.solve_ivp(
-        lambda t, y: (y[1], -gravity * lever / inertia * np.cos(y[0] + tilt)),
-        (0.0, duration),
-        (angle, rate),
-        method="DOP853",
-        rtol=1e-13,
-        atol=1e-13,
-    )
-    return found.y[:, -1]

@@ -5,9 +5,6 @@ from functools import cache
 
 import numpy as np
 from arms import arm, parse
-from pydrake.geometry import SceneGraph
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context
 
@@ -26,7 +23,6 @@ from drake_dae import (
     TaskController,
     TrackingLaw,
     poles,
-    shipped_model,
     simulate,
 )
 from drake_dae.diagrams import LoopSettings, wire_loop
@@ -85,11 +81,11 @@ def task_loop(
     return wire_loop(soft_wall(), controller, settings=LoopSettings(sampling=sampling))
 
 
-def started(loop: ClosedLoop, distance: float = FAR, height: float = 0.3) -> Context:
+def started(loop: ClosedLoop, distance: float = FAR) -> Context:
     """A context of a loop with the arm at rest, off the wall."""
     context = loop.diagram.CreateDefaultContext()
     guess = polisher().dae.nominal_state
-    loop.set_state(context, loop.controller.rest_state([height, distance], guess))
+    loop.set_state(context, loop.controller.rest_state([0.3, distance], guess))
     return context
 
 
@@ -103,8 +99,3 @@ def push(loop: ClosedLoop, context: Context, force: float) -> None:
     """A hand that pushes the tool into the wall, or pulls it off."""
     own = loop.plant.GetMyMutableContextFromRoot(context)
     loop.plant.set_parameter(own, "push.force", np.array([force, 0.0, 0.0]))
-
-
-def add_arm(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Adds the two-link arm to a plant."""
-    Parser(plant).AddModels(str(shipped_model("two_link_arm.urdf")))

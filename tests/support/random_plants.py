@@ -82,10 +82,10 @@ def make_joint(kind, name, parent, child, random):
     return WeldJoint(name, parent, child, random_pose(random))
 
 
-def random_plant(seed, time_step=0.0):
+def random_plant(seed):
     """A tree with every supported joint, at random places in random order, and two more."""
     random = np.random.default_rng(seed)
-    plant = MultibodyPlant(time_step)
+    plant = MultibodyPlant(0.0)
     plant.mutable_gravity_field().set_gravity_vector(random.normal(0.0, 8.0, 3))
     instances = [plant.AddModelInstance(name) for name in ("first", "second")]
     bodies = [plant.world_body()]
@@ -128,9 +128,9 @@ def random_plant(seed, time_step=0.0):
 
 
 @cache
-def random_robot(seed, time_step=0.0):
+def random_robot(seed):
     """The plant, its expressions, and these as functions of (q, v, masses)."""
-    plant = random_plant(seed, time_step)
+    plant = random_plant(seed)
     expressions = MultibodyExpressions(plant)
     return SimpleNamespace(plant=plant, expressions=expressions, terms=terms_of(expressions))
 
@@ -187,8 +187,8 @@ def assert_terms_agree(plant, context, terms, masses):
     assert_close(N.reshape(v.size, v.size) @ v, plant.MapVelocityToQDot(context, v), "velocity map")
 
 
-def one_body(joint=None, time_step=0.0, finalize=True):
-    plant = MultibodyPlant(time_step)
+def one_body(joint=None, finalize=True):
+    plant = MultibodyPlant(0.0)
     body = plant.AddRigidBody("box", SpatialInertia.SolidCubeWithDensity(1.0, 1.0))
     if joint is not None:
         plant.AddJoint(joint("joint", plant.world_frame(), body.body_frame()))

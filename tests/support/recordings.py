@@ -61,9 +61,9 @@ def vertices(thing):
     return np.asarray(array, dtype=float).reshape(-1, 3)
 
 
-def middles(thing, sides=6):
+def middles(thing):
     """Of a tube, the points of its line, m, shape (k, 3)."""
-    return vertices(thing).reshape(-1, sides, 3).mean(axis=1)
+    return vertices(thing).reshape(-1, 6, 3).mean(axis=1)
 
 
 def overlay(page):

@@ -32,10 +32,10 @@ def two_link(*settings):
     return load_scenario(find_scenario("two_link_wall"), settings)
 
 
-def lever(folder, shape='<box size="1 0.1 0.1"/>', drive=DRIVE, scenario=LEVER):
+def lever(folder, shape='<box size="1 0.1 0.1"/>', drive=DRIVE):
     folder.mkdir(exist_ok=True)
     (folder / "lever.urdf").write_text(ONE_JOINT.format(shape=shape, drive=drive))
-    (folder / "lever.yaml").write_text(scenario)
+    (folder / "lever.yaml").write_text(LEVER)
     return folder / "lever.yaml"
 
 

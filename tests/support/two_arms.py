@@ -9,11 +9,9 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drake_dae import (
     AxisCoordinates,
-    ConstantReference,
     JointPositions,
     PointCoordinates,
     RobotModel,
-    SinusoidReference,
     WeldedFrames,
 )
 from drake_dae.robots import Stage
@@ -33,20 +31,6 @@ GRASP = WeldedFrames(
     name="grasp",
 )
 """The right tool on the right end of the object; its fx presses the object together."""
-
-REFERENCES = [
-    SinusoidReference(APART / 2, 0.05, 2.0),
-    SinusoidReference(0.0, 0.05, 3.0),
-    SinusoidReference(0.4, 0.04, 2.5),
-    ConstantReference([0.0, 0.0]),
-    SinusoidReference(0.0, 0.1, 2.0),
-    ConstantReference([0.0, 0.0]),
-    SinusoidReference(40.0, 15.0, 4.0),
-    ConstantReference([0.0, 0.0]),
-    SinusoidReference(0.0, 1.0, 3.0),
-    ConstantReference([0.0, 0.0]),
-]
-"""The object moves and turns about x; fx presses with 40 N, mx twists, the rest stays zero."""
 
 
 def two_arms_plant() -> MultibodyPlant:

@@ -39,11 +39,12 @@ def with_disturbance(
         system: The system, as a robot's `RobotModel.dae`.
         states: The names of the states whose rates contain d, for a robot those of v.
         frictions: The names of parameters that are observed as well: coefficients of friction, such
-            as "wall.friction", and others that have bounds. They become exogenous signals.
+            as "wall.friction", and others with bounds or `ranges` of `Observing`. They become
+            exogenous signals.
 
     Raises:
         ModelError: A name is not that of a state or parameter, or occurs twice; or the system
-            already has a parameter "disturbance"; or a parameter has no bounds.
+            already has a parameter "disturbance".
     """
     names = [signal.name for signal in system.state_signals]
     for name in states:

@@ -9,8 +9,6 @@ from typing import ClassVar, Self
 
 import casadi as ca
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Parameter, Signal
@@ -66,7 +64,7 @@ class Constraint(ABC):
        relative to the other object.
     8. `touch` is the contact point, if there is a free side; `residual` is its clearance.
        `surface_at` and `placement` are the surface for values of the parameters, and where it
-       stands: for pictures, and for Drake's own contact. `add_to` gives it to Drake, if it can.
+       stands: for pictures, and for Drake's own contact.
     """
 
     name: str
@@ -173,10 +171,3 @@ class Constraint(ABC):
     def placement(self, values: FloatArray) -> RigidTransform:
         """The pose of that surface in the world, for the values of its parameters."""
         return RigidTransform()
-
-    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
-        """Adds it to a plant that is not finalized, and returns Drake's id."""
-        raise ModelError(
-            f"'{self.name}': Drake has no constraint for a {type(self).__name__}; use a "
-            "WeldedFrames, a CoincidentPoints with three axes, or ideal constraints"
-        )

@@ -7,8 +7,6 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import MultibodyConstraintId
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import check_axes
@@ -16,7 +14,7 @@ from drake_dae.dae import Parameter, Signal, signals
 from drake_dae.errors import ModelError
 from drake_dae.robots.constraints.constraint import Constraint
 from drake_dae.robots.links.links import Application, Frames, Kinematics
-from drake_dae.robots.links.plant_frames import body_with_frame, constant_pose
+from drake_dae.robots.links.plant_frames import constant_pose
 from drake_dae.robots.surfaces.surface import Vector
 from drake_dae.trace.expressions import length_of
 
@@ -117,15 +115,6 @@ class CoincidentPoints(Constraint):
         axes = ca.SX.eye(3)[:, self._rows], ca.SX(3, len(self.axes))
         return (Application(point, *axes, self.frame_b, self.frame_a),)
 
-    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
-        if len(self.axes) < 3:
-            return super().add_to(plant)
-        (a, pose_a), (b, pose_b) = (
-            body_with_frame(plant, name) for name in (self.frame_a, self.frame_b)
-        )
-        points = pose_a @ np.array(self.point_a), pose_b @ np.array(self.point_b)
-        return plant.AddBallConstraint(a, points[0], b, points[1])
-
     @property
     def _rows(self) -> list[int]:
         return ["xyz".index(axis) for axis in self.axes]
@@ -184,12 +173,6 @@ class WeldedFrames(Constraint):
         point = kinematics.position(self.frame_b)
         axes = ca.horzcat(R_WA, none), ca.horzcat(none, R_WA)
         return (Application(point, *axes, self.frame_b, self.frame_a),)
-
-    def add_to(self, plant: MultibodyPlant) -> MultibodyConstraintId:
-        (a, pose_a), (b, pose_b) = (
-            body_with_frame(plant, name) for name in (self.frame_a, self.frame_b)
-        )
-        return plant.AddWeldConstraint(a, pose_a @ self.pose, b, pose_b)
 
 
 def rotation_error(E: ca.SX) -> ca.SX:

@@ -21,10 +21,8 @@ from pydrake.multibody.tree import (
     RigidBody,
     RpyFloatingJoint,
     ScrewJoint,
-    SpatialInertia,
     UniversalJoint,
     WeldJoint,
-    default_model_instance,
 )
 
 from drake_dae.arrays import FloatArray, unknown_name, vector
@@ -34,20 +32,6 @@ from drake_dae.robots.links.tree import ElementaryJoint, TreeLink
 
 MOST_CORNERS = 200
 """The largest number of points of a mesh."""
-
-
-def body_with_frame(plant: MultibodyPlant, name: str) -> tuple[RigidBody, RigidTransform]:
-    """A frame's body in a plant that is not finalized, and its pose: for constraints of Drake."""
-    # Drake 1.51 ends the process at a constraint with the world, but not at one with a body that is
-    # welded to the world. So a frame of the world is put on such a body, which is added.
-    frame = frame_named(plant, name)
-    body, pose = frame.body(), frame.GetFixedPoseInBodyFrame()
-    if body.index() == plant.world_body().index():
-        ground = f"drake_dae_ground_{plant.num_bodies()}"
-        inertia = SpatialInertia.SolidBoxWithMass(1.0, 1.0, 1.0, 1.0)
-        body = plant.AddRigidBody(ground, default_model_instance(), inertia)
-        plant.WeldFrames(plant.world_frame(), body.body_frame())
-    return body, pose
 
 
 def frame_named(plant: MultibodyPlant, name: str) -> Frame:

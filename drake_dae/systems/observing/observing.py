@@ -19,7 +19,8 @@ class Observing:
             only constraint forces; None for k_o.
         state_rate: w, the rate at which the state is corrected by measured positions; None for the
             state as it is measured.
-        friction_rate: k_f, the rate at which coefficients of friction are identified.
+        friction_rate: k_f, the rate at which coefficients of friction are identified, unless other
+            parameters are estimated, and friction with these.
         largest_friction: The upper bound of coefficients of friction.
         least_speed: The speed in m/s below which a contact may stick, so that its friction is not
             identified.

@@ -19,7 +19,7 @@ from drake_dae.systems import PointMaterial
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
 RUNNING, HOLDING, STOPPED, WAITING = range(4)
-FAULTS = NONE, NUMBER, STALE, LATE, CLOCK, VALUE = range(6)
+NONE, NUMBER, STALE, LATE, CLOCK, VALUE = range(6)
 
 SAMPLED = "sampling={period: 0.001}"
 EVERYTHING = (

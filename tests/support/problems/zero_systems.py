@@ -112,14 +112,14 @@ def spring_masses(damping: float) -> DaeSystem:
     )
 
 
-def internal(rate: Callable, start: float = 1.0) -> DaeSystem:
+def internal(rate: Callable) -> DaeSystem:
     """z' = u and an internal state s' = rate(s, z)."""
     return DaeSystem.from_functions(
         ["z", "s"],
         f=lambda x: [0, rate(x[1], x[0])],
         h=lambda x: [1, 0],
         l=lambda x: x[0],
-        nominal_state=[0.0, start],
+        nominal_state=[0.0, 1.0],
         output_signals=["z"],
         name="internal",
     )
