@@ -9,11 +9,11 @@ import sqlite3
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import numpy as np
 import pytest
+from distributed import Client, LocalCluster
 from runs import scenario, some
 
 import drake_dae as dd
@@ -97,8 +97,10 @@ def test_it_continues_with_what_is_missing_or_died_and_runs_nothing_again(
 
 
 @pytest.mark.slow
-def test_an_executor_runs_them_too(study, tmp_path):
-    with ThreadPoolExecutor(2) as executor:
+def test_a_dask_cluster_runs_them_too(study, tmp_path):
+    local = {"n_workers": 1, "threads_per_worker": 2, "processes": False}
+    with LocalCluster(**local, dashboard_address=None) as cluster, Client(cluster) as client:
+        executor = client.get_executor()
         found = dd.sweep(chosen(), VARIATIONS, tmp_path / "runs.db", executor=executor)
     assert found.table() == study.table()
 
