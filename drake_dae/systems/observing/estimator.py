@@ -33,8 +33,8 @@ class StateEstimator(ParameterizedSystem):
 
     with the gains of the stationary Kalman filter of each position, `ChainFilter`.
 
-    **Friction** takes its share of r, mu' = k_f (c . r) / (c . c) with c = S^T dg/dmu v.
-    **Parameters** that `with_disturbance` made exogenous, and friction beside them: `ParameterFilter`.
+    **Friction** takes its share of r, mu' = k_f (c . r) / (c . c) with c = S^T dg/dmu v. Parameters
+    that `with_disturbance` made exogenous, and friction beside them, follow by `ParameterFilter`.
 
     Input ports:
         measured_state: x, shape (n,). With a state_rate velocities count if their noise is given.
