@@ -16,6 +16,7 @@ from drake_dae.references import ConstantReference
 from drake_dae.robots import KnownWrench, PointOnSurface
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.robot_file.reading import robot_links
+from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 
@@ -42,13 +43,16 @@ def build_commanded(scenario: Scenario) -> Commanded:
     additional friction are zero. Signals for which a task waits are inputs of the diagram.
 
     Raises:
-        ScenarioError: The scenario itself is not valid, or its plant has Drake's own contact, which
-            cannot be traced; the message contains the key.
+        ScenarioError: The scenario itself is not valid, or its plant has Drake's hydroelastic
+            contact, which cannot be traced; the message contains the key. Point contact can.
     """
+    scenario, remark = for_rollout(scenario)
     if scenario.plant.carries:
-        text = "Drake's own contact cannot be traced: take a !CompliantContact in its place"
+        text = (
+            "Drake's hydroelastic contact cannot be traced: take a !CompliantContact in its place"
+        )
         raise ScenarioError(("plant", text))
-    extended, left_out = scenario, list[str]()
+    extended, left_out = scenario, [f"Drake's plant: {remark}"] if remark else []
     parts: Mapping[str, Callable[[Scenario], Scenario]] = {
         "friction of the plant": _with_friction,
         "surfaces that are dragged": _with_moving_surfaces,
@@ -63,7 +67,7 @@ def build_commanded(scenario: Scenario) -> Commanded:
         completed, loop = build_completed(extended, commanded=True)
     except DrakeDaeError as error:
         completed, loop = build_completed(scenario, commanded=True)  # Its own errors come first.
-        left_out = [f"{name}: {error}" for name in parts]
+        left_out = left_out[: bool(remark)] + [f"{name}: {error}" for name in parts]
     # The original exogenous signals decide whether the loop starts at rest.
     initial = replace(completed.scenario, exogenous=scenario.exogenous)
     return Commanded(completed.scenario, loop, start_scenario(initial, loop), tuple(left_out))

@@ -43,7 +43,7 @@ def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
     none = {f"{name}.viscous_friction": 0.0 for name in viscous}
     plant = replace(plant, parameters={**plant.parameters, **none})
     return replace(scenario, plant=plant), (
-        f"the rollout runs !{type(plant).__name__} in place of !{type(scenario.plant).__name__}: "
+        f"a !{type(plant).__name__} runs in place of !{type(scenario.plant).__name__}: "
         "the same equations of contact, traced. Drake's solver stops at a relative residual of "
         "1e-6, and joints stop at their limits in Drake's plant alone"
     )

@@ -9,11 +9,12 @@ import pytest
 from browser import LOW_CONTRAST, in_page, needs_chromium
 from runs import scenario
 
-from drake_dae import write_page
+from drake_dae import build_scenario, write_page
 from drake_dae.cli import main
 from drake_dae.errors import MachineCodeError
 from drake_dae.pictures.page import wasm
 from drake_dae.scenario import build_commanded
+from drake_dae.scenario.rolled import for_rollout, roll_scenario
 
 needs_zig = pytest.mark.skipif(find_spec("ziglang") is None, reason="there is no ziglang")
 
@@ -30,6 +31,28 @@ def page(tmp_path_factory):
     given = built.loop, built.context, file, scenario("two_link_wall").integrator
     assert write_page(*given, TITLE, ["not <b>this</b>"]) == file
     return file
+
+
+@needs_zig
+@pytest.mark.slow
+@needs_chromium
+def test_drakes_contact_is_shown_in_steps_with_the_errors_of_a_rollout(tmp_path):
+    """Compared at another moment of a step than its end, 0.3 m/s would look like 0.3 mm."""
+    point = "{time_step: 0.001, contact_model: point, stiffness: 1.0e5, friction: 0}"
+    chosen = scenario(
+        *("two_link_wall", f"plant=!MultibodyPlant {point}", "law.gains=null", "duration=3"),
+        *("sampling={period: 0.001, delay: 0.001}", "estimator.parameters=[]"),
+    )
+    built, file = build_commanded(chosen), tmp_path / "contact.html"
+    assert "MultibodyPlant" in built.left_out[0]
+    write_page(built.loop, built.context, file, chosen.integrator)
+    script = "await run(3); return bench.samples.slice(-100).map(({ error }) => error);"
+    found = np.array(in_page(file.read_text(), script, tmp_path / "script.html"))
+    rolled = for_rollout(chosen)[0]
+    record = roll_scenario(rolled, *build_scenario(rolled)).record
+    wanted = (record["controlled_output"] - record["desired_output"])[record.time > 2.2]
+    assert np.abs(wanted).max() > 0.0
+    assert np.all(np.abs(found).max(axis=0) < 1.2 * np.abs(wanted).max(axis=0) + 1e-9)
 
 
 @pytest.mark.slow
@@ -201,8 +224,8 @@ def test_a_page_is_small_and_loads_nothing(page):
 
 
 @pytest.mark.slow
-def test_drakes_own_contact_is_refused_with_what_takes_its_place(tmp_path, capsys):
-    assert main(["page", "wall_point_contact", f"--out={tmp_path / 'no.html'}"]) == 1
+def test_hydroelastic_contact_is_refused_with_what_takes_its_place(tmp_path, capsys):
+    assert main(["page", "wall_hydroelastic", f"--out={tmp_path / 'no.html'}"]) == 1
     assert "!CompliantContact" in capsys.readouterr().err
     assert not (tmp_path / "no.html").exists()
 

@@ -48,7 +48,7 @@ USUAL_POLE = 4.0
 """The assumed rate of decay of the errors where there is no law with poles, in 1/s."""
 
 TICK = 1.0 / 120.0
-"""Commands take effect at multiples of this time after the start, in s."""
+"""Commands take effect at multiples of this time after the start, in s, or of the steps near it."""
 
 _CONTENT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; "
@@ -211,13 +211,17 @@ class Bench:
         else:  # A task desires distances, too, while its contact is open.
             r = [first["desired_output"] + k for k in range(len(signals))]
         slowest = float(np.min(-law.gains.poles.real)) if law.gains.poles.size else USUAL_POLE
+        # The state of a plant that steps is shown just before a step, where it is that of the time.
+        step = loop.plant.time_step
+        tick = step * max(round(TICK / step), 1) if step else TICK
         pushes = pushes_of(loop.plant, numbers)
         rate = PUSHED_FRACTION * self.size * slowest**2
         strongest = strongest_pushes(loop.plant, self.state, list(pushes), rate)
         return {
             **self.robot.data(self.state, lambda *which: sliders.get(which)),
             "start": self.context.get_time(),
-            "tick": TICK,
+            "tick": tick,
+            "early": 1e-6 * step,
             "size": self.size,
             "outputs": [asdict(signal) for signal in signals],
             "places": {

@@ -35,7 +35,7 @@ async function makeEngine() {
     },
     /* Samples after each of some ticks. */
     advance(ticks) {
-      return Array.from({ length: ticks }, () => sample(data.start + ++tick * data.tick));
+      return Array.from({ length: ticks }, () => sample(data.start + ++tick * data.tick - data.early));
     },
   };
 }
