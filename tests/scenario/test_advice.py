@@ -11,11 +11,13 @@ from runs import scenario
 
 from drake_dae import build_scenario, contact_gains, load_scenario
 from drake_dae.cli import main
+from drake_dae.dae import Parameter
+from drake_dae.dae.beyond.disturbance import estimated_within
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import build, plants
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.build import build_completed
-from drake_dae.scenario.estimated import with_all_estimated
+from drake_dae.scenario.estimated import estimates_all, with_all_estimated
 from drake_dae.scenario.gains import advised, sensed_contact
 from drake_dae.scenario.judging import find_feasibility
 from drake_dae.scenario.model import scenario_model, scenario_structure
@@ -73,6 +75,33 @@ def test_an_estimator_estimates_what_it_can_unless_parameters_are_named():
         ("estimator.parameters=[]",): set(),
     }
     assert loop.observer.friction_signals[0].name == "wall.friction"
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_free"),
+    [
+        ([], True),
+        (["constraints.0.surface=!Sphere {center: [2.2, 0, 0.3], radius: 1.0}"], False),
+        (["estimator.state_rate=200"], False),
+        (["plant=!IdealConstraints {}"], False),
+        (["estimator.parameters=[link2.mass]"], False),
+    ],
+)
+def test_it_is_estimated_on_planes_that_give_way_with_velocities(settings, is_free):
+    found = two_link("estimator.rate=20", *settings)
+    assert estimates_all(found, scenario_model(found)) == is_free
+
+
+def test_ranges_end_where_a_parameter_has_no_meaning():
+    mass, friction, angle = (
+        Parameter("mass", 0.1, positive=True),
+        Parameter("friction", 0.1, nonnegative=True),
+        Parameter("angle", 0.1),
+    )
+    ranges = dict.fromkeys(["mass", "friction", "angle"], 1.0)
+    low, high = estimated_within([mass, friction, angle], ranges)
+    np.testing.assert_allclose(low, [1e-4, 0.0, -0.9], rtol=1e-12)
+    np.testing.assert_allclose(high, 1.1, rtol=1e-12)
 
 
 def test_what_cannot_be_estimated_refuses_no_run(monkeypatch):
