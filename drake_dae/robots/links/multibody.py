@@ -353,12 +353,14 @@ class MultibodyExpressions(Links):
                         f"the plant's own {name} is not finite at q = {state[0]}: a joint has no "
                         "mass to move; give each moving link mass and inertia, or weld it"
                     )
-                error = np.abs(one - other).max() / max(np.abs(other).max(), scale)
-                if not error <= TOLERANCE:
+                error = np.abs(one - other) / max(np.abs(other).max(), scale)
+                if not error.max() <= TOLERANCE:
+                    place = np.unravel_index(np.argmax(error), error.shape)
                     raise ModelError(
-                        f"{name} differs from the plant's own by {error:.1e} (relative) at "
-                        f"q = {state[0]}, v = {state[1]}; this is an error in drake_dae, please "
-                        "report the model"
+                        f"{name} differs from the plant's own by {error.max():.1e} (relative): "
+                        f"entry {[int(i) for i in place]} is {one[place]:g}, the plant's "
+                        f"{other[place]:g}, at q = {state[0]}, v = {state[1]}; this is an error in "
+                        "drake_dae, please report the model"
                     )
 
 
