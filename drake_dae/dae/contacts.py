@@ -22,11 +22,8 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 
-FAR = 1e9
-"""Forces that exceed what they balance by this factor count as infinite."""
-
-MOST = 8
-"""The largest number of unilateral forces with friction: every subset of them is examined."""
+FAR = 1e9  # Forces that exceed what they balance by this factor count as infinite.
+MOST = 8  # The largest number of unilateral forces with friction: every subset of them is examined.
 
 
 @dataclass(frozen=True)

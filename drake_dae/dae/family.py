@@ -11,26 +11,20 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import fields_at
 from drake_dae.errors import InconsistentStateError
 
+# The number of random members. Functions are analytic almost everywhere: one that is zero at a few
+# random members is zero at all.
 MEMBERS = 4
-"""The number of random members. Functions are analytic almost everywhere: one that is zero at a few
-random members is zero at all."""
-
-VISIBLE = 1e-6
-"""An action above this, relative to the sizes of its terms, is not round-off."""
-
+VISIBLE = 1e-6  # An action above this, relative to the sizes of its terms, is not round-off.
+# If there is no consistent state for drawn numbers, they are moved towards the defaults by this
+# factor, so often.
 NEARER, TRIES = 0.25, 6
-"""If there is no consistent state for drawn numbers, they are moved towards the defaults by this
-factor, so often."""
-
+# How a box of bounds is searched: the number of random corners and of random places, of the places
+# from which a margin is minimized, of steps, and the difference for its gradient.
 CORNERS, STARTS, DESCENTS, STEP = 16, 3, 25, 1e-4
-"""How a box of bounds is searched: the number of random corners and of random places, of the places
-from which a margin is minimized, of steps, and the difference for its gradient."""
-
+# Parameters that differ less from their defaults, relative to the others, do not decide.
 SAME = 1e-3
-"""Parameters that differ less from their defaults, relative to the others, do not decide."""
-
+# A function of a consistent state and the values of all parameters.
 OfMember = Callable[[FloatArray, FloatArray], float]
-"""A function of a consistent state and the values of all parameters."""
 
 
 @dataclass(frozen=True, eq=False)

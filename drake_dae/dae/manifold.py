@@ -26,20 +26,12 @@ from drake_dae.trace.newton import (
 )
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
-POLE = 1e-3
-"""A larger residual, over its usual change by the scale of the states, is no round-off."""
-
-NEAR_POLE = 1e-6, 1e-3
-"""The distances at which poles show, in states over their scale."""
-
-RESTARTS = 12
-"""The number of random starts of `Manifold.settle`."""
-
+POLE = 1e-3  # A larger residual, over its usual change by the scale of the states, is no round-off.
+NEAR_POLE = 1e-6, 1e-3  # The distances at which poles show, in states over their scale.
+RESTARTS = 12  # The number of random starts of `Manifold.settle`.
+# A velocity is kept if no state moves further for it than so many times the size of the state.
 FAR = 100.0
-"""A velocity is kept if no state moves further for it than so many times the size of the state."""
-
-FLOOR = 1e-12
-"""A distance from N* that is round-off even if all states are zero."""
+FLOOR = 1e-12  # A distance from N* that is round-off even if all states are zero.
 
 
 class Manifold:

@@ -25,30 +25,18 @@ from drake_dae.trace.expressions import result_of
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 
+# A or B counts as singular below this fraction of its usual margin, also if it is a single number.
 VANISHED = 1e-9
-"""A or B counts as singular below this fraction of its usual margin, also if it is a single
-number."""
-
+# The tolerance of an integration step; the method overestimates its error by two orders.
 TOLERANCE = 1e-6
-"""The tolerance of an integration step; the method overestimates its error by two orders."""
-
-SHORTEST = 1e-6
-"""The smallest step, as a fraction of a time step, at which the motion ends."""
-
-JUMP = 0.1
-"""A correction above this, relative to the state, may lead to another solution."""
-
-MOST_STEPS = 20_000
-"""The largest number of steps of one motion, besides its given times."""
-
-GROWN = 1e8
-"""A state that has grown by this factor grows without bound."""
-
+SHORTEST = 1e-6  # The smallest step, as a fraction of a time step, at which the motion ends.
+JUMP = 0.1  # A correction above this, relative to the state, may lead to another solution.
+MOST_STEPS = 20_000  # The largest number of steps of one motion, besides its given times.
+GROWN = 1e8  # A state that has grown by this factor grows without bound.
+# A margin below this fraction of its largest value along the motion counts as tending to zero.
 LOST = 1e-2
-"""A margin below this fraction of its largest value along the motion counts as tending to zero."""
-
+# t -> R(t) = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), or t -> values of all parameters.
 TimeFunction = Callable[[float], FloatArray]
-"""t -> R(t) = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), or t -> values of all parameters."""
 
 
 @dataclass(frozen=True, eq=False)

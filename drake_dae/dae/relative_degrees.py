@@ -24,12 +24,10 @@ from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.round_off import Sized, multiply
 
-MANY = 10
-"""A function that is zero at this many random states is zero."""
-
+MANY = 10  # A function that is zero at this many random states is zero.
+# Rows of numbers at a state for values of all parameters, without round-off, with their sizes
+# before cancellation.
 Row = Callable[[FloatArray, FloatArray], Sized]
-"""Rows of numbers at a state for values of all parameters, without round-off, with their sizes
-before cancellation."""
 
 
 def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list[ca.SX]], Samples]:

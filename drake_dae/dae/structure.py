@@ -36,8 +36,7 @@ from drake_dae.trace.round_off import equilibrated, equilibration, positive, sma
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 
-PART = 0.1
-"""The least part of a constraint in a vanishing combination, relative to the largest."""
+PART = 0.1  # The least part of a constraint in a vanishing combination, relative to the largest.
 
 
 @checked(ModelError)

@@ -308,7 +308,8 @@ def judge_run(
         more=behind,
     )
     told = tuple(dict.fromkeys(filter(None, notes)))
-    return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy)
+    named = (scenario.estimator.parameters if scenario.estimator else None) or ()
+    return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy, named)
 
 
 def _beyond_edge(

@@ -27,27 +27,17 @@ from drake_dae.arrays import brief
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
 from drake_dae.trace.compiler import FLAGS, find_compiler
 
-Compiled = bool | Literal["auto"]
-"""Whether functions become machine code."""
-
+Compiled = bool | Literal["auto"]  # Whether functions become machine code.
+# After this many calls "auto" looks into the cache, which takes about as long as these calls.
 LOOK = 500
-"""After this many calls "auto" looks into the cache, which takes about as long as these calls."""
-
-INTERPRETED = 5.5e-9
-"""The time of an interpreted operation, in s."""
-
+INTERPRETED = 5.5e-9  # The time of an interpreted operation, in s.
+# The time to compile an operation, in s; -O0 makes code that is three times slower.
 COMPILING = {"-O1": 2.7e-4, "-O0": 4e-5}
-"""The time to compile an operation, in s; -O0 makes code that is three times slower."""
-
-STARTING = 0.05
-"""The start-up time of a compiler, in s."""
-
-LIMIT = 10.0
-"""The longest expected compilation under "auto", in s."""
-
+STARTING = 0.05  # The start-up time of a compiler, in s.
+LIMIT = 10.0  # The longest expected compilation under "auto", in s.
+# A compiler hangs if it takes this long, in s, and this many times longer than expected on an idle
+# machine.
 HANGS = (120.0, 40.0)
-"""A compiler hangs if it takes this long, in s, and this many times longer than expected on an idle
-machine."""
 
 
 def attempts(compiled: Compiled, operations: int) -> list[tuple[int, bool]]:

@@ -17,12 +17,11 @@ from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled, attempts, machine_code
 
+# A number above this, in any unit, means that something grew without bound. Its powers cancel and
+# overflow, so that pivots have no meaning.
 HUGE = 1e30
-"""A number above this, in any unit, means that something grew without bound. Its powers cancel and
-overflow, so that pivots have no meaning."""
-
+# A matrix whose `pivot` is below this counts as singular; see `trace.factorization`.
 SINGULAR_PIVOT = 1e-12
-"""A matrix whose `pivot` is below this counts as singular; see `trace.factorization`."""
 
 
 class FailureKind(Enum):

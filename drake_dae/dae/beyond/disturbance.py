@@ -15,11 +15,8 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
-DISTURBANCE = "disturbance"
-"""The name of the parameter."""
-
-_TINY = 1e-200
-"""The denominator where nothing slides or presses; the quotient is then not used."""
+DISTURBANCE = "disturbance"  # The name of the parameter.
+_TINY = 1e-200  # The denominator where nothing slides or presses; the quotient is then not used.
 
 
 @checked(ModelError)
