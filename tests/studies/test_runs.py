@@ -6,6 +6,7 @@ from runs import run_scenario, scenario, some
 
 from drake_dae import build_scenario
 from drake_dae.analysis import robot_limits
+from drake_dae.errors import ScenarioError
 from drake_dae.running.summary import figures_of
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import read_scenario, scenario_data, varied_data
@@ -165,6 +166,16 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
         assert bool(result.figures) == (outcome in (Outcome.FAILED, Outcome.FINISHED))
         if outcome is Outcome.FAILED:
             assert 0.0 < result.figures["end [s]"] < 2.0
+
+
+UNTRACED = "plant=!MultibodyPlant {contact_model: hydroelastic}"
+
+
+def test_what_no_rollout_has_is_reported():
+    base = scenario_data(scenario("two_link_wall", *SHORT, UNTRACED))
+    Runner(base).check({})
+    with pytest.raises(ScenarioError, match="Simulator"):
+        Runner(base, 1.0).check({})
 
 
 @pytest.mark.slow
