@@ -1,5 +1,7 @@
 """What is told about a run, as text, as data and as figures, of a record made by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arms import arm
@@ -104,14 +106,18 @@ def test_cut_off_controls_say_for_how_long():
     assert row[-2:] == ["0.4", "s"]
 
 
-def test_identified_parameters_with_what_the_motion_does_not_excite():
-    signals = [("wall.friction", ""), ("load.mass", "kg")]
+def test_identified_parameters_that_differ_from_the_law_or_that_are_named():
+    signals = [("wall.friction", ""), ("wall.rpy[1]", "rad"), ("load.mass", "kg")]
     found = record(
-        identified=([[0.5, 1.0], [0.3, 1.0], [0.25, 1.0]], signals),
-        identified_deviation=([[0.2, 1.0], [0.1, 1.0], [0.01, 0.9]], signals),
+        identified=([[0.5, 0.0, 1.0], [0.3, 0.0, 1.0], [0.25, 0.015, 1.0]], signals),
+        identified_deviation=([[0.2, 0.1, 1.0], [0.1, 0.1, 1.0], [0.01, 0.01, 0.9]], signals),
     )
     text = summary(found).text
     assert "wall.friction = 0.25 +- 0.01" in text
+    assert "wall.rpy[1]" not in text  # It is within two deviations of the 0 before.
+    assert "load.mass" not in text
+    text = replace(summary(found), named=["wall.rpy", "load.mass"]).text
+    assert "wall.rpy[1] = 0.015 +- 0.01 rad" in text
     assert "load.mass: this motion" in text
 
 

@@ -178,8 +178,8 @@ def test_scenario_as_run_says_all_and_needs_no_advice(tmp_path):
 def test_run_reports_its_advice_and_what_it_identified(tmp_path, capsys):
     out = tmp_path / "run"
     write = "write={record: false, plots: false, animation: false}"
-    command = ["simulate", "wall_point_contact", "--out", str(out)]
-    assert main([*command, "--set", "duration=0.1", "--set", write]) == 0
+    command = ["simulate", "wall_point_contact", "--out", str(out), "--set", "duration=0.1"]
+    assert main([*command, "--set", "plant.friction=0.35", "--set", write]) == 0
     assert "recommended for a contact of 1e+05 N/m" in capsys.readouterr().out
     told = (out / "summary.txt").read_text()
     assert "recommended for a contact of 1e+05 N/m" in told
