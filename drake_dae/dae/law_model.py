@@ -86,15 +86,10 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
 
         M v' + D (v + T v') = u,    or    (M + T D) v' + D v = u.
 
-    With M alone the joint moves as if it had M + T D while gains and integrals are computed for M:
-    a light joint with T D / M = 30, as in the wrists of some arms, has errors that decay 30 times
-    as slowly. Drake's discrete MultibodyPlant has the same matrix, with its step h in place of T,
-    since its damping is implicit: it adds h / 2 to T.
-
-    D is -df / dv without Coulomb friction at the nominal speeds, usually rest, and at any position:
-    a contact with viscous friction damps several joints by one matrix J^T d J. v are the states
-    that a force or a control drives. Those whose own damping, at the nominal state, is 0 or
-    negative do not count.
+    With M alone the errors of a light joint with T D / M = 30, as in the wrists of some arms, decay
+    30 times as slowly as designed. Drake's discrete MultibodyPlant, whose damping is implicit, adds
+    h / 2 to T. D is -df / dv without Coulomb friction at the nominal speeds, at any position. v are
+    the states that a force or a control drives, if their own damping there is positive.
     """
     if latency < 0.0:
         raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")
@@ -115,17 +110,11 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
         return system
     damping, places = ca.SX(n, n), [rows[i] for i in kept]
     damping[places, places] = slopes[kept, kept]
-    added, inner = latency * ca.sparsify(damping), system.implicit
-
-    def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
-        assert inner is not None
-        balance, constraint_rate = inner(rate, constraint_input)
-        return balance + ca.mtimes(added, rate), constraint_rate
-
+    added = latency * ca.sparsify(damping)
     return replace(
         system,
         mass_matrix=system.mass_matrix + added,
-        implicit=None if inner is None else implicit,
+        implicit=system.implicit_with(lambda rate: ca.mtimes(added, rate)),
         state_scale=system.scale,
     )
 
