@@ -82,33 +82,11 @@ def with_exogenous(block: Block, places: Sequence[int]) -> Block:
     """The block, whose parameters at some places come through an input port `exogenous`."""
     exogenous, parameters = ca.SX.sym("exogenous", len(places)), ca.SX(block.parameters)
     parameters[list(places)] = exogenous
-
-    def moved(value: ca.SX) -> ca.SX:
-        (value,) = ca.substitute([value], [block.parameters], [parameters])
-        return value
-
-    projection = block.projection
-    if projection is not None:
-        projection = replace(projection, parameters=moved(projection.parameters))
+    moved = block.mapped(lambda v: ca.substitute(v, [block.parameters], [parameters]))
     return replace(
-        block,
-        projection=projection,
+        moved,
         inputs={**block.inputs, "exogenous": exogenous},
-        outputs={name: moved(value) for name, value in block.outputs.items()},
-        derivative=moved(block.derivative),
-        held={
-            name: replace(
-                held,
-                next=moved(held.next),
-                begin=None if held.begin is None else moved(held.begin),
-            )
-            for name, held in block.held.items()
-        },
-        defaults={
-            **{name: moved(value) for name, value in block.defaults.items()},
-            "exogenous": block.parameters[list(places)],
-        },
-        requirements=tuple(replace(r, margin=moved(r.margin)) for r in block.requirements),
+        defaults={**moved.defaults, "exogenous": block.parameters[list(places)]},
     )
 
 
