@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from difflib import get_close_matches
-from functools import cache
 from math import isfinite
 
 import numpy as np
@@ -23,6 +21,7 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import unknown_name
 from drake_dae.blocks.traced_system import check_context
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
 from drake_dae.running.compiled_run import NO_EVENTS, CompiledRun
@@ -81,7 +80,7 @@ def simulate(
         progress: Shows simulated time and speed on stderr.
         may_diverge: Whether a diverging run continues.
         look: A function that is called with the context after some steps, at least after every
-            32nd, such as `RecordWriter.update`.
+            32nd.
 
     Raises:
         ModelError: The duration or the settings are not valid.
@@ -183,30 +182,13 @@ def check_duration(duration: float) -> None:
         raise ModelError(f"a duration must be positive, got {duration} s")
 
 
-@cache
-def _schemes() -> dict[str, bool]:
-    """The schemes of Drake, and whether they have error control; CENIC needs a MultibodyPlant."""
-    found = dict[str, bool]()
-    for name in GetIntegrationSchemes():
-        if name != "cenic":
-            trial = Simulator(Integrator(1))
-            config = SimulatorConfig(integration_scheme=name, use_error_control=True)
-            ApplySimulatorConfig(config, trial)
-            found[name] = not trial.get_integrator().get_fixed_step_mode()
-    return found
-
-
 def check_config(config: SimulatorConfig) -> None:
     """Checks for settings that Drake accepts but that hang, fail late, or are ignored."""
     scheme = config.integration_scheme
-    schemes = _schemes()
+    schemes = [name for name in GetIntegrationSchemes() if name != "cenic"]  # Of MultibodyPlants.
     if scheme not in schemes:
-        near = get_close_matches(scheme, schemes, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ModelError(
-            f"integration_scheme: no scheme '{scheme}' for these systems; {hint}there are "
-            f"{', '.join(schemes)}"
-        )
+        text = unknown_name("scheme", scheme, schemes)
+        raise ModelError(f"integration_scheme: {text}")
     for name in ("accuracy", "max_step_size"):
         value = getattr(config, name)
         if not (isfinite(value) and value > 0.0):
@@ -216,7 +198,9 @@ def check_config(config: SimulatorConfig) -> None:
             f"target_realtime_rate must not be negative, got {config.target_realtime_rate}; 0 is "
             "as fast as possible"
         )
-    if config.use_error_control and not schemes[scheme]:
+    trial = Simulator(Integrator(1))
+    ApplySimulatorConfig(config, trial)
+    if config.use_error_control and trial.get_integrator().get_fixed_step_mode():
         raise ModelError(
             f"use_error_control: {scheme} has none; set it to false and max_step_size to the "
             "step, or choose runge_kutta5"
