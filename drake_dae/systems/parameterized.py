@@ -19,13 +19,9 @@ from drake_dae.robots import RobotModel
 class ParameterizedSystem(TracedSystem):
     """A block whose numeric parameter 0 begins with all parameters of a DaeSystem.
 
-    So a study changes numbers in a context without tracing again, and a controller can have other
-    numbers than its plant. Varying parameters, the exogenous signals w, come through an input port
-    `exogenous` with the derivatives that the block needs, stacked like references: w_1, w_1', ...,
-    w_2, .... Without a wire they keep the values of the parameters.
-    `exogenous_layout` and `exogenous_places` are the layout of that port's entries, and their
-    indices among the parameters. `degrees` are the numbers of derivatives of the entries of w that
-    the block needs; by default those on which its expressions depend.
+    Varying ones, the exogenous signals w, come through an input port `exogenous` with as many
+    derivatives, `degrees`, as the block needs, stacked like references; without a wire they keep
+    the values of the parameters, at `exogenous_places`.
     """
 
     __slots__ = TracedSystem.__slots__
