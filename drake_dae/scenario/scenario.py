@@ -149,7 +149,6 @@ _REFERENCES: dict[str, type] = {
     "!PointToPoint": rs.PointToPointReference,
     "!Line": rs.LineReference,
     "!Circle": rs.CircleReference,
-    "!Spiral": rs.SpiralReference,
     "!Polyline": rs.PolylineReference,
     "!Waypoints": rs.WaypointsReference,
     "!Csv": rs.CsvReference,

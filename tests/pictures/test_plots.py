@@ -1,6 +1,7 @@
 """Plots of runs: what they show, of records made by hand, and the command that draws them."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -267,3 +268,20 @@ def test_the_moment_of_a_change_shows_the_phase_before_it():
     times = np.array([0.0, 1.9, 2.0, 2.1, 4.0, 4.1, 5.0])
     wanted = ["Approach"] * 3 + ["Press"] * 2 + ["Release"] * 2
     assert phases_at(run, times) == wanted
+
+
+def test_names_of_short_phases_stand_apart():
+    times, phase = np.linspace(0.0, 10.0, 101), np.zeros((101, 4))
+    for k, begin in enumerate((0, 50, 52, 54)):
+        phase[begin:, k], phase[begin:, :k] = 1.0, 0.0
+    signals = {
+        "control": Recorded(np.zeros((101, 1)), [Signal("u", "N m")]),
+        "phase": Recorded(phase, [Signal(f"{k} Move", "") for k in range(4)]),
+    }
+    figure = plot_runs({"one": Record(times, signals)}, ["control"])
+    (axis,) = figure.axes
+    assert legend(figure) == ["one"]
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in axis.texts]
+    assert len(boxes) == 4
+    assert all(a.x1 <= b.x0 for a, b in pairwise(boxes))

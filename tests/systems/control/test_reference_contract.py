@@ -23,7 +23,7 @@ from drake_dae import (
     WaypointsReference,
 )
 from drake_dae.errors import ReferenceSignalError
-from drake_dae.references import PathLimits, ReferenceRows, SpiralReference
+from drake_dae.references import PathLimits, ReferenceRows
 from drake_dae.systems import TrajectoryReference
 
 PATH = PiecewisePolynomial.CubicWithContinuousSecondDerivatives(
@@ -47,7 +47,6 @@ MEMBERS = {
     "line": LineReference([0.0, 1.0], [0.8, 0.4], LIMITS, 0.2),
     "circle": CircleReference([0.0, 1.0], 0.3, period=2.0),
     "turn": CircleReference([0.0, 1.0], 0.1, limits=LIMITS),
-    "spiral": SpiralReference([0.0, 1.0], 0.0, 0.3, 0.2, LIMITS),
     "polyline": PolylineReference(EDGES, LIMITS, 0.2),
     "polyline of many pieces": PolylineReference(EDGES, LIMITS, 0.01),
     "waypoints": WaypointsReference([[0.0, 0.0], [0.3, 0.2], [0.5, 0.0]], [0.1, 0.8, 1.9]),
