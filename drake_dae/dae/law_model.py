@@ -29,9 +29,8 @@ def damped(
     force. On N* all y_i^(j) vanish, so that nothing changes there: alpha (13) becomes alpha - A^-1
     (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay.
 
-    If a force is an output of degree mu >= 1, the law differentiates alpha and takes the added term
-    as constant: a compliant contact does not move as the model demands, so that the derivatives of
-    the model would destabilize it. The force poles must be faster than the contact.
+    Where a force is an output of degree mu >= 1, the law takes the added term as constant: along
+    the model its derivatives would destabilize a compliant contact, which moves otherwise.
     """
     system = acting_late(structure.system, latency)
     if damping is None and system is structure.system:
@@ -127,8 +126,7 @@ class ForceMeasurement:
             force error of a wrong model shrinks to 1 / (1 + Gbar).
         mu_i >= 1: v_j takes the place of the model's l*_i, as (71) and (81) allow.
 
-    Outputs that are combinations of constraint inputs, z_i = m_i(x) v, take m_i v in place of v_j;
-    then Gbar is a multiple of the identity.
+    For outputs that are combinations, z_i = m_i(x) v, Gbar is a multiple of the identity.
     """
 
     layout: DerivativeLayout
@@ -285,8 +283,8 @@ class IntegralAction:
 class Deflection:
     """The motion of compliant contacts, lambda = -k phi, that a wanted force lambda_d needs.
 
-    A law that keeps phi'' + c phi' = 0 leaves phi'' + c phi' = A (lambda - lambda_d) there: a step
-    of lambda_d makes the contact oscillate with sqrt(A k). With phi_d = -lambda_d / k and
+    A law that keeps phi'' + c phi' = 0 lets a step of lambda_d make the contact oscillate with
+    sqrt(A k). With phi_d = -lambda_d / k and
 
         phi'' - phi_d'' + c (phi' - phi_d') = 0,    so    u for lambda_d + A^-1 (c lambda_d' +
                                                           lambda_d'') / k,
