@@ -132,7 +132,7 @@ def test_the_program_finds_what_is_wrong(two_link, tmp_path):
     assert done.stdout.endswith("FAILED\n")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @needs_compiler
 def test_a_long_controller_plays_with_the_instructions_of_this_processor(tmp_path):
     """Where what is held begins with several equal numbers, of which gcc 12 made more."""
