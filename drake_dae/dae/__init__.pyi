@@ -11,7 +11,7 @@ from .beyond.contact_gains import contact_gains as contact_gains
 from .beyond.disturbance import IdentifiedTerms as IdentifiedTerms
 from .beyond.disturbance import Observation as Observation
 from .beyond.disturbance import with_disturbance as with_disturbance
-from .beyond.lags import Lags as Lags
+from .beyond.filters import Lags as Lags
 from .beyond.one_direction import SensorNoise as SensorNoise
 from .contacts import UnilateralInput as UnilateralInput
 from .derivatives import Derivatives as Derivatives
