@@ -1,7 +1,6 @@
 """Margins: how far a matrix of the state is from losing its rank, and friction from the paradox."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 
 import casadi as ca
@@ -9,17 +8,11 @@ import numpy as np
 
 from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.contacts import critical_factor
-from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Samples
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
-# The allowed distance of a state from the box after Newton's method, relative to the box.
-SLACK = 1e-6
-# A gradient that changes a function by less than this fraction across the box counts as zero.
-FLAT = 1e-3
-TRIES = 6  # Of each step, each a quarter of the one before.
 # Critical coefficients above this are meaningless: they occur where sliding is only round-off.
 MEANINGLESS = 1e6
 # The fractions of the lowest critical friction so far for which a paradoxical state is sought.
@@ -93,9 +86,9 @@ def find_margin(
             along = gradient(state, *pair, system.parameter_values)[0]
             return float(values[-1]), np.where(np.isfinite(along), along, 0.0)
 
-        region = Region.around(samples)
+        box = samples.surroundings()
         starts = np.argsort(distances, kind="stable")[:3]
-        lowest = [region.descend(slope, candidates[start]) for start in starts]
+        lowest = [box.descend(samples.manifold, slope, candidates[start]) for start in starts]
         candidates += lowest
         distances += [distance(state) for state in lowest]
     state = candidates[int(np.argmin(distances))]
@@ -132,70 +125,6 @@ def _crossing(
         else:
             there = middle
     return here
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """The states of N* with low <= x <= high, for the default parameters."""
-
-    manifold: Manifold
-    low: FloatArray
-    high: FloatArray
-
-    @classmethod
-    def around(cls, samples: Samples) -> "Region":
-        return cls(samples.manifold, samples.states.min(axis=0), samples.states.max(axis=0))
-
-    def descend(
-        self, function: Callable[[FloatArray], tuple[float, FloatArray]], start: FloatArray
-    ) -> FloatArray:
-        """Minimizes a nonnegative function along N*, by steps to the zero of the linearized one.
-
-        Zeros are found in a few steps. A positive minimum is only approached.
-        """
-        width = self.high - self.low
-        slack = SLACK * np.maximum(np.maximum(np.abs(self.low), np.abs(self.high)), width)
-        state, (value, gradient) = start, function(start)
-        for _ in range(40):
-            direction = self._downhill(state, gradient)
-            slope = float(direction @ direction)
-            # In units of the box: the state moves by the width times this.
-            if not value > 0.0 or not np.sqrt(slope) > FLAT * value:
-                break
-            step = width * direction
-            edge, moving = np.where(step < 0.0, self.low, self.high), step != 0.0
-            with np.errstate(over="ignore"):
-                room = np.min((edge - state)[moving] / step[moving], initial=np.inf)
-            length = min(value / slope, float(room))
-            for _ in range(TRIES):
-                length, trial = length / 4.0, state + length * step
-                with suppress(InconsistentStateError):
-                    trial = self.manifold.project(trial)
-                    if not np.all((trial >= self.low - slack) & (trial <= self.high + slack)):
-                        continue
-                    trial_value, trial_gradient = function(trial)
-                    if trial_value < value:
-                        break
-            else:
-                break
-            state, value, gradient = trial, trial_value, trial_gradient
-        return state
-
-    def _downhill(self, state: FloatArray, gradient: FloatArray) -> FloatArray:
-        """The descent direction along N* that stays in the box, in units of the box."""
-        width = self.high - self.low
-        rows = self.manifold.gradients(state) * width
-        slope, fixed = gradient * width, np.zeros(state.size, dtype=bool)
-        while True:
-            normal = np.vstack([rows, np.eye(state.size)[fixed]])
-            length = np.linalg.norm(normal, axis=1)
-            normal = normal[length > 0.0] / length[length > 0.0, None]
-            direction = normal.T @ np.linalg.lstsq(normal.T, slope)[0] - slope
-            blocked = (direction < 0.0) & (state <= self.low + SLACK * width)
-            blocked |= (direction > 0.0) & (state >= self.high - SLACK * width)
-            if not np.any(blocked & ~fixed):
-                return np.where(fixed, 0.0, direction)
-            fixed |= blocked
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +192,7 @@ class ContactMargins:
         self, samples: Samples, best: ContactMargin, parameters: FloatArray
     ) -> ContactMargin:
         """The margin at a state in the Painleve paradox with as little friction as can be found."""
-        region, unit = Region.around(samples), self._direction(parameters)
+        box, unit = samples.surroundings(), self._direction(parameters)
 
         def reserve(state: FloatArray) -> tuple[float, FloatArray]:
             """The margin as far as it is positive, and its gradient."""
@@ -276,7 +205,7 @@ class ContactMargins:
             for _ in range(20):
                 size = part * best.lowest if np.isfinite(best.lowest) else 1e3
                 values = self._with_friction(parameters, size * unit / max(unit))
-                state = region.descend(reserve, best.state)
+                state = box.descend(samples.manifold, reserve, best.state)
                 lower = self.at(state, parameters)
                 if not lower.lowest < best.lowest:
                     break
