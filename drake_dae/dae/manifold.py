@@ -91,10 +91,9 @@ class Manifold:
     def newton_step(self) -> TracedFunction:
         """The Newton step of least norm from a state, divided by the scale of the states.
 
-        A function of the state, a second state at which the gradients are taken, and parameters.
-        With C the gradients and S the scale it is -(C S)' N^-1 residual, N = C S (C S)', each row
-        by its largest entry: the squares of entries may be too large for a number. An error of N^-1
-        grows with the square of the condition of C, and only makes Newton's method slower.
+        A function of the state, another state at which the gradients C are taken, and parameters:
+        -(C S)' N^-1 residual, N = C S (C S)', with the scale S, and rows by their largest entries,
+        whose squares may be too large for a number. An error of N^-1 only makes Newton slower.
         """
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(self.short_gradient, state, other)

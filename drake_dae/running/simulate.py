@@ -68,9 +68,8 @@ def simulate(
     A run whose start_time is the end of an earlier run appends to its logs. A run that starts
     earlier clears them.
 
-    Ctrl-C, SIGTERM and SIGHUP end the run after the current step, or within it after a second; a
-    second signal ends it immediately with a KeyboardInterrupt. Logs are kept, also if an exception
-    ends the run.
+    Ctrl-C, SIGTERM and SIGHUP end the run after the current step; a second signal ends it
+    immediately with a KeyboardInterrupt. Logs are kept, also if an exception ends the run.
 
     Args:
         diagram: The system.
@@ -104,17 +103,13 @@ def simulate(
     start, going_on = context.get_time(), EventStatus.DidNothing()
     began, composed = 0.0, None
     watch = RunWatch(diagram, context, config, duration)
-    accepted = start, context.get_continuous_state_vector().CopyToVector()
 
     def stop(number: signal.Signals) -> None:
         ending(number)
         if began:
             simulator.set_monitor(monitor)
-            ending.insist()  # It ends a long step between two evaluations.
 
     def seen(current: Context, steps: int) -> bool:
-        nonlocal accepted
-        accepted = current.get_time(), current.get_continuous_state_vector().CopyToVector()
         bar.show(current.get_time() - start)
         if look is not None:
             look(current)
@@ -127,7 +122,8 @@ def simulate(
         return EventStatus.ReachedTermination(diagram, "interrupted")
 
     bar = _Progress(duration, progress)
-    with closing(bar), Interruption() as ending, ending_signals(stop):
+    ending = Interruption()
+    with closing(bar), ending_signals(stop):
         try:
             simulator.Initialize()
             began = time.perf_counter()
@@ -148,11 +144,6 @@ def simulate(
                 steps = 0
             elapsed = time.perf_counter() - began
             watch.look(context, is_last=True)
-        except KeyboardInterrupt:
-            if not ending.is_over:
-                raise
-            context.SetTimeAndContinuousState(*accepted)
-            steps, elapsed = simulator.get_num_steps_taken(), time.perf_counter() - began
         except (DrakeDaeError, RuntimeError) as error:
             if not began and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.

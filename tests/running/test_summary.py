@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arms import arm
 
 from drake_dae import Record, Signal
-from drake_dae.analysis import LimitKind, SignalRange, robot_limits
+from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
 from drake_dae.running.judgement import judge
 from drake_dae.running.simulate import RunStatistics
@@ -139,19 +138,4 @@ def test_figures_by_hand():
         "margin of q2 [rad]": pytest.approx(-0.2),
         "largest residual": 4.44e-11,
         "end [s]": 1.0,
-    }
-
-
-def test_limits_of_a_robot():
-    limits = robot_limits(arm("two_link").model)
-    pairs = zip(limits.signals, limits.bounds.T, strict=True)
-    found = {signal.name: tuple(pair) for signal, pair in pairs}
-    assert found == {
-        "joint1_motor": (-300.0, 300.0),
-        "joint2_motor": (-120.0, 120.0),
-        "joint1": (-3.1416, 3.1416),
-        "joint2": (-2.7925, 2.7925),
-        "joint1_w": (-3.0, 3.0),
-        "joint2_w": (-3.0, 3.0),
-        "wall.force": (0.0, np.inf),
     }

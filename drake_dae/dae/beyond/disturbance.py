@@ -58,18 +58,11 @@ def with_disturbance(
     parameter = Parameter(DISTURBANCE, np.zeros(len(rows)), exogenous=True)
     force = ca.SX(system.num_states, 1)
     force[rows] = parameter.symbol
-    inner = system.implicit
-
-    def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
-        assert inner is not None
-        balance, constraint_rate = inner(rate, constraint_input)
-        return balance - force, constraint_rate
-
     return replace(
         system,
         f=system.f + force,
         parameters=(*system.parameters, parameter),
-        implicit=None if inner is None else implicit,
+        implicit=system.implicit_with(lambda rate: -force),
         state_scale=system.scale,
     ).with_exogenous(frictions)
 
@@ -107,16 +100,15 @@ class IdentifiedTerms:
     An error delta = theta* - theta leaves the disturbance d = -G delta in the balance of the
     momentum p, where G is the derivative of p' - S^T (E' x + f + g v + h u) with respect to theta.
     An error of a surface leaves a distance phi(x) that is not zero in contact.
-    `slopes` is (x, u, v, parameters) -> the derivatives by theta of p, of its rate without inputs
-    and of the part from the inputs, (k, c) each; the distances phi that depend on theta, (j,), with
-    derivatives, (j, c), and second derivatives, one below the other, (j c, c). `pressed` are
-    the constraint inputs of these distances, `places` the indices in theta that they depend on.
     """
 
     parameters: tuple[Parameter, ...]
+    # (x, u, v, parameters) -> the derivatives by theta of p, of its rate without inputs and of the
+    # part from the inputs, (k, c) each; the distances phi that depend on theta, (j,), their
+    # derivatives, (j, c), and second derivatives, one below the other, (j c, c).
     slopes: TracedFunction
-    pressed: tuple[int, ...]
-    places: tuple[int, ...]
+    pressed: tuple[int, ...]  # The constraint inputs of these distances.
+    places: tuple[int, ...]  # The indices in theta that these distances depend on.
 
     @classmethod
     def of(
