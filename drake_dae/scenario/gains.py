@@ -52,7 +52,7 @@ _STATES = 33
 """The number of states along the references at which friction is compared with what jams."""
 
 _DEVELOPED = 10.0
-"""The factor of their velocities, so that friction of the model is that of a contact that slides."""
+"""The factor of velocities, so that friction of the model is that of a contact that slides."""
 
 _PERIODS = 3
 """The number of oscillations of the contact after the force of a touch has reached its goal."""
