@@ -16,7 +16,6 @@ from drake_dae.trace.round_off import positive
 # The number of random members. Functions are analytic almost everywhere: one that is zero at a few
 # random members is zero at all.
 MEMBERS = 4
-VISIBLE = 1e-6  # An action above this, relative to the sizes of its terms, is not round-off.
 # If there is no consistent state for drawn numbers, they are moved towards the defaults by this
 # factor, so often.
 NEARER, TRIES = 0.25, 6

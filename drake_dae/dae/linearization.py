@@ -218,26 +218,10 @@ def sampled_poles(
 
         x_(k+1) = exp(A T) x_k + Gamma(T - c) G x_(k-n) + exp(A (T - c)) Gamma(c) G x_(k-n-1).
 
-    The loop is stable where all of these poles are within the unit circle, that is
-    abs(sampled_poles(...)).max() < 1; where T and d tend to 0 they tend to exp(p T) for the poles p
-    of the continuous loop, and to 0. A compliant constraint has further poles: see
-    `contact_damping`.
-
-    Args:
-        law: The law, without integrals, whose control takes no measured force.
-        reference: R, shape (sum (mu_i + 1),), at rest.
-        period: T in s.
-        delay: d in s.
-        state: x on N*, shape (n,), an equilibrium under the law; the nominal consistent state if
-            None.
-        parameters: Values of the plant's parameters; the defaults if None.
-
-    Returns:
-        The poles, shape ((n + 2) k,) for k minimal states, largest first.
-
-    Raises:
-        InconsistentStateError: The state is not on N*.
-        ModelError: The law is another one, the state is no equilibrium, or a number makes no sense.
+    The loop is stable where all of these poles, shape ((n + 2) k,) for k minimal states, largest
+    first, are within the unit circle; where T and d tend to 0 they tend to exp(p T) for the poles p
+    of the continuous loop, and to 0. A compliant constraint has further poles: `contact_damping`.
+    The state, the nominal consistent one if None, must be an equilibrium under the law with R.
     """
     period, delay = positive("period", period), number("delay", delay)
     if delay < 0.0:

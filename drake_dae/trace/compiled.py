@@ -63,9 +63,6 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     """Returns a function as machine code; None if there is none.
 
     It writes all results unconditionally: call it by its `buffer()`, with an array bound to each.
-
-    Warns:
-        MachineCodeWarning: Machine code is requested and cannot be made.
     """
     # With many results, a branch for each takes the compiler ten times as long.
     source = without_branches(generate(function))
@@ -76,11 +73,7 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
 def library(
     source: str, operations: int, compiled: Compiled, make: bool, options: Sequence[str] = ()
 ) -> Path | None:
-    """Returns a shared library in the cache, compiled from C source; None if there is none.
-
-    Warns:
-        MachineCodeWarning: Machine code is requested and cannot be made.
-    """
+    """Returns a shared library in the cache, compiled from C; None, with a warning, if not."""
     try:
         return _library(source, operations, compiled, make, tuple(options))
     except MachineCodeError as error:

@@ -10,6 +10,8 @@ import numpy as np
 from drake_dae.arrays import FloatArray
 
 ZERO = 1e-9  # A sum of products below this, relative to the sizes of its terms, is zero.
+VISIBLE = 1e-6  # One above this is not round-off, whatever the parameters are.
+MANY = 10  # A function that is only round-off at this many random states is zero.
 # A factor below this, relative to the other factors in its row or column, is zero.
 NEGLIGIBLE = 1e-11
 # An entry or row below this, relative to the largest of its whole matrix, is round-off.

@@ -32,16 +32,8 @@ def with_disturbance(
     through the port `exogenous` of its controller; see `StateEstimator`. With d = 0 it is the
     law of the original system.
 
-    Args:
-        system: The system, as a robot's `RobotModel.dae`.
-        states: The names of the states whose rates contain d, for a robot those of v.
-        frictions: The names of parameters that are observed as well: coefficients of friction, such
-            as "wall.friction", and others with bounds or `ranges` of `Observing`. They become
-            exogenous signals.
-
-    Raises:
-        ModelError: A name is not that of a state or parameter, or occurs twice; or the system
-            already has a parameter "disturbance".
+    `frictions` are the names of parameters that are observed as well: coefficients of friction,
+    such as "wall.friction", and others with bounds or `ranges` of `Observing`.
     """
     names = [signal.name for signal in system.state_signals]
     for name in states:
@@ -70,11 +62,7 @@ def with_disturbance(
 def estimated_within(
     parameters: Sequence[Parameter], ranges: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """The lowest and highest values between which estimation starts: bounds, or a deviation.
-
-    Raises:
-        ModelError: A parameter has neither.
-    """
+    """The lowest and highest values between which estimation starts: bounds, or a deviation."""
     low, high = [np.zeros(0)], [np.zeros(0)]
     for p in parameters:
         if p.bounds is not None and np.all(p.low < p.high):
