@@ -6,7 +6,8 @@ is all that joins two of them. A law says which DaeSystem it is for (`TracedSyst
 `shares`, (1) the symbols of these parameters, and (2) if its control comes straight from this law,
 x' under the law (`TracedSystem.motion`), in which A and B are factorized once for both: 1,507
 operations in place of 2,770 for seven joints on a wall. `simulate` and `compile_diagram` share, for
-numbers that stay. Rollouts, pages and exported loops share nothing: their numbers change.
+numbers that stay; a rollout shares in the runs in which the numbers are equal. Pages and exported
+loops share nothing: their numbers change.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -78,6 +79,14 @@ def leaf_inputs(system: System, index: int) -> list[Port]:
         return [(system, index)]
     found = system.GetInputPortLocators(InputPortIndex(index))
     return [leaf for inner, port in found for leaf in leaf_inputs(inner, int(port))]
+
+
+def laws_of(systems: Iterable[System]) -> dict[TracedSystem, TracedSystem]:
+    """Plant -> the law whose model it is."""
+    traced = [system for system in systems if isinstance(system, TracedSystem)]
+    laws = {id(system.equations): system for system in traced if system.is_law}
+    plants = [s for s in traced if not s.is_law and id(s.equations) in laws]
+    return {plant: laws[id(plant.equations)] for plant in plants}
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,13 +237,8 @@ class _Walk:
 
     def _find_twins(self) -> dict[System, TracedSystem]:
         """Plant -> the law whose model it is, with equal parameters: see the head of this file."""
-        traced = [system for system in self.leaves.systems if isinstance(system, TracedSystem)]
-        laws = {id(system.equations): system for system in traced if system.is_law}
         twins = dict[System, TracedSystem]()
-        for plant in traced:
-            law = laws.get(id(plant.equations))
-            if law is None or plant.is_law:
-                continue
+        for plant, law in laws_of(self.leaves.systems).items():
             own = self.parameters_of(plant)
             if np.array_equal(own, self.parameters_of(law)[: own.size]):
                 twins[plant] = law

@@ -273,3 +273,4 @@ class Run:
     next: float = np.nan  # the end of a step that was not accepted
     trial_time: float = np.inf  # of the earliest trial that failed
     trial: FloatArray | None = None
+    error: Exception | None = None  # of Drake

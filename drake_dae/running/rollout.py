@@ -41,6 +41,7 @@ from drake_dae.running.diagnosis import (
     stiffness,
     too_long,
 )
+from drake_dae.running.drake_stepped import run_stepped
 from drake_dae.running.events import Seed
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, program_of
 from drake_dae.running.simulate import check_config
@@ -118,8 +119,7 @@ def rollout(
     Drake's, with states before their projection. Under error control, steps are those of DOP853
     (Hairer, Norsett and Wanner, 1993) with a thousandth of the accuracy as their error, and rows
     between them are on N*. If a C compiler is found, the whole diagram becomes machine code;
-    otherwise CasADi interprets its functions. A `CompliantPlant` stands for a `ContactPlant`, which
-    runs by `simulate` alone.
+    otherwise CasADi interprets its functions. Drake steps a `ContactPlant`.
 
     Args:
         loop: The closed loop, or any diagram of blocks that can be traced; its record has the
@@ -200,38 +200,47 @@ def run_loop(
         if not (moments[1:] > moments[:-1]).all():
             raise ModelError("times must be strictly increasing")
         problems = program.problems(starts, parameters, moments, seeds)
+        is_shared = program.shares(problems.parameters, len(problems.state))
 
     def stop(rows: Callable[[], FloatArray]) -> bool:
         return look is not None and look(lambda after: program.record(moments, rows(), after))
 
-    # Machine code, where it saves more time than it takes to make.
-    with MAKING:
-        functions, count = program.functions, len(problems.state)
-        settings = StepSettings.of(config, functions, stop)
-        calls: float = STAGES_PER_SECOND
-        if settings.tableau is not None:
-            calls = len(settings.tableau.b) / settings.longest
-        calls += sum(1.0 / rate.period for rate in functions.rates)
-        calls *= count * float(np.ptp(moments)) if lasting is None else lasting
-        lanes, code = None, program.machine_code(choice, calls, lasting is None)
-        if code is not None and look is None and count >= SEVERAL:
-            lanes = program.machine_code(choice, FASTER * calls, lasting is None, several=True)
-
-    if code is None:
-        runs = [run_interpreted(functions, problems.run(i), settings) for i in range(count)]
-    elif lanes is None:
-        runs = run_alone(code, problems, settings)
-    else:
-        runs = run_several(lanes, code, problems, settings)
+    seconds = len(problems.state) * float(np.ptp(moments)) if lasting is None else lasting
+    runs = dict[int, Run]()
+    for of in (True, False):
+        indices = np.flatnonzero(is_shared == of)
+        if not indices.size:
+            continue
+        with MAKING:
+            kind = program.shared if of else program
+            some = kind.reduced(problems, indices)
+            settings = StepSettings.of(config, kind.functions, stop)
+            calls: float = STAGES_PER_SECOND
+            if settings.tableau is not None:
+                calls = len(settings.tableau.b) / settings.longest
+            calls = seconds * (calls + sum(1.0 / rate.period for rate in kind.functions.rates))
+            lanes, code = None, kind.machine_code(choice, calls, lasting is None)
+            if code is not None and look is None and indices.size >= SEVERAL:
+                lanes = kind.machine_code(choice, FASTER * calls, lasting is None, several=True)
+        if code is not None and lanes is not None:
+            made = run_several(lanes, code, some, settings)
+        elif code is not None:
+            made = run_alone(code, some, settings)
+        elif kind.drake is not None:
+            made = [run_stepped(kind, some.run(i), settings) for i in range(indices.size)]
+        else:
+            each = map(some.run, range(indices.size))
+            made = [run_interpreted(kind.functions, one, settings) for one in each]
+        runs |= zip(indices.tolist(), made, strict=True)
     if settings.tableau is None:
-        _warn_of_stiffness(program, max(runs, key=lambda run: run.steps), problems)
+        _warn_of_stiffness(program, max(runs.values(), key=lambda run: run.steps), problems)
     found = []
-    for i, run in enumerate(runs):
+    for i in range(len(problems.state)):
         failure = None
-        if run.ending not in (RunEnding.DONE, RunEnding.PAUSED):
+        if runs[i].ending not in (RunEnding.DONE, RunEnding.PAUSED):
             with MAKING:
-                failure = _failure(program, problems.run(i).parameters, run)
-        found.append(Rollout(run.steps, failure, program, moments, run.rows))
+                failure = _failure(program, problems.run(i).parameters, runs[i])
+        found.append(Rollout(runs[i].steps, failure, program, moments, runs[i].rows))
     return found
 
 
@@ -248,6 +257,8 @@ def _warn_of_stiffness(program: RolloutProgram, run: Run, problems: RunProblem) 
 
 def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> SimulationError:
     """The exception that the same run raises in Drake's Simulator."""
+    if isinstance(run.error, SimulationError):
+        return run.error
     plants = [s for s in program.composed.states if isinstance(s, Plant)]
     state = run.state[program.composed.states[plants[0]] if plants else slice(program.num_states)]
     trial = None

@@ -1,11 +1,12 @@
 """A diagram as a rollout steps it: its block, and the places of its numbers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import pairwise, starmap
 from numbers import Integral
 from threading import RLock
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,71 +16,168 @@ from pydrake.systems.primitives import RandomSource
 
 from drake_dae.arrays import FloatArray, brief, by_columns, numbers
 from drake_dae.blocks.block import Block, Held, stacked
-from drake_dae.blocks.compose import compose
-from drake_dae.blocks.machine import Stepper, can_run_several, load
+from drake_dae.blocks.compose import Leaves, compose, laws_of, leaf_inputs
+from drake_dae.blocks.machine import (
+    Stepper,
+    can_run_several,
+    load,
+)
 from drake_dae.blocks.stepping import RunProblem, StepFunctions
-from drake_dae.blocks.traced_system import context_in
+from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, computed_record, recorded_values
 from drake_dae.errors import ModelError
 from drake_dae.running.events import Seed, drawn_noise, events_within, source_period
+from drake_dae.systems.parameterized import ParameterizedSystem
 from drake_dae.systems.plants.contract import plants_in
 from drake_dae.systems.plants.dae_plant import DaePlant
 from drake_dae.trace.compiled import Compiled, attempts
+
+CONTROL = "$control"
+"""The name of the control of Drake's plant among the outputs of the block."""
 
 MAKING = RLock()
 """What is made once is made by one thread; expressions of CasADi cannot be shared by several."""
 
 
 class RolloutProgram:
-    """A closed loop, or any diagram, as one block whose inputs became parameters and held values.
+    """A closed loop, or any diagram, as a rollout steps it.
 
-    `signals` are the columns of a row: name of an output port -> names and units of its entries.
+    It is one block, whose inputs became parameters and held values.
+
+    Attributes:
+        functions: The functions of the block.
+        drake: The `ContactPlant` that Drake steps; None without one.
+        signals: The columns of a row: name of an output port -> names and units of its entries.
+        choice: Whether it becomes machine code by default.
     """
 
-    def __init__(self, loop: ClosedLoop | Diagram) -> None:
+    def __init__(
+        self,
+        loop: ClosedLoop | Diagram,
+        context: Context | None = None,
+        like: "RolloutProgram | None" = None,
+    ) -> None:
+        """`context` has values of ports without a wire; `like` has no shared parameters."""
         signals = dict[str, Sequence[Signal]]()
-        self.loop = loop
         self.choice: Compiled = "auto"
         if isinstance(loop, ClosedLoop):
             self.diagram, self.name = loop.diagram, loop.plant.get_name()
             signals, self.choice = {**loop.signals}, loop.plant.dae.compiled
         else:
             self.diagram, self.name = loop, loop.get_name() or "the diagram"
-        self.context = self.diagram.CreateDefaultContext()
-        ports = map(self.diagram.get_output_port, range(self.diagram.num_output_ports()))
-        vectors = {
-            p.get_name(): p for p in ports if p.get_data_type() == PortDataType.kVectorValued
+        diagram, self.loop = self.diagram, loop
+        self.context, leaves = context or diagram.CreateDefaultContext(), Leaves.of(diagram)
+        self.laws = laws_of(leaves.systems)
+        for plant, law in self.laws.items() if like is not None else ():
+            own = plant.GetMyMutableContextFromRoot(self.context).get_mutable_numeric_parameter(0)
+            numbers = law.GetMyContextFromRoot(self.context).get_numeric_parameter(0)
+            own.SetFromVector(numbers.value()[: own.size()])
+        names = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]
+        names = [p for p in names if p.get_data_type() == PortDataType.kVectorValued]
+        self.ports = {p.get_name(): p for p in names if not signals or p.get_name() in signals}
+        stepped = [plant for plant in plants_in(diagram) if plant.time_step]
+        self.is_discrete = bool(stepped)
+        self.drake = next((p for p in stepped if not isinstance(p, TracedSystem)), None)
+        wanted = dict(self.ports)
+        if self.drake is not None:
+            (entry,) = leaf_inputs(self.drake, int(self.drake.GetInputPort("control").get_index()))
+            system, index = leaves.sources[entry]
+            wanted[CONTROL] = system.get_output_port(index)
+        self.composed = composed = compose(
+            diagram, wanted, context=self.context, shares=like is not None
+        )
+        inside = Leaves.of(self.drake).systems if isinstance(self.drake, Diagram) else [self.drake]
+        self.stepped = {name: cut for name, cut in composed.cuts.items() if cut[0] in inside}
+        self.block = block = self._without_inputs()
+        outputs = {each: block.outputs[each] for each in signals or self.ports}
+        self.functions = StepFunctions(replace(block, outputs=outputs))
+        self.num_states = block.state.numel()
+        if self.drake is not None and (states := list(composed.states)):
+            raise ModelError(
+                f"a rollout cannot combine '{self.drake.get_name()}', which has Drake's own "
+                f"contact, with '{states[0].get_name()}', which has a continuous state. Sample the "
+                "law, with a force sensor without a time constant, or run the loop by simulate"
+            )
+        self.signals = signals or {
+            each: composed.block.signals.get(each)
+            or [Signal(f"{each}[{i}]") for i in range(value.numel())]
+            for each, value in outputs.items()
         }
-        self.ports = {name: p for name, p in vectors.items() if not signals or name in signals}
-        if not self.ports:
+        if not self.signals:
             raise ModelError(
                 "the diagram has no output port with a vector, so that a rollout has nothing to "
                 "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
             )
-        self.composed = compose(self.diagram, self.ports, context=self.context, shares=False)
-        self.block = block = self._without_inputs()
-        outputs = {name: block.outputs[name] for name in signals or self.ports}
-        self.functions = StepFunctions(replace(block, outputs=outputs))
-        self.num_states = block.state.numel()
-        self.signals = signals or {
-            name: self.composed.block.signals.get(name)
-            or [Signal(f"{name}[{i}]") for i in range(value.numel())]
-            for name, value in outputs.items()
-        }
         self.sources = {
             name: source
-            for name, (source, _) in self.composed.cuts.items()
+            for name, (source, _) in composed.cuts.items()
             if isinstance(source, RandomSource)
         }
-        ends = np.cumsum([0, *(held.symbol.numel() for held in block.held.values())]).tolist()
+        sizes = [held.symbol.numel() for held in block.held.values()]
+        ends = np.cumsum([0, *sizes]).tolist()
         self.held_places = dict(zip(block.held, starmap(slice, pairwise(ends)), strict=True))
         every = np.arange(ends[-1])
         drawn = [every[self.held_places[name]] for name in self.sources]
         self.drawn_places = np.concatenate([every[:0], *drawn])
         self.kept_places = np.setdiff1d(every, self.drawn_places)
-        self._made = dict[bool, Stepper | None]()
+        self._like, self._made = like, dict[str, Any]()
+
+    def kept(self, name: str, make: Callable[[], Any]) -> Any:
+        with MAKING:
+            if name not in self._made:
+                self._made[name] = make()
+            return self._made[name]
+
+    @property
+    def stepper(self) -> Stepper | None:
+        """Its machine code; None if there is none yet."""
+        return self._made.get("code")
+
+    @property
+    def shared(self) -> "RolloutProgram":
+        """The program of runs in which each plant and the model of its law have equal numbers."""
+        if not self.laws:
+            return self
+        found: RolloutProgram = self.kept("shared", lambda: RolloutProgram(self.loop, like=self))
+        return found
+
+    def shares(self, parameters: FloatArray, count: int) -> np.ndarray:
+        """In which runs each plant and its law have equal numbers, shape (count,)."""
+        parts, equal = self.composed.parameters, np.full(len(parameters), True)
+        for plant, law in self.laws.items():
+            if plant not in parts:
+                continue
+            own = parameters[:, parts[plant]]
+            same = own == parameters[:, parts[law]][:, : own.shape[1]]
+            if isinstance(plant, ParameterizedSystem) and plant.exogenous_places:
+                same[:, plant.exogenous_places] |= plant.GetInputPort("exogenous").HasValue(
+                    plant.GetMyContextFromRoot(self.context)
+                )
+            equal &= same.all(axis=1)
+        return np.broadcast_to(equal & bool(self.laws), count)
+
+    def reduced(self, problems: RunProblem, indices: np.ndarray) -> RunProblem:
+        """Some runs, with the parameters of this program."""
+        parameters, noise = (
+            table if len(table) == 1 else table[indices]
+            for table in (problems.parameters, problems.noise)
+        )
+        if self._like is not None:
+            whole = self._like.composed.parameters
+            own = [whole[system] for system in self.composed.parameters]
+            total = sum(part.stop - part.start for part in whole.values())
+            columns = [np.arange(part.start, part.stop) for part in own]
+            columns.append(np.arange(total, parameters.shape[1]))
+            parameters = np.ascontiguousarray(parameters[:, np.concatenate(columns)])
+        return replace(
+            problems,
+            state=problems.state[indices],
+            held=problems.held[indices],
+            parameters=parameters,
+            noise=noise,
+        )
 
     def machine_code(
         self, choice: Compiled, calls: float, is_all: bool, several: bool = False
@@ -90,19 +188,21 @@ class RolloutProgram:
         """
         tries = attempts("auto", self.functions.num_operations)
         make = choice is True or any(makes and calls >= least for least, makes in tries)
-        if choice is False or not (make or is_all) or (several and not self._runs_several):
+        if choice is False or self.drake is not None or not (make or is_all):
             return None
-        self._made[several] = self._made.get(several) or load(self.functions, choice, make, several)
-        return self._made[several]
+        if several and not self.kept("lanes do", lambda: can_run_several(self.functions)):
+            return None
+        name = "lanes" if several else "code"
+        self._made[name] = self._made.get(name) or load(self.functions, choice, make, several)
+        code: Stepper | None = self._made[name]
+        return code
 
     @property
-    def stepper(self) -> Stepper | None:
-        """Its machine code; None if there is none yet."""
-        return self._made.get(False)
-
-    @cached_property
-    def _runs_several(self) -> bool:
-        return can_run_several(self.functions)
+    def drake_state(self) -> slice:
+        """The place of the state of Drake's plant among the held values."""
+        size = self.drake.dae.num_states if self.drake is not None else 0
+        parts = [self.held_places[name] for name in self.stepped]
+        return next(part for part in parts if part.stop - part.start == size)
 
     def values_in(self, context: Context) -> tuple[FloatArray, FloatArray, FloatArray]:
         """State, held values and parameters in a context of the diagram."""
@@ -115,9 +215,8 @@ class RolloutProgram:
             local = context_in(system, context)
             held[self.held_places[group]] = local.get_discrete_state(i).value()
         for name, (system, i) in composed.cuts.items():
-            held[self.held_places[name]] = system.get_output_port(i).Eval(
-                context_in(system, context)
-            )
+            value = system.get_output_port(i).Eval(context_in(system, context))
+            held[self.held_places[name]] = value
         values = []
         for system in composed.parameters:
             local = context_in(system, context)
@@ -160,6 +259,9 @@ class RolloutProgram:
             port, local = system.get_input_port(i), system.GetMyMutableContextFromRoot(context)
             port.FixValue(local, parameters[first : first + port.size()])
             first += port.size()
+        if self.drake is not None:
+            local = self.drake.GetMyMutableContextFromRoot(context)
+            self.drake.set_state(local, held[self.drake_state])
 
     def problems(
         self,
@@ -172,8 +274,7 @@ class RolloutProgram:
         functions = self.functions
         rates = [(rate.period, rate.offset) for rate in functions.rates]
         # A discrete plant logs its steps before the updates of their times.
-        is_discrete = any(plant.time_step for plant in plants_in(self.diagram))
-        events, due = events_within(rates, times, with_end=not is_discrete)
+        events, due = events_within(rates, times, with_end=not self.is_discrete)
         if parameters is None:
             parameters = self.values_in(self.context)[2]
         if seeds is not None:
@@ -238,30 +339,31 @@ class RolloutProgram:
                 plant.check_start(one.state[part], values)
 
     def _without_inputs(self) -> Block:
-        """The block with values of unwired inputs as parameters, and random numbers as held ones.
+        """The block with values of unwired inputs as parameters, and what Drake computes as held.
 
         Its only input is "noise", from which sources of random numbers take their next values.
         """
-        block, noise, random = self.composed.block, list[ca.SX](), dict[str, Held]()
-        for name, (system, index) in self.composed.cuts.items():
-            symbol = block.inputs[name]
-            if not isinstance(system, RandomSource):
+        composed, block = self.composed, self.composed.block
+        noise, random, stepped = list[ca.SX](), dict[str, Held](), dict[str, Held]()
+        for name, (system, index) in composed.cuts.items():
+            symbol, start = block.inputs[name], np.zeros(block.inputs[name].numel())
+            if isinstance(system, RandomSource):
+                noise.append(ca.SX.sym(name, symbol.numel()))
+                random[name] = Held(symbol, noise[-1], start, source_period(system))
+            elif self.drake is not None and name in self.stepped:
+                stepped[name] = Held(symbol, symbol, start, self.drake.time_step)
+            else:
                 port = system.get_output_port(index).get_name()
                 raise ModelError(
-                    f"the output port '{port}' of '{system.get_name()}' cannot be traced, such as "
-                    "that of Drake's own contact, for which a CompliantPlant may stand. What "
-                    "depends on it only runs in Drake's Simulator, by simulate"
+                    f"the output port '{port}' of '{system.get_name()}' cannot be traced. What "
+                    "depends on it only runs in Drake's Simulator"
                 )
-            noise.append(ca.SX.sym(name, symbol.numel()))
-            start = np.zeros(symbol.numel())
-            random[name] = Held(symbol, noise[-1], start, source_period(system))
+        fixed = [block.inputs[name] for name in composed.fixed]
         return replace(
             block,
             inputs={"noise": stacked(noise)},
-            held={**block.held, **random},
-            parameters=stacked(
-                [block.parameters, *(block.inputs[name] for name in self.composed.fixed)]
-            ),
+            held={**stepped, **block.held, **random},
+            parameters=stacked([block.parameters, *fixed]),
         )
 
     def record(self, times: FloatArray, rows: FloatArray, after: float | None = None) -> Record:

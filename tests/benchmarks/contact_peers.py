@@ -366,7 +366,8 @@ def run(law: str, condition: Condition, friction: float) -> tuple[float, ...]:
 
 def wired(law: Rival, plant: MeasuredPlant, loop, scenario):
     builder = DiagramBuilder()
-    reference = ReferenceGenerator(loop.reference.references, loop.reference.degrees)
+    degrees = (*loop.reference.degrees[:-1], 0)  # A rival knows no rate of the force.
+    reference = ReferenceGenerator(loop.reference.references, degrees)
     hold = ControlHold(7, scenario.sampling)
     sensor = scenario.sensors.force.sensor(1)
     for system in (plant, law, reference, hold, sensor):

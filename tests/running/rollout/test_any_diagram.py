@@ -111,7 +111,7 @@ def random_diagram(seed):
     return builder.Build(), loggers
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(20))
 def test_random_diagrams_roll_out(seed):
     """To 1e-11: fixed steps of the same method, and updates at the same instants."""
     diagram, loggers = random_diagram(seed)

@@ -102,10 +102,11 @@ def test_tasks_are_those_of_drake(name, compiled):
 
 
 @pytest.mark.slow
-def test_wall_polish_is_the_same_in_the_simulator():
-    """To 1e-9, through touch, press and slide."""
+@pytest.mark.parametrize("plant", ["!CompliantContact", "!MultibodyPlant"])
+def test_wall_polish_is_the_same_in_the_simulator(plant):
+    """To 1e-9, through touch, press and slide, on contact that is traced and on Drake's own."""
     settings = [
-        "plant=!CompliantContact {radius: 1.0e-5}",
+        f"plant={plant} {{radius: 1.0e-5}}",
         "sampling={period: 0.001, delay: 0.001}",
         "integrator.use_error_control=false",
         "integrator.max_step_size=0.001",
