@@ -3,13 +3,16 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from importlib import import_module
 from typing import ClassVar, cast
 
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
+from drake_dae.arrays import brief
 from drake_dae.dae import ConstraintStructure
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import RobotModel
 from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.robot import Payload
@@ -35,7 +38,7 @@ class ScenarioPlant(ABC):
     3. `material` is the material of compliant contacts, and None for ideal contacts.
     4. `rolled` is the member that a rollout runs instead: this member, or one with a traced plant.
     5. `in_context` are the keys of numbers that `begin` sets in a context, even if the plant was
-       made with other numbers.
+       made with other numbers. Without `adjusts` the plant is made anew for each payload and force.
 
     Attributes:
         parameters: Parameter name -> the plant's value, unknown to the law's model; one number for
@@ -48,6 +51,7 @@ class ScenarioPlant(ABC):
     payloads: list[Payload] = field(default_factory=list)
     disturbances: list[DisturbanceForce] = field(default_factory=list)
     carries: ClassVar[bool] = False
+    adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
 
     @property
@@ -131,3 +135,43 @@ class CompliantContact(PointMaterial, ScenarioPlant):
     def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
         with at("plant or plant.parameters"):  # Whose numbers are set in a context.
             return CompliantPlant(model, self, structure=structure)
+
+
+@dataclass(frozen=True)
+class OwnPlant(ScenarioPlant):
+    """The plant is your own class that follows the contract of `drake_dae.Plant`.
+
+    It is called with the robot and its structure, as `maker(model, structure)`. Running such a
+    scenario imports the module, found by PYTHONPATH, also in the processes of a sweep: use only
+    files from people whose code you trust.
+
+    Attributes:
+        maker: The module and the class in it, as "my_plants:SpringyPlant".
+    """
+
+    maker: str
+    adjusts: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        module, _, name = self.maker.partition(":")
+        if not (module and name.isidentifier()):
+            raise ModelError(
+                "maker: a module and a class in it are needed, as my_plants:SpringyPlant, got "
+                f"'{brief(self.maker)}'"
+            )
+
+    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+        module, _, name = self.maker.partition(":")
+        with at("plant.maker"):
+            try:
+                plant = getattr(import_module(module), name)(model, structure)
+            except DrakeDaeError:
+                raise
+            except Exception as error:
+                what = f"{type(error).__name__}: {error}"
+                raise ModelError(f"'{self.maker}' cannot be loaded and made: {what}") from error
+            if not isinstance(plant, Plant):
+                raise ModelError(
+                    f"'{self.maker}' makes no plant that keeps the contract of drake_dae.Plant"
+                )
+            return plant

@@ -189,7 +189,7 @@ FAMILIES: dict[type, Family] = {
     Reference: Family(_REFERENCES, float),
     Load: _family(robots.KnownForce, robots.JointFriction),
     plants.ScenarioPlant: _family(
-        plants.IdealConstraints, plants.MultibodyPlant, plants.CompliantContact
+        plants.IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
     ),
     parts.Gains: _family(parts.Poles, parts.Coefficients, parts.Matrices),
     ps.Phase: _family(ps.Approach, ps.Press, ps.Move, ps.Dwell, ps.Release, ps.Retreat),

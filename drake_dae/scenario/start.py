@@ -80,10 +80,16 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
         pushes = enumerate(of_plant.disturbances)
         numbers["plant.payloads"] = {f"{p.name}.mass": p.mass for p in of_plant.payloads}
         numbers["plant.disturbances"] = {f"plant_disturbance_{i}.force": d.force for i, d in pushes}
+    before = plant.parameters(at_plant)
     for key, values in numbers.items():
         with at(key):
             for name, value in values.items():
-                plant.set_parameter(at_plant, name, value)
+                # A user's own plant may not let these be set, and has been made with them.
+                is_set = key != "plant.parameters" and np.array_equal(
+                    before[plant.dae.parameter_slice(name)], np.ravel(value)
+                )
+                if not is_set:
+                    plant.set_parameter(at_plant, name, value)
     with at("plant"):
         of_plant.begin(plant, at_plant)
     force, encoders, gains = scenario.sensors.force, scenario.sensors.encoders, scenario.law.gains

@@ -14,7 +14,7 @@ def each(few, many, size=1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seeds", each(range(30), range(30, 110), 5))
+@pytest.mark.parametrize("seeds", each(range(40), range(40, 110), 5))
 def test_a_bad_scenario_is_refused_or_runs_with_a_reason(seeds, tmp_path: Path):
     for seed in seeds:
         outcome = bad_inputs.scenario_attempt(seed, tmp_path)

@@ -13,7 +13,7 @@ from drake_dae.errors import ScenarioError
 from drake_dae.scenario import scenario_schema
 from drake_dae.scenario.shipped import shipped_scenarios
 
-KINDS = {"key": 60, "value": 90, "tag": 30, "text": 60}
+KINDS = {"key": 90, "value": 90, "tag": 60, "text": 60}
 PIECES = (":", "- ", "[", "]", "{", "}", "&a ", "*a", "!X ", '"', "'", "#", "\t", "\n", "\0", "?")
 WRONG = {  # By what the value was.
     r"\[.*\]|-?[\d.]+(e-?\d+)?": ("abc", "true", "{a: 1}", "[[]]", ".nan", "1_000"),

@@ -168,7 +168,7 @@ def test_what_goes_wrong_is_an_outcome_with_its_reason(total):
             assert 0.0 < result.figures["end [s]"] < 2.0
 
 
-UNTRACED = "plant=!MultibodyPlant {contact_model: hydroelastic}"
+UNTRACED = "plant=!OwnPlant {maker: 'members:SpringyPlant'}"
 
 
 def test_what_no_rollout_has_is_reported():

@@ -135,7 +135,11 @@ class Broken(LeafSystem):
         )
 
 
-@pytest.mark.parametrize(("name", "since"), [("runge_kutta3", 0.0), ("runge_kutta5", 0.3)])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "since"),
+    [("runge_kutta3", 0.0), ("runge_kutta3", 0.3), ("runge_kutta5", 0.3), ("radau3", 0.3)],
+)
 def test_nan_from_a_block_of_someone_else_ends_the_run(name, since):
     """Where Drake's error control alone would make steps shorter for ever."""
     builder = DiagramBuilder()
