@@ -27,7 +27,7 @@ from pydrake.systems.framework import (
     System,
 )
 
-from drake_dae.arguments import checked
+from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import NOTHING, Block, Held, Projection, stacked
 from drake_dae.blocks.primitives import symbolic_block
@@ -134,6 +134,7 @@ def compile_diagram(
     return compose(diagram, outputs, context=context).block
 
 
+@uncollected
 def compose(
     diagram: Diagram,
     outputs: Mapping[str, OutputPort] | None = None,

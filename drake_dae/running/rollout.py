@@ -101,7 +101,7 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
     return np.concatenate([state[: program.num_states], held[program.kept_places]]), values
 
 
-@checked(ModelError)
+@checked(ModelError, lasts=True)
 def rollout(
     loop: ClosedLoop | Diagram,
     starts: ArrayLike,

@@ -47,7 +47,7 @@ class RunStatistics:
         return self.simulated_time / max(self.wall_time, 1e-9)
 
 
-@checked(ModelError)
+@checked(ModelError, lasts=True)
 def simulate(
     diagram: System,
     context: Context,

@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
-from drake_dae.arguments import checked
+from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.blocks.block import NOTHING, Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
@@ -73,6 +73,7 @@ def build_scenario(
     return loop, start_scenario(completed.scenario, loop)
 
 
+@uncollected
 def build_completed(
     scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
 ) -> tuple[Completed, ClosedLoop]:

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import uncollected
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled, attempts, machine_code
@@ -94,6 +95,7 @@ class TracedFunction:
         self.is_machine_code = False
 
     @cached_property
+    @uncollected
     def function(self) -> ca.Function:
         """The CasADi function: outputs, pivot, and numbers that are finite if they are valid."""
         expressions = self._expressions
