@@ -1,8 +1,12 @@
 """Checks the arguments of public functions and constructors by their annotations."""
 
+import gc
 import inspect
+import time
 from collections.abc import Callable, Collection, Mapping
+from contextlib import ContextDecorator
 from functools import cache, wraps
+from threading import Lock, get_ident
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -18,7 +22,41 @@ Problem = tuple[str, str, Any]
 """Where a value is not what an annotation says, what would be right there, and what it is."""
 
 
-def checked(error: Callable[[str], Exception]) -> Callable[[F], F]:
+class _Uncollected(ContextDecorator):
+    """Meanwhile no thread collects garbage by itself.
+
+    CasADi builds and frees expressions without Python's lock, and these share their constants: a
+    collection in another thread, such as one of a notebook or of Dask, can break what is built.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._depth, self._was = Lock(), 0, False
+        self._collector: int | None = None  # The thread that collects now.
+        gc.callbacks.append(self._watch)
+
+    def _watch(self, phase: str, _: object) -> None:
+        self._collector = get_ident() if phase == "start" else None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._depth += 1
+            if self._depth == 1:
+                self._was = gc.isenabled()
+                gc.disable()
+        while self._collector not in (None, get_ident()):
+            time.sleep(1e-3)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._depth -= 1
+            if self._depth == 0 and self._was:
+                gc.enable()
+
+
+uncollected = _Uncollected()
+
+
+def checked(error: Callable[[str], Exception], lasts: bool = False) -> Callable[[F], F]:
     """Decorates a public name so that arguments which do not match their annotations raise.
 
     Of a class, the constructor and the class methods are decorated; what it makes keeps copies of
@@ -26,16 +64,18 @@ def checked(error: Callable[[str], Exception]) -> Callable[[F], F]:
     entries of lists and dictionaries are checked as well. Shapes and ranges are left to the
     function. A default is always accepted. A check takes some 10 us: nothing that is called in a
     loop has one. `error` makes the exception of "<name>: <argument> must be <condition>, got ...".
+    Meanwhile garbage is `uncollected`, unless the function `lasts`.
     """
 
     def decorate(target: F) -> F:
         if not inspect.isclass(target):
-            return _checked(target, error, target.__qualname__)
+            return _checked(target if lasts else uncollected(target), error, target.__qualname__)
         for name, member in list(vars(target).items()):
             if name == "__init__":
-                setattr(target, name, _checked(member, error, target.__name__))
+                setattr(target, name, _checked(uncollected(member), error, target.__name__))
             elif name[0] != "_" and isinstance(member, (classmethod, staticmethod)):
-                inner = _checked(member.__func__, error, f"{target.__name__}.{name}")
+                made = uncollected(member.__func__)
+                inner = _checked(made, error, f"{target.__name__}.{name}")
                 setattr(target, name, type(member)(inner))
         return target
 

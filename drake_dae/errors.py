@@ -132,18 +132,7 @@ class SingularityError(SimulationError):
 
 
 class PainleveError(SingularityError):
-    """The Painleve paradox in a frictional contact: A(x) is not a P-matrix.
-
-    Attributes:
-        outcome: A `dae.contacts.PainleveOutcome`; None if it is not known.
-    """
-
-    def __init__(self, message: str, time: float, state: ArrayLike, outcome: Any = None) -> None:
-        super().__init__(message, time, state)
-        self.outcome = outcome
-
-    def retold(self, message: str, time: float, state: ArrayLike) -> PainleveError:
-        return type(self)(message, time, state, self.outcome)
+    """The Painleve paradox in a frictional contact: A(x) is not a P-matrix."""
 
 
 class NonFiniteError(SimulationError):

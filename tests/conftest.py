@@ -34,8 +34,14 @@ def same_surroundings(tmp_path_factory: pytest.TempPathFactory) -> None:
     for name in ("PYTHONIOENCODING", "PYTHONOPTIMIZE", "PYTHONWARNINGS", "MPLBACKEND"):
         os.environ.pop(name, None)
     os.umask(0o022)
-    # As the command does: Python's own threshold takes a tenth of the time.
-    gc.set_threshold(100_000, 50, 100)
+    # Garbage is collected between tests, in the main thread: pytest-xdist has a second one in each
+    # process, and what it frees would break expressions that a test is building.
+    gc.disable()
+
+
+def pytest_runtest_teardown() -> None:
+    if gc.get_count()[0] > 100_000:
+        gc.collect()
 
 
 @pytest.fixture

@@ -6,7 +6,9 @@ is none, the test of that name fails and says so.
 """
 
 import contextlib
+import gc
 import inspect
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 from functools import cache
@@ -28,6 +30,7 @@ from pydrake.trajectories import PiecewisePolynomial, Trajectory
 
 import drake_dae as dd
 from drake_dae.analysis import Analysis, Assumption
+from drake_dae.arguments import checked, uncollected
 from drake_dae.blocks.block import Block
 from drake_dae.dae import (
     Derivatives,
@@ -41,7 +44,7 @@ from drake_dae.dae import (
     with_disturbance,
 )
 from drake_dae.diagrams.record import Recorded
-from drake_dae.errors import DrakeDaeError
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.references import PathLimits
 from drake_dae.robots import Constraint, Links, Surface
 from drake_dae.scenario.robot_file.reading import read_robot
@@ -349,3 +352,56 @@ def test_what_runs_in_a_loop_is_not_checked():
     """A check takes some 20 us; the law is called at each step."""
     for method in (dd.TrackingLaw.control, dd.DaePlant.state, dd.Reference.derivatives):
         assert not hasattr(method, "__wrapped__")
+
+
+def test_no_thread_collects_garbage_while_expressions_are_built():
+    seen = []
+
+    @checked(ModelError)
+    class Built:
+        def __init__(self, inner: bool) -> None:
+            seen.append(gc.isenabled())
+            if inner:
+                Built(False)
+                seen.append(gc.isenabled())
+                raise KeyError
+
+    was = gc.isenabled()
+    try:
+        for enabled in (True, False):
+            (gc.enable if enabled else gc.disable)()
+            with pytest.raises(KeyError):
+                Built(True)
+            assert gc.isenabled() is enabled
+    finally:
+        (gc.enable if was else gc.disable)()
+    assert seen == [False] * 6
+
+
+def test_what_is_built_waits_for_a_collection_in_another_thread():
+    begun, end, built = (threading.Event() for _ in range(3))
+
+    class Slow:
+        def __del__(self):
+            begun.set()
+            assert end.wait(60.0)
+
+    def collect():
+        slow = Slow()
+        slow.itself = slow
+        del slow
+        gc.collect()
+
+    @uncollected
+    def build():
+        built.set()
+
+    threads = [threading.Thread(target=collect), threading.Thread(target=build)]
+    threads[0].start()
+    assert begun.wait(60.0)
+    threads[1].start()
+    assert not built.wait(0.2)
+    end.set()
+    for thread in threads:
+        thread.join()
+    assert built.is_set()

@@ -15,7 +15,6 @@ MADE = {
     "ScenarioError": lambda kind: kind(("plant.friction", "must be positive"), ("", "no robot")),
     "AssumptionError": lambda kind: kind("A is singular", 2, STATE, violation=("wall", 3)),
     "InconsistentStateError": lambda kind: kind("not on N*", STATE),
-    "PainleveError": lambda kind: kind("no P-matrix", 0.3, STATE, outcome=("jams", 1)),
 }
 """Exceptions whose constructors take more than a text; others are made in `made`."""
 

@@ -1,7 +1,7 @@
 """A block: one system as expressions of symbols, without Drake."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import casadi as ca
@@ -26,26 +26,18 @@ def stacked(values: Sequence[ca.SX]) -> ca.SX:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Values that change only at t_k = offset + k period, all from the values before t_k.
-
-    Attributes:
-        symbol: The values, a column of symbols.
-        next: The values after an update.
-        start: The values at the start, shape (k,); nan where `begin` gives them.
-        period, offset: In s.
-        is_unrestricted: Whether it comes before other updates of its instant, as Drake's
-            unrestricted ones, among them the step of a discrete MultibodyPlant, so that both see
-            the same instant. Otherwise it sees what these have changed.
-        begin: The values at the start of a run where `start` is nan; None if it never is.
-    """
+    """Values that change only at t_k = offset + k period, all from the values before t_k."""
 
     symbol: ca.SX
     next: ca.SX
-    start: FloatArray
+    start: FloatArray  # (k,); nan where `begin` gives it
     period: float
     offset: float = 0.0
+    # Whether it comes before other updates of its instant, as Drake's unrestricted ones, among them
+    # the step of a discrete MultibodyPlant: both see the same instant. Otherwise it sees their
+    # changes.
     is_unrestricted: bool = True
-    begin: ca.SX | None = None
+    begin: ca.SX | None = None  # the values at the start of a run where `start` is nan
 
 
 def where_finite(value: ca.SX, *checks: ca.SX) -> ca.SX:
@@ -56,16 +48,10 @@ def where_finite(value: ca.SX, *checks: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True, eq=False)
 class Requirement:
-    """What must hold where values of a block are valid.
+    """What must hold where values of a block are valid."""
 
-    Attributes:
-        margin: A number that is not negative where it holds.
-        reason: The matrix that must be regular, or why there are no values.
-        fault: SINGULAR or OUTSIDE.
-    """
-
-    margin: ca.SX
-    reason: str
+    margin: ca.SX  # not negative where it holds
+    reason: str  # the matrix that must be regular, or why there are no values
     fault: FailureKind = FailureKind.SINGULAR
 
     OUTSIDE: ClassVar[FailureKind] = FailureKind.OUTSIDE
@@ -82,19 +68,15 @@ class Requirement:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """The projection of a block's state onto a manifold, after each accepted step.
+    """The projection of a block's state onto a manifold, after each accepted step."""
 
-    Attributes:
-        newton: (state, start, parameters) -> a Newton step in units of the block's `scale`, with
-            the gradients at the start.
-        project: (state, parameters) -> the state on the manifold, also where plain Newton steps do
-            not converge; the state itself if it is there. Raises InconsistentStateError.
-        parameters: The parameters of both, an expression of the block's symbols.
-    """
-
+    # (state, start, parameters) -> a Newton step in units of the block's scale, with the gradients
+    # at the start.
     newton: ca.Function
+    # (state, parameters) -> the state on the manifold, also where plain Newton steps do not
+    # converge; the state itself if it is there. Raises InconsistentStateError.
     project: Callable[[FloatArray, FloatArray], FloatArray]
-    parameters: ca.SX
+    parameters: ca.SX  # of both
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +163,35 @@ class Block:
             rates.setdefault((each.period, each.offset, each.is_unrestricted), []).append(name)
         return rates
 
+    def mapped(self, change: Callable[[list[ca.SX]], Sequence[ca.SX]]) -> "Block":
+        """The block with all its expressions changed together, such as by other symbols."""
+        held, projection, required = self.held, self.projection, self.requirements
+        begins = {name: each.begin for name, each in held.items() if each.begin is not None}
+        after = (each.next for each in held.values())
+        margins = (each.margin for each in required)
+        named = *self.outputs.values(), *self.defaults.values()
+        projected = [] if projection is None else [projection.parameters]
+        changed = iter(
+            change([self.derivative, *named, *after, *begins.values(), *margins, *projected])
+        )
+        derivative = next(changed)
+        outputs, defaults, nexts, begins = (
+            {name: next(changed) for name in names}
+            for names in (self.outputs, self.defaults, held, begins)
+        )
+        return replace(
+            self,
+            outputs=outputs,
+            defaults=defaults,
+            derivative=derivative,
+            held={
+                name: replace(each, next=nexts[name], begin=begins.get(name))
+                for name, each in held.items()
+            },
+            requirements=tuple(replace(each, margin=next(changed)) for each in required),
+            projection=projection and replace(projection, parameters=next(changed)),
+        )
+
     def default(self, name: str) -> FloatArray:
         """The state or the parameters at the start."""
         column = self.state if name == "state" else self.parameters
@@ -188,11 +199,7 @@ class Block:
 
 
 class BlockFunction(TracedFunction):
-    """Some values of a block as a function of the columns that they depend on.
-
-    Attributes:
-        sources: The name of the column of each argument, as of `Block.columns`.
-    """
+    """Some values of a block as a function of the columns, `sources`, that they depend on."""
 
     def __init__(
         self,

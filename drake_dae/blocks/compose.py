@@ -1,8 +1,19 @@
-"""A diagram, or the part of it that can be traced, as one block."""
+"""A diagram, or the part of it that can be traced, as one block.
+
+What plant and law share stands here alone. By default each leaf has its own symbols, and a wire
+is all that joins two of them. A law says which DaeSystem it is for (`TracedSystem.equations`,
+`is_law`); a plant with these same `equations` and equal numbers in its parameters shares, with
+`shares`, (1) the symbols of these parameters, and (2) if its control comes straight from this law,
+x' under the law (`TracedSystem.motion`), in which A and B are factorized once for both: 1,507
+operations in place of 2,770 for seven joints on a wall. `simulate` and `compile_diagram` share, for
+numbers that stay; a rollout shares in the runs in which the numbers are equal. Pages and exported
+loops share nothing: their numbers change.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from functools import partial
+from itertools import pairwise, starmap
 
 import casadi as ca
 import numpy as np
@@ -16,9 +27,9 @@ from pydrake.systems.framework import (
     System,
 )
 
-from drake_dae.arguments import checked
+from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.block import NOTHING, Block, Held, Projection, Requirement, stacked
+from drake_dae.blocks.block import NOTHING, Block, Held, Projection, stacked
 from drake_dae.blocks.primitives import symbolic_block
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
@@ -33,9 +44,8 @@ class Leaves:
     """The leaf systems of a diagram, and the wires between them, with nested diagrams flattened."""
 
     systems: list[System] = field(default_factory=list)  # in the order of Drake's states
-    sources: dict[Port, Port] = field(
-        default_factory=dict
-    )  # input port -> the output port it is wired to
+    # Input port -> the output port that it is wired to.
+    sources: dict[Port, Port] = field(default_factory=dict)
 
     @classmethod
     def of(cls, diagram: Diagram) -> "Leaves":
@@ -81,22 +91,14 @@ def laws_of(systems: Iterable[System]) -> dict[TracedSystem, TracedSystem]:
 
 @dataclass(frozen=True, eq=False)
 class Composed:
-    """A part of a diagram as one block.
-
-    Attributes:
-        block: The block. Its inputs are `cuts` and `fixed`.
-        cuts: Name of an input -> the output port of a leaf that is not in the block.
-        fixed: Name of an input -> the input port of a leaf that is exported or has a fixed value.
-        states, parameters: Leaf -> its slice of the block's column.
-        held: (leaf, index of its group) -> the name of a group of the block, and its slice there.
-    """
+    """A part of a diagram as one block, and the places of its leaves there."""
 
     block: Block
-    cuts: Mapping[str, Port]
-    fixed: Mapping[str, Port]
-    states: Mapping[System, slice]
+    cuts: Mapping[str, Port]  # input -> the output port of a leaf that is not in the block
+    fixed: Mapping[str, Port]  # input -> the input port of a leaf, exported or with a fixed value
+    states: Mapping[System, slice]  # leaf -> its slice of the block's column
     parameters: Mapping[System, slice]
-    held: Mapping[tuple[System, int], tuple[str, slice]]
+    held: Mapping[tuple[System, int], tuple[str, slice]]  # (leaf, group) -> group and slice
 
     @property
     def systems(self) -> set[System]:
@@ -132,6 +134,7 @@ def compile_diagram(
     return compose(diagram, outputs, context=context).block
 
 
+@uncollected
 def compose(
     diagram: Diagram,
     outputs: Mapping[str, OutputPort] | None = None,
@@ -146,8 +149,7 @@ def compose(
 
     The block ends at the output ports of `cuts`, which are inputs of these names. With `merge` held
     values of one rate become one group, which takes Drake less time. With `is_whole` it has all
-    blocks with states, also those on which no output depends. Without `shares` a plant has its own
-    parameters also where they equal those of its law.
+    blocks with states, also those on which no output depends.
     """
     if outputs is None:
         every = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]
@@ -159,60 +161,41 @@ def compose(
         block = walk.block(system)
         if block is not None and (block.state.numel() or block.held):
             walk.used.add(system)
-    dynamics: dict[System, _Dynamics] = {}
-    while new := [s for s in walk.leaves.systems if s in walk.used and s not in dynamics]:
-        dynamics |= {system: walk.dynamics(system) for system in new}  # May use more.
-    systems = [s for s in walk.leaves.systems if s in dynamics]  # In the order of Drake's states.
-    states, first = dict[System, slice](), 0
-    for system in systems:
-        size = walk.own[system]["state"].numel()
-        if size:
-            states[system] = slice(first, first + size)
-            first += size
-    every_held = {
-        (system, i): held for system in systems for i, held in enumerate(dynamics[system].held)
+    parts: dict[System, Block] = {}
+    while new := [s for s in walk.leaves.systems if s in walk.used and s not in parts]:
+        parts |= {system: walk.part(system) for system in new}  # May use more.
+    parts = {s: parts[s] for s in walk.leaves.systems if s in parts}  # In Drake's order of states.
+    owners = [s for s in walk.leaves.systems if s in walk.owners]
+    states = _slices({s: part.state.numel() for s, part in parts.items()})
+    parameters = _slices({s: walk.own[s]["parameters"].numel() for s in owners})
+    held, places = _grouped(walk, parts, [*values.values()] if merge else None)
+    starts = {
+        "state": [part.default("state") for part in parts.values()],
+        "parameters": [walk.parameters_of(system) for system in parameters],
     }
-    held, places = _grouped(walk, every_held, [*values.values()] if merge else None)
-    parameters, column, first = dict[System, slice](), list[ca.SX](), 0
-    defaults = list[np.ndarray]()
-    for system in walk.leaves.systems:
-        if system in walk.owners and (size := walk.own[system]["parameters"].numel()):
-            parameters[system] = slice(first, first + size)
-            first += size
-            column.append(walk.own[system]["parameters"])
-            defaults.append(walk.parameters_of(system))
-    start = {
-        "state": np.concatenate([np.zeros(0), *(dynamics[s].start for s in systems)]),
-        "parameters": np.concatenate([np.zeros(0), *defaults]),
-    }
-    scales = [dynamics[s].scale for s in systems]
+    scales = [s for part in parts.values() if (s := part.scale) is not None]
     block = Block(
         diagram.get_name() or "compiled",
         walk.inputs,
         values,
-        stacked([walk.own[s]["state"] for s in states]),
-        stacked([dynamics[s].derivative for s in states]),
+        stacked([part.state for part in parts.values()]),
+        stacked([part.derivative for part in parts.values()]),
         held,
-        stacked(column),
-        start,
-        projection=_projection(states, dynamics),
+        stacked([walk.own[system]["parameters"] for system in parameters]),
+        {name: np.concatenate([np.zeros(0), *each]) for name, each in starts.items()},
+        projection=_projection(states, parts),
         scale=np.concatenate([np.zeros(0), *scales]),
-        requirements=tuple(r for s in systems for r in dynamics[s].requirements),
+        requirements=tuple(r for part in parts.values() for r in part.requirements),
         signals=walk.signals(outputs) | {"parameters": walk.parameter_signals(parameters)},
     )
     return Composed(block, walk.cuts, walk.fixed, states, parameters, places)
 
 
-@dataclass(frozen=True, eq=False)
-class _Dynamics:
-    """What changes the states of a leaf, as expressions of the whole."""
-
-    derivative: ca.SX
-    held: list[Held]
-    start: np.ndarray
-    scale: np.ndarray
-    projection: Projection | None
-    requirements: tuple[Requirement, ...]
+def _slices(sizes: Mapping[System, int]) -> dict[System, slice]:
+    """The place of each system in one column, of those with entries there."""
+    ends = np.cumsum([0, *sizes.values()]).tolist()
+    places = zip(sizes, starmap(slice, pairwise(ends)), strict=True)
+    return {system: place for system, place in places if sizes[system]}
 
 
 class _Walk:
@@ -253,9 +236,9 @@ class _Walk:
         values = [local.get_numeric_parameter(i).CopyToVector() for i in groups]
         return np.concatenate([np.zeros(0), *values])
 
-    def _find_twins(self) -> dict[System, System]:
-        """Plant -> the law whose model it is, with equal parameters: they share their symbols."""
-        twins = {}
+    def _find_twins(self) -> dict[System, TracedSystem]:
+        """Plant -> the law whose model it is, with equal parameters: see the head of this file."""
+        twins = dict[System, TracedSystem]()
         for plant, law in laws_of(self.leaves.systems).items():
             own = self.parameters_of(plant)
             if np.array_equal(own, self.parameters_of(law)[: own.size]):
@@ -351,55 +334,40 @@ class _Walk:
             "connect it, or fix its value in the context"
         )
 
-    def dynamics(self, system: System) -> _Dynamics:
-        """What changes the states of a leaf."""
+    def part(self, system: System) -> Block:
+        """The block of a leaf in symbols of the whole, without outputs, with its numbers."""
         block, local, own = self.block(system), self.local(system), self.own[system]
         assert block is not None
-        groups = list(block.held.values())
-        (derivative, *following) = self.expressions(
-            system, [block.derivative, *(held.next for held in groups)]
-        )
-        if (short := self._under(system)) is not None:
-            derivative = short
-        begins = [
-            None if held.begin is None else self.expressions(system, [held.begin])[0]
-            for held in groups
-        ]
-        names = list(block.held)
-        held = [
-            replace(
-                each,
-                symbol=own[f"held {names[i]}"],
-                next=following[i],
-                start=local.get_discrete_state(i).CopyToVector(),
-                begin=begins[i],
-            )
-            for i, each in enumerate(groups)
-        ]
-        margins = self.expressions(system, [r.margin for r in block.requirements])
-        required = tuple(
-            Requirement(margin, r.reason, r.fault)
-            for r, margin in zip(block.requirements, margins, strict=True)
-        )
+        moved = replace(block, outputs={}, defaults={}).mapped(partial(self.expressions, system))
         size = block.state.numel()
         start = local.get_continuous_state_vector().CopyToVector() if size else np.zeros(0)
-        scale = np.ones(size) if block.scale is None else block.scale
-        projection = block.projection
-        if projection is not None:
-            (parameters,) = self.expressions(system, [projection.parameters])
-            projection = replace(projection, parameters=parameters)
-        return _Dynamics(derivative, held, start, scale, projection, required)
+        held = {
+            name: replace(
+                each,
+                symbol=own[f"held {name}"],
+                start=local.get_discrete_state(i).CopyToVector(),
+            )
+            for i, (name, each) in enumerate(moved.held.items())
+        }
+        return replace(
+            moved,
+            state=own["state"],
+            derivative=self._under(system, moved.derivative),
+            held=held,
+            start={"state": start},
+            scale=np.ones(size) if block.scale is None else block.scale,
+        )
 
-    def _under(self, plant: System) -> ca.SX | None:
-        """x' of a plant that is its law's model and gets its control by a wire."""
+    def _under(self, plant: System, derivative: ca.SX) -> ca.SX:
+        """x' of a plant, that under its law if it is its model and gets its control by a wire."""
         law, block = self._twins.get(plant), self.block(plant)
         if law is None or block is None or "exogenous" in block.inputs:
-            return None
+            return derivative
         wired = self.leaves.sources.get((plant, int(plant.GetInputPort("control").get_index())))
         if wired != (law, int(law.GetOutputPort("control").get_index())):
-            return None
+            return derivative
         motion = law.motion()
-        return None if motion is None else self.expressions(law, [motion])[0]
+        return derivative if motion is None else self.expressions(law, [motion])[0]
 
     def parameter_signals(self, systems: Iterable[System]) -> list[Signal]:
         """Names and units of the parameters of leaves; numbers where a block names none."""
@@ -428,30 +396,28 @@ class _Walk:
 
 
 def _projection(
-    states: Mapping[System, slice], dynamics: Mapping[System, _Dynamics]
+    states: Mapping[System, slice], leaves: Mapping[System, Block]
 ) -> Projection | None:
     """The projection of all states, each by that of its leaf."""
-    parts = [(s, p) for s in states if (p := dynamics[s].projection) is not None]
+    parts = [(states[s], p) for s, leaf in leaves.items() if (p := leaf.projection) is not None]
     if not parts:
         return None
-    sizes = [p.parameters.numel() for _, p in parts]
-    ends = np.cumsum([0, *sizes])
-    places = [slice(a, b) for a, b in pairwise(ends.tolist())]
+    ends = np.cumsum([0, *(p.parameters.numel() for _, p in parts)]).tolist()
+    own = [slice(a, b) for a, b in pairwise(ends)]
     total = max(part.stop for part in states.values())
     x, start = ca.SX.sym("x", total), ca.SX.sym("start", total)
-    values, steps = ca.SX.sym("parameters", int(ends[-1])), ca.SX.zeros(total)
-    for (system, each), place in zip(parts, places, strict=True):
-        part = states[system]
+    values, steps = ca.SX.sym("parameters", ends[-1]), ca.SX.zeros(total)
+    for (part, each), place in zip(parts, own, strict=True):
         steps[part] = each.newton(x[part], start[part], values[place])
 
     def project(state: FloatArray, parameters: FloatArray) -> FloatArray:
         moved = state
-        for (system, each), place in zip(parts, places, strict=True):
-            before = state[states[system]]
+        for (part, each), place in zip(parts, own, strict=True):
+            before = state[part]
             after = each.project(before, parameters[place])
             if after is not before:
                 moved = state.copy() if moved is state else moved
-                moved[states[system]] = after
+                moved[part] = after
         return moved
 
     newton = ca.Function("newton", [x, start, values], [steps])
@@ -459,42 +425,35 @@ def _projection(
 
 
 def _grouped(
-    walk: _Walk, held: Mapping[tuple[System, int], Held], outputs: Sequence[ca.SX] | None
+    walk: _Walk, parts: Mapping[System, Block], outputs: Sequence[ca.SX] | None
 ) -> tuple[dict[str, Held], dict[tuple[System, int], tuple[str, slice]]]:
     """The groups of held values; those of one rate as one, except for those that are outputs."""
-    groups: dict[str, list[tuple[tuple[System, int], Held]]] = {}
-    for key, each in held.items():
-        system, i = key
-        block = walk.blocks[system]
-        assert block is not None
-        name = f"{walk.name(system)}.{list(block.held)[i]}"
-        shown = any(_is_same(value, each.symbol) for value in outputs or ())
-        if outputs is not None and not shown:
-            name = f"held at {each.offset:g} s + k {each.period:g} s"
-            name += "" if each.is_unrestricted else ", last"
-        groups.setdefault(name, []).append((key, each))
-    result, places = dict[str, Held](), {}
-    for name, members in groups.items():
-        first = 0
-        for key, each in members:
-            places[key] = name, slice(first, first + each.symbol.numel())
-            first += each.symbol.numel()
-        one = members[0][1]
-        begins = [each.begin for _, each in members]
-        result[name] = Held(
-            stacked([each.symbol for _, each in members]),
-            stacked([each.next for _, each in members]),
-            np.concatenate([each.start for _, each in members]),
-            one.period,
-            one.offset,
-            one.is_unrestricted,
-            None
-            if all(begin is None for begin in begins)
-            else stacked(
-                [ca.SX(each.start) if each.begin is None else each.begin for _, each in members]
-            ),
-        )
-    return result, places
+    groups, places = dict[str, list[Held]](), {}
+    for system, part in parts.items():
+        for i, (own, each) in enumerate(part.held.items()):
+            name = f"{walk.name(system)}.{own}"
+            if outputs is not None and not any(_is_same(v, each.symbol) for v in outputs):
+                name = f"held at {each.offset:g} s + k {each.period:g} s"
+                name += "" if each.is_unrestricted else ", last"
+            members = groups.setdefault(name, [])
+            first = sum(member.symbol.numel() for member in members)
+            places[system, i] = name, slice(first, first + each.symbol.numel())
+            members.append(each)
+    return {name: _as_one(members) for name, members in groups.items()}, places
+
+
+def _as_one(members: Sequence[Held]) -> Held:
+    """Held values of one rate, stacked."""
+    begin = None
+    if any(each.begin is not None for each in members):
+        begin = stacked([ca.SX(e.start) if e.begin is None else e.begin for e in members])
+    return replace(
+        members[0],
+        symbol=stacked([each.symbol for each in members]),
+        next=stacked([each.next for each in members]),
+        start=np.concatenate([each.start for each in members]),
+        begin=begin,
+    )
 
 
 def _is_same(value: ca.SX, symbol: ca.SX) -> bool:

@@ -2,11 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
-import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray, show_state
-from drake_dae.dae import ConstraintStructure, Manifold, Signal, painleve_outcome
+from drake_dae.dae import ConstraintStructure, Manifold, Signal
 from drake_dae.errors import (
     InconsistentStateError,
     NonFiniteError,
@@ -166,39 +165,21 @@ def singular_configuration(
 
 
 def jammed_contact(
-    structure: ConstraintStructure,
-    error: SimulationError,
-    control: FloatArray,
-    parameters: FloatArray,
-    force: FloatArray,
+    structure: ConstraintStructure, error: SimulationError, parameters: FloatArray
 ) -> PainleveError | None:
-    """The error of a Painleve paradox with its outcome; None if there is none."""
-    dae, elimination = structure.system, structure.elimination
-    frictional, matrix = dae.frictional_contacts, elimination.constraint_matrix
-    outputs = {
-        "A": ca.densify(matrix),
-        "A_0": ca.densify(frictional.without_friction(matrix)),
-        "gradient": elimination.constraint_gradient,
-        "reserve": frictional.reserve(matrix),
-    }
-    values = dae.trace("A(x)", outputs, often=False)(error.state, parameters)
-    m, reserve = dae.num_constraints, values[3].item()
-    if not reserve < SINGULAR_PIVOT:
+    """The error of a Painleve paradox; None if there is none."""
+    dae = structure.system
+    frictional = dae.frictional_contacts
+    reserve = frictional.reserve(structure.elimination.constraint_matrix)
+    (value,) = dae.trace("reserve", {"reserve": reserve}, often=False)(error.state, parameters)
+    if not value.item() < SINGULAR_PIVOT:
         return None
-    A, A_0, gradient = (value.reshape(m, -1) for value in values[:3])
-    fields = dict(zip(dae.fields.output_names, dae.fields(error.state, parameters), strict=True))
-    free = np.abs(fields["f"])
-    if control.size:
-        free = free + np.abs(fields["h"].reshape(free.size, -1)) @ np.abs(control)
-    outcome = painleve_outcome(A, A_0, force, np.abs(gradient) @ free, frictional.rows)
     names = ", ".join(f"'{dae.constraint_input_signals[i].name}'" for i in frictional.rows)
-    remark = f". What becomes of it is {outcome.value}" if outcome else ""
     return PainleveError(
         f"{dae.name}: Painleve paradox at the contact of {names} at t = {error.time:.6g} s, "
         f"state {show_state(error.state)}: a principal minor of A(x) has come to "
-        f"{reserve:.2g} of what it is without friction{remark}. Lower the friction, slide the "
-        "other way, or hold the robot less steeply to the surface",
+        f"{value.item():.2g} of what it is without friction, so that no force fits, or several. "
+        "Lower the friction, slide the other way, or hold the robot less steeply to the surface",
         error.time,
         error.state,
-        outcome,
     )

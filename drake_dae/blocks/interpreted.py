@@ -6,6 +6,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepFunctions, StepSettings
+from drake_dae.blocks.trials import LEAST_PROGRESS, PACE_STEPS
 from drake_dae.errors import InconsistentStateError
 
 REACHED, NEAR = 1e-8, 1e-5
@@ -14,37 +15,21 @@ REACHED, NEAR = 1e-8, 1e-5
 LOOKED = 64
 """The number of steps after which a run checks for Ctrl-C and divergence."""
 
-PACE_STEPS, LEAST_PROGRESS = 1000, 1e-8
-"""The least increase of the time by so many steps, relative to the simulated time."""
-
 
 class _Ended(Exception):
-    """The run cannot go on."""
-
-    def __init__(self, ending: RunEnding) -> None:
-        self.ending = ending
+    """The run cannot go on: its argument says why."""
 
 
 def run_interpreted(functions: StepFunctions, problem: RunProblem, settings: StepSettings) -> Run:
     """Makes a run until its end, or to where it cannot go on."""
-    run = InterpretedRun(functions, problem, settings)
-    ending = RunEnding.DONE
+    run, ending = InterpretedRun(functions, problem, settings), RunEnding.DONE
     try:
         run.steps_to_end()
     except _Ended as ended:
-        ending = ended.ending
-    return Run(
-        np.array(run.rows).reshape(-1, functions.row.numel_out(0)),
-        ending,
-        run.time,
-        run.state,
-        run.held,
-        run.steps,
-        run.before,
-        run.next,
-        run.trial_time,
-        run.trial,
-    )
+        (ending,) = ended.args
+    rows = np.array(run.rows).reshape(-1, functions.row.numel_out(0))
+    at = run.time, run.state, run.held, run.steps, run.before, run.next
+    return Run(rows, ending, *at, run.trial_time, run.trial)
 
 
 class InterpretedRun:
@@ -119,14 +104,13 @@ class InterpretedRun:
         """Makes the updates of one kind that are due, all at once."""
         held, noise = self.held.copy(), self.problem.noise[self.event]
         for number, rate in enumerate(self.functions.rates):
-            if (
-                rate.is_unrestricted == is_unrestricted
-                and self.problem.due[self.event] >> number & 1
-            ):
-                given = self.time, self.state, self.held, self.problem.parameters, noise
-                (held[rate.places],) = self.functions.buffered[f"update_{number}"](*given)
-                if not np.isfinite(held[rate.places]).all():
-                    raise _Ended(RunEnding.INVALID)
+            is_due = self.problem.due[self.event] >> number & 1
+            if not is_due or rate.is_unrestricted != is_unrestricted:
+                continue
+            given = self.time, self.state, self.held, self.problem.parameters, noise
+            (held[rate.places],) = self.functions.buffered[f"update_{number}"](*given)
+            if not np.isfinite(held[rate.places]).all():
+                raise _Ended(RunEnding.INVALID)
         self.held = held
 
     def steps_to_end(self) -> None:

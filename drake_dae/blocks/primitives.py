@@ -15,11 +15,7 @@ from drake_dae.errors import ModelError
 
 
 def symbolic_block(system: System) -> Block | None:
-    """A system of Drake, or a user's LeafSystem templated on the scalar type, as a block.
-
-    None if it does not convert, has an abstract state, several rates, or computes something that
-    symbolic expressions cannot represent.
-    """
+    """A system of Drake, or a LeafSystem templated on the scalar type; None if it is no block."""
     if system not in _KNOWN:
         _KNOWN[system] = _traced(system)
     return _KNOWN[system]

@@ -63,18 +63,9 @@ class Buffered:
 class StepFunctions:
     """The functions of a block: of time, state, all held values and parameters, dense columns.
 
-    A result that is not valid has an entry that is not finite.
-
-    Args:
-        block: The block, whose only input is "noise": its numbers are drawn for each update.
-
-    Attributes:
-        block: The block.
-        rate: -> x'. A block without a state has one that is 0.
-        row: -> all outputs, stacked.
-        newton: -> the state after a Newton step to its manifold, and the length of the step in
-            units of the block's scale.
-        rates: The updates.
+    Its only input is "noise", drawn for each update. A result that is not valid is not finite.
+    `rate` is x', 0 for a block without a state; `row` all outputs, stacked; `newton` the state
+    after a Newton step to its manifold, and the length of this step in units of the scale.
     """
 
     def __init__(self, block: Block) -> None:

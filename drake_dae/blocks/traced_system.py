@@ -114,11 +114,7 @@ class TracedSystem(LeafSystem):
         return f"{type(self).__name__}('{self.get_name()}', {', '.join(ports)})"
 
     def check_context(self, context: Context) -> None:
-        """Refuses the context of another system.
-
-        Raises:
-            ModelError: It belongs to another system.
-        """
+        """Refuses the context of another system, by a ModelError."""
         check_context(self, context)
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
@@ -126,11 +122,10 @@ class TracedSystem(LeafSystem):
             derivatives.SetFromVector(self._derivative(context)[0])
 
     def ToAutoDiffXd(self) -> LeafSystem_[AutoDiffXd]:
-        """The converted system. Drake's own method would wrap it and rename its ports."""
+        # Drake's own method would wrap it and rename its ports.
         return _convert(_CONVERTED[AutoDiffXd], self)
 
     def ToSymbolic(self) -> LeafSystem_[sym.Expression]:
-        """As `ToAutoDiffXd`, with symbolic expressions."""
         return _convert(_CONVERTED[sym.Expression], self)
 
     def begin_run(self, context: Context) -> None:
@@ -150,9 +145,7 @@ class TracedSystem(LeafSystem):
     ) -> SimulationError:
         """Returns the error of a function without a value, or a more precise one.
 
-        Args:
-            error: The error, with time and state.
-            values: Source of each argument, as of `Block.columns` -> its values.
+        `values` are those of each argument, by its source as of `Block.columns`.
         """
         return error
 
@@ -214,11 +207,9 @@ Make = Callable[[str, Mapping[str, ca.SX], Mapping[str, Reader]], Evaluate]
 
 
 def _declare(system: Any, scalar: type, make: Make) -> None:
-    """Declares ports, states, parameters and updates of a system on a scalar type.
-
-    No callback holds the system or a port: Drake keeps callbacks in C++, where Python's collector
-    sees no cycle, and a port keeps its system alive.
-    """
+    """Declares ports, states, parameters and updates of a system on a scalar type."""
+    # No callback holds the system or a port: Drake keeps callbacks in C++, where Python's collector
+    # sees no cycle, and a port keeps its system alive.
     block, vector, is_float = system.block, BasicVector_[scalar], scalar is float
     system.set_name(block.name)
     # Only floats have a value without a copy.
@@ -380,6 +371,11 @@ def _by_jacobians(
     return evaluate
 
 
+_NAMES = (
+    *("sin", "cos", "tan", "asin", "acos", "atan", "atan2"),
+    *("sinh", "cosh", "tanh", "exp", "log", "sqrt"),
+)
+
 _OPERATIONS: dict[int, Callable[..., Any]] = {
     **{ca.OP_ADD: add, ca.OP_SUB: sub, ca.OP_MUL: mul, ca.OP_DIV: truediv, ca.OP_POW: pow},
     **{ca.OP_CONSTPOW: pow, ca.OP_NEG: lambda a: -a, ca.OP_SQ: lambda a: a * a},
@@ -393,24 +389,7 @@ _OPERATIONS: dict[int, Callable[..., Any]] = {
     ca.OP_AND: mul,
     ca.OP_OR: sym.max,
     ca.OP_IF_ELSE_ZERO: lambda a, b: sym.if_then_else(a == 1, b, 0),
-    **{
-        getattr(ca, f"OP_{name.upper()}"): getattr(sym, name)
-        for name in [
-            "sin",
-            "cos",
-            "tan",
-            "asin",
-            "acos",
-            "atan",
-            "atan2",
-            "sinh",
-            "cosh",
-            "tanh",
-            "exp",
-            "log",
-            "sqrt",
-        ]
-    },
+    **{getattr(ca, f"OP_{name.upper()}"): getattr(sym, name) for name in _NAMES},
 }
 
 

@@ -6,7 +6,7 @@ import shlex
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
@@ -33,7 +33,6 @@ from drake_dae.files import check_unwritten
 from drake_dae.pictures import ANIMATION, PLOTS
 from drake_dae.pictures.animation import make_animation
 from drake_dae.running.interruption import Interruption, end_at_once, ending_signals
-from drake_dae.running.record_writer import RecordWriter
 from drake_dae.running.simulate import RunStatistics, simulate
 from drake_dae.scenario.build import build_completed, build_scenario
 from drake_dae.scenario.judging import judge_run
@@ -44,9 +43,6 @@ from drake_dae.scenario.start import start_scenario
 from drake_dae.scene.view import start_meshcat
 
 SCENARIO, SUMMARY, RECORD = "scenario.yaml", "summary.txt", "record.npz"
-PART = "record.part"
-"""The record during a run; it remains if the run is killed."""
-
 FILES = (SCENARIO, SUMMARY, RECORD, *PLOTS, ANIMATION)
 """The files of a run in its folder."""
 
@@ -78,7 +74,7 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         raise ScenarioError(("--meshcat", "leave it out: --rollout shows nothing while it runs"))
     if options.out is not None:
         check_folder(options.out)
-        check_unwritten((options.out / name for name in (*FILES, PART)), options.force)
+        check_unwritten((options.out / name for name in FILES), options.force)
 
     # The loop at its start.
     began = time.perf_counter()
@@ -98,27 +94,21 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     # The run, in a folder of its own.
     folder = options.out or _new_folder(f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}")
     folder.mkdir(parents=True, exist_ok=True)
-    for file in (*FILES, PART):
+    for file in FILES:
         (folder / file).unlink(missing_ok=True)
     first_line = f"# Scenario as run by drake-dae {drake_dae.__version__}"
     save_scenario(scenario, folder / SCENARIO, first_line)
     recorded: list[RecordAfter] = [lambda after: loop.record(context, after)]
     statistics, reason, results, problems = None, "", dict[str, Any](), list[str]()
-    about = {"scenario": scenario_data(scenario)}
-    with (
-        _watched(meshcat),
-        RecordWriter(folder / PART, lambda _, after: recorded[0](after), about) as writer,
-    ):
-        look = writer.update if scenario.write.record else lambda context: None
+    with _watched(meshcat):
         try:
             if options.rollout:
-                statistics = _roll(scenario, loop, context, recorded, look)
+                statistics = _roll(scenario, loop, context, recorded)
             else:
                 config, may_diverge = scenario.integrator, scenario.judgement.may_diverge
                 statistics = simulate(
                     *(loop.diagram, context, scenario.duration, config),
                     progress=True,
-                    look=look,
                     may_diverge=may_diverge,
                 )
         except DrakeDaeError as error:
@@ -132,7 +122,7 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
             if record.time.size:
                 title = f"{path.stem}: {scenario.description}".removesuffix(": ")
                 made = scenario, loop, context, record, statistics, reason
-                results, problems = _write(*made, writer, folder, title, notes)
+                results, problems = _write(*made, folder, title, notes)
     if options.open and (folder / ANIMATION).is_file():
         open_page(folder / ANIMATION)
     told = {"scenario": path.stem, "folder": str(folder), **results}
@@ -166,18 +156,13 @@ def _watched(meshcat: Meshcat | None) -> Iterator[None]:
 
 
 def _roll(
-    scenario: Scenario,
-    loop: ClosedLoop,
-    context: Context,
-    recorded: list[RecordAfter],
-    look: Callable[[Context], None],
+    scenario: Scenario, loop: ClosedLoop, context: Context, recorded: list[RecordAfter]
 ) -> RunStatistics:
     """Runs by `rollout`; `recorded` becomes what it has recorded."""
     began = time.perf_counter()
 
     def see(record: RecordAfter) -> bool:
         recorded[0] = record
-        look(context)
         return ending.signal is not None
 
     with ending_signals(ending := Interruption()), waiting("rolling out"):
@@ -197,7 +182,6 @@ def _write(
     record: Record,
     statistics: RunStatistics | None,
     reason: str,
-    writer: RecordWriter,
     folder: Path,
     title: str,
     notes: Sequence[str],
@@ -222,12 +206,8 @@ def _write(
             predicted = Recorded(loop.predicted_error(record), outputs)
             signals = {**record.signals, "predicted_error": predicted}
             with attempt(RECORD) as place:
-                replace(record, signals=signals, about=writer.about).save(place / RECORD)
-            if problems:
-                with suppress(OSError):
-                    writer.finish(context)  # The rows that still fit.
-            else:
-                writer.path.unlink(missing_ok=True)
+                about = {"scenario": scenario_data(scenario)}
+                replace(record, signals=signals, about=about).save(place / RECORD)
         with attempt(SUMMARY) as place:
             text = "\n".join([summary.text, *notes, ""])
             (place / SUMMARY).write_text(text, encoding="utf-8")
@@ -246,7 +226,7 @@ def _write(
                         page = make_animation(loop, record, context, title)
                         (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
-        written = [name for name in (*FILES, PART) if (folder / name).exists()]
+        written = [name for name in FILES if (folder / name).exists()]
         text, word = summary.text, summary.judgement.outcome.name
         if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
             color = {"GOOD": 32, "BAD": 31, "UNDECIDED": 33}[word]
@@ -325,10 +305,10 @@ def _plot(options: argparse.Namespace) -> int:
 
 def _load_record(path: Path) -> Record:
     """The record of a run: of its folder, or a file."""
-    names = [name for name in (RECORD, PART) if (path / name).is_file()]
-    if path.is_dir() and not names:
+    file = path / RECORD if path.is_dir() else path
+    if path.is_dir() and not file.is_file():
         raise ModelError(f"'{path}' is no folder of a run: it has no {RECORD}")
-    record = Record.load(path / names[0] if names else path)
+    record = Record.load(file)
     if not record.time.size:
         raise ModelError(f"the record in '{path}' has no rows")
     return record

@@ -11,13 +11,9 @@ from .beyond.contact_gains import contact_gains as contact_gains
 from .beyond.disturbance import IdentifiedTerms as IdentifiedTerms
 from .beyond.disturbance import Observation as Observation
 from .beyond.disturbance import with_disturbance as with_disturbance
-from .beyond.lags import Lags as Lags
+from .beyond.filters import Lags as Lags
 from .beyond.one_direction import SensorNoise as SensorNoise
-from .beyond.sampled import sampled_poles as sampled_poles
-from .beyond.sampled import sampling_error as sampling_error
-from .contacts import PainleveOutcome as PainleveOutcome
 from .contacts import UnilateralInput as UnilateralInput
-from .contacts import painleve_outcome as painleve_outcome
 from .derivatives import Derivatives as Derivatives
 from .elimination import Elimination as Elimination
 from .equilibria import ComplexArray as ComplexArray
@@ -36,6 +32,7 @@ from .linearization import Linearization as Linearization
 from .linearization import LinearModel as LinearModel
 from .linearization import linearize as linearize
 from .linearization import linearize_loop as linearize_loop
+from .linearization import sampled_poles as sampled_poles
 from .manifold import Manifold as Manifold
 from .margins import ContactMargin as ContactMargin
 from .margins import RankMargin as RankMargin

@@ -202,8 +202,7 @@ def find_dependence(
         return [a, last * system.scale]
 
     def is_singular(state: FloatArray) -> bool:
-        scaled = equilibrated(significant(matrices(state)[0]))
-        return smallest_singular_value(scaled) < system.least_margin
+        return smallest_singular_value(equilibrated(matrices(state)[0])) < system.least_margin
 
     everywhere = all(is_singular(state) for state in states)
     examined = [where, *states] if everywhere else [where]

@@ -1,4 +1,4 @@
-"""Frictional contacts: whether a unique nonnegative force exists, and the motions if not.
+"""Frictional contacts: whether a unique nonnegative force exists.
 
 A contact that can only push keeps phi >= 0 with lambda >= 0 and phi'' lambda = 0, where
 
@@ -12,7 +12,6 @@ reaches zero is the Painleve paradox (1895).
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
 from itertools import chain, combinations
 
 import casadi as ca
@@ -22,11 +21,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import Parameter, Signal
 from drake_dae.errors import ModelError
 
-FAR = 1e9
-"""Forces that exceed what they balance by this factor count as infinite."""
-
-MOST = 8
-"""The largest number of unilateral forces with friction: every subset of them is examined."""
+MOST = 8  # The largest number of unilateral forces with friction: every subset of them is examined.
 
 
 @dataclass(frozen=True)
@@ -36,19 +31,6 @@ class UnilateralInput:
     force: str
     friction: str | None = None
     sliding: ca.SX | None = field(default=None, repr=False, compare=False)
-
-
-class PainleveOutcome(Enum):
-    """The number of possible motions in a Painleve paradox; the enum value is a description."""
-
-    INCONSISTENT = (
-        "inconsistent: no compressive force maintains the contact, and without a force there "
-        "would be penetration"
-    )
-    INDETERMINATE = (
-        "indeterminate: a compressive force maintains the contact, and it can open as well"
-    )
-    OPENING = "opening: without a force the contact opens, and no compressive force maintains it"
 
 
 class Contacts:
@@ -114,52 +96,10 @@ def _minors(matrix: ca.SX, rows: Sequence[int], before: ca.SX | float = 1.0) -> 
 
 def critical_factor(without: FloatArray, per_unit: FloatArray, rows: Sequence[int]) -> float:
     """Returns the smallest s > 0 at which a principal minor of A_0 - s D is zero; else infinity."""
-    largest = 0.0
-    for used in _sets(len(without), rows):
-        part = np.ix_(used, used)
+    largest, always = 0.0, [i for i in range(len(without)) if i not in rows]
+    for chosen in chain.from_iterable(combinations(rows, n + 1) for n in range(len(rows))):
+        part = np.ix_([*always, *chosen], [*always, *chosen])
         values = np.linalg.eigvals(np.linalg.solve(without[part], per_unit[part]))
         real = values.real[np.abs(values.imag) <= 1e-9 * np.abs(values).max(initial=0.0)]
         largest = max(largest, float(real.max(initial=0.0)))
     return 1.0 / largest if largest > 0.0 else np.inf
-
-
-def painleve_outcome(
-    matrix: FloatArray,
-    without: FloatArray,
-    force: FloatArray,
-    size: FloatArray,
-    rows: Sequence[int],
-) -> PainleveOutcome | None:
-    """Determines the outcome of a Painleve paradox by the linear complementarity problem."""
-    if not np.all(np.isfinite(force)):
-        return PainleveOutcome.INCONSISTENT
-    edge = np.abs(without) @ np.abs(force)
-    if not np.all(edge <= FAR * size):
-        return PainleveOutcome.INCONSISTENT  # A is singular, and no forces balance b.
-    if np.all(np.abs(matrix @ force) <= edge / FAR):
-        return PainleveOutcome.INDETERMINATE  # A is singular, and several forces balance b.
-    free = -matrix @ force
-    fitting = []
-    for used in _sets(len(matrix), rows, with_none=True):
-        force = np.zeros(len(matrix))
-        try:
-            force[used] = np.linalg.solve(matrix[np.ix_(used, used)], -free[used])
-        except np.linalg.LinAlgError:
-            return None
-        closed = np.isin(rows, used)
-        rate = (matrix @ force + free)[rows]
-        if np.all(force[rows][closed] >= 0.0) and np.all(rate[~closed] >= 0.0):
-            fitting.append(closed)
-    if not fitting:
-        return PainleveOutcome.INCONSISTENT
-    if len(fitting) > 1:
-        return PainleveOutcome.INDETERMINATE
-    return None if fitting[0].any() else PainleveOutcome.OPENING
-
-
-def _sets(size: int, rows: Sequence[int], with_none: bool = False) -> Iterator[list[int]]:
-    """Generates every set of contacts, each together with all bilateral constraints."""
-    always = [i for i in range(size) if i not in rows]
-    counts = range(0 if with_none else 1, len(rows) + 1)
-    for chosen in chain.from_iterable(combinations(rows, count) for count in counts):
-        yield [*always, *chosen]

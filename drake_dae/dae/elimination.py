@@ -34,7 +34,7 @@ class Elimination:
 def eliminate(derivatives: Derivatives) -> Elimination:
     """Derives (9)-(14) from the derivatives on N*, which are affine in the control."""
     system = derivatives.system
-    alpha, beta = derivatives.by_control(derivatives.constraint_input)  # (13), (14)
+    alpha, beta = derivatives.by_control(derivatives.constraint_input)  # (13), (14), (25)
     f_star, h_star = derivatives.by_control(derivatives.rate)  # (9), (10)
     l_star, n_star = system.outputs(alpha), ca.sparsify(ca.mtimes(system.m, beta))  # (11), (12)
     gradient, matrix = derivatives.constraint_gradient, derivatives.constraint_matrix

@@ -14,27 +14,14 @@ from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
 from drake_dae.trace.round_off import DEPENDENT
 
-LINEARIZED = 1e-11
-"""The error of a linearization, relative to the terms in each of its entries."""
-
-ROUNDED = 1e-15
-"""The error of computed eigenvalues, relative to the norm of the matrix."""
-
-SHIFT = 1e-7
-"""The error of an equilibrium, relative to the size of the states."""
-
-AT_REST = 1e-8
-"""A state is at rest if the terms of E x' cancel to this, relative to their sizes."""
-
-ISOLATED = 1e-6
-"""An equilibrium is known to this distance, relative to the scale of the states."""
-
+LINEARIZED = 1e-11  # The error of a linearization, relative to the terms in each of its entries.
+ROUNDED = 1e-15  # The error of computed eigenvalues, relative to the norm of the matrix.
+SHIFT = 1e-7  # The error of an equilibrium, relative to the size of the states.
+AT_REST = 1e-8  # A state is at rest if the terms of E x' cancel to this, relative to their sizes.
+ISOLATED = 1e-6  # An equilibrium is known to this distance, relative to the scale of the states.
+# The distance, relative to the scale, within which the slopes must be nearly constant.
 BESIDE = 1e-5
-"""The distance, relative to the scale, within which the slopes must be nearly constant."""
-
-SAME = 0.5
-"""The allowed relative change of the slopes there: then Newton's method contracts."""
-
+SAME = 0.5  # The allowed relative change of the slopes there: then Newton's method contracts.
 ComplexArray = np.typing.NDArray[np.complex128]
 
 

@@ -5,32 +5,27 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy  # SciPy loads its large parts when they are used.
 
 from drake_dae.arrays import FloatArray
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import fields_at
 from drake_dae.errors import InconsistentStateError
+from drake_dae.trace.round_off import positive
 
+# The number of random members. Functions are analytic almost everywhere: one that is zero at a few
+# random members is zero at all.
 MEMBERS = 4
-"""The number of random members. Functions are analytic almost everywhere: one that is zero at a few
-random members is zero at all."""
-
-VISIBLE = 1e-6
-"""An action above this, relative to the sizes of its terms, is not round-off."""
-
+# If there is no consistent state for drawn numbers, they are moved towards the defaults by this
+# factor, so often.
 NEARER, TRIES = 0.25, 6
-"""If there is no consistent state for drawn numbers, they are moved towards the defaults by this
-factor, so often."""
-
-CORNERS, STARTS, DESCENTS, STEP = 16, 3, 25, 1e-4
-"""How a box of bounds is searched: the number of random corners and of random places, of the places
-from which a margin is minimized, of steps, and the difference for its gradient."""
-
+# How a box of bounds is searched: random corners, random places, minima from the best of them.
+CORNERS, STARTS = 16, 3
+UNKNOWN = 10.0  # A margin where there is no consistent state; others are at most about 1.
+# Parameters that differ less from their defaults, relative to the others, do not decide.
 SAME = 1e-3
-"""Parameters that differ less from their defaults, relative to the others, do not decide."""
-
+# A function of a consistent state and the values of all parameters.
 OfMember = Callable[[FloatArray, FloatArray], float]
-"""A function of a consistent state and the values of all parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +84,7 @@ class Family:
     def lost(self, margin: OfMember, least: float) -> Deciding | None:
         """Returns parameters within their bounds where a margin is not above the least, or None.
 
-        The margin is tried at corners and random places of the box of bounds, and then minimized
-        from the lowest, by steps to the zero of the linearized margin.
+        It is tried at corners and random places of the box of bounds, and minimized from the best.
         """
         system, defaults = self._system, self._system.parameter_values
         bounded = [p for p in system.parameters if p.bounds is not None]
@@ -98,40 +92,27 @@ class Family:
         places = np.concatenate([np.r_[system.parameter_slice(p.name)] for p in bounded])
         low, high = (bound[places] for bound in system.parameter_box)
         width, random = high - low, np.random.default_rng(0)
-        default = (defaults[places] - low) / np.where(width > 0.0, width, 1.0)
+        default = (defaults[places] - low) / positive(width)
 
         def at(box: FloatArray) -> float:
             values = defaults.copy()
             values[places] = low + width * box
             member = self._consistent(self._states[0], values)
-            return np.inf if member is None else margin(*member)
+            return UNKNOWN if member is None else min(margin(*member), UNKNOWN)
 
         alone = [np.where(row > 0, end, default) for row in np.eye(places.size) for end in (0, 1)]
         corners = random.integers(0, 2, (CORNERS, places.size))
         inside = random.uniform(size=(CORNERS, places.size))
-        tried = [*alone, *np.unique(corners, axis=0), *inside]
-        lowest = sorted((at(box), k) for k, box in enumerate(tried))
-        for value, k in lowest[:STARTS]:
-            box = np.array(tried[k], dtype=float)
-            for _ in range(DESCENTS):
-                if not value > least:
-                    break
-                slope = np.zeros(box.size)
-                for i in np.flatnonzero(width > 0.0):
-                    other = box.copy()
-                    other[i] += STEP if box[i] < 0.5 else -STEP
-                    slope[i] = (at(other) - value) / (other[i] - box[i])
-                square = float(slope @ slope)
-                if not 0.0 < square < np.inf:
-                    break
-                # To the zero of the linearized margin, or as far as the margin falls.
-                steps = (c * value / square * slope for c in (1.0, 0.25, 0.06))
-                trials = (np.clip(box - step, 0.0, 1.0) for step in steps)
-                lower = next(((t, v) for t in trials if (v := at(t)) < value), None)
-                if lower is None:
-                    break
-                box, value = lower
-            if not value > least:
+        tried = np.array([*alone, *np.unique(corners, axis=0), *inside], dtype=float)
+        values = np.array([at(box) for box in tried])
+        for k in np.argsort(values, kind="stable")[:STARTS]:
+            box, value = tried[k], float(values[k])
+            if value > least:
+                found = scipy.optimize.minimize(
+                    at, box, method="L-BFGS-B", bounds=[(0.0, 1.0)] * box.size
+                )
+                box, value = found.x, float(found.fun)
+            if value <= least:
                 moved = np.abs(box - default)
                 rows = zip(names, low + width * box, defaults[places], moved, strict=True)
                 far = SAME * np.max(moved)

@@ -20,26 +20,14 @@ from drake_dae.dae.manifold import tangent
 from drake_dae.dae.pinned_motion import GROWN, PinnedMotion, PinnedSet
 from drake_dae.errors import ModelError
 
-ACCURACY = 1e-9
-"""The error of an integration step, relative to the scale of the states."""
-
-MOST_STEPS = 5000
-"""The largest number of integration steps in a period."""
-
-SECTIONS = 16
-"""The number of parts of a period; after each, the state is projected onto Z(R)."""
-
+ACCURACY = 1e-9  # The error of an integration step, relative to the scale of the states.
+MOST_STEPS = 5000  # The largest number of integration steps in a period.
+SECTIONS = 16  # The number of parts of a period; after each, the state is projected onto Z(R).
+# A motion is periodic if it returns to within this, relative to the scale of the states.
 CLOSED = 1e-7
-"""A motion is periodic if it returns to within this, relative to the scale of the states."""
-
-CARRIED = 1e-6
-"""The error of the matrix M, relative to its norm."""
-
-NEWTON_STEPS = 12
-"""The largest number of Newton steps."""
-
-REPEATED = 1e-6
-"""A reference has a period if it repeats itself to this, relative to its values."""
+CARRIED = 1e-6  # The error of the matrix M, relative to its norm.
+NEWTON_STEPS = 12  # The largest number of Newton steps.
+REPEATED = 1e-6  # A reference has a period if it repeats itself to this, relative to its values.
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,9 +107,8 @@ class FeedbackGains:
 
 T = TypeVar("T")
 
+# A function that makes gains for outputs of given names and degrees.
 GainDesign = Callable[[Sequence[str], Sequence[int]], FeedbackGains]
-"""A function that makes gains for outputs of given names and degrees."""
-
 Poles = float | complex | Sequence[float | complex]
 
 

@@ -29,9 +29,8 @@ def damped(
     force. On N* all y_i^(j) vanish, so that nothing changes there: alpha (13) becomes alpha - A^-1
     (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay.
 
-    If a force is an output of degree mu >= 1, the law differentiates alpha and takes the added term
-    as constant: a compliant contact does not move as the model demands, so that the derivatives of
-    the model would destabilize it. The force poles must be faster than the contact.
+    Where a force is an output of degree mu >= 1, the law takes the added term as constant: along
+    the model its derivatives would destabilize a compliant contact, which moves otherwise.
     """
     system = acting_late(structure.system, latency)
     if damping is None and system is structure.system:
@@ -86,15 +85,10 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
 
         M v' + D (v + T v') = u,    or    (M + T D) v' + D v = u.
 
-    With M alone the joint moves as if it had M + T D while gains and integrals are computed for M:
-    a light joint with T D / M = 30, as in the wrists of some arms, has errors that decay 30 times
-    as slowly. Drake's discrete MultibodyPlant has the same matrix, with its step h in place of T,
-    since its damping is implicit: it adds h / 2 to T.
-
-    D is -df / dv without Coulomb friction at the nominal speeds, usually rest, and at any position:
-    a contact with viscous friction damps several joints by one matrix J^T d J. v are the states
-    that a force or a control drives. Those whose own damping, at the nominal state, is 0 or
-    negative do not count.
+    With M alone the errors of a light joint with T D / M = 30, as in the wrists of some arms, decay
+    30 times as slowly as designed. Drake's discrete MultibodyPlant, whose damping is implicit, adds
+    h / 2 to T. D is -df / dv without Coulomb friction at the nominal speeds, at any position. v are
+    the states that a force or a control drives, if their own damping there is positive.
     """
     if latency < 0.0:
         raise ModelError(f"the latency of a law must be 0 s or more, got {latency:g} s")
@@ -115,17 +109,11 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
         return system
     damping, places = ca.SX(n, n), [rows[i] for i in kept]
     damping[places, places] = slopes[kept, kept]
-    added, inner = latency * ca.sparsify(damping), system.implicit
-
-    def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
-        assert inner is not None
-        balance, constraint_rate = inner(rate, constraint_input)
-        return balance + ca.mtimes(added, rate), constraint_rate
-
+    added = latency * ca.sparsify(damping)
     return replace(
         system,
         mass_matrix=system.mass_matrix + added,
-        implicit=None if inner is None else implicit,
+        implicit=system.implicit_with(lambda rate: ca.mtimes(added, rate)),
         state_scale=system.scale,
     )
 
@@ -138,8 +126,7 @@ class ForceMeasurement:
             force error of a wrong model shrinks to 1 / (1 + Gbar).
         mu_i >= 1: v_j takes the place of the model's l*_i, as (71) and (81) allow.
 
-    Outputs that are combinations of constraint inputs, z_i = m_i(x) v, take m_i v in place of v_j;
-    then Gbar is a multiple of the identity.
+    For outputs that are combinations, z_i = m_i(x) v, Gbar is a multiple of the identity.
     """
 
     layout: DerivativeLayout
@@ -296,8 +283,8 @@ class IntegralAction:
 class Deflection:
     """The motion of compliant contacts, lambda = -k phi, that a wanted force lambda_d needs.
 
-    A law that keeps phi'' + c phi' = 0 leaves phi'' + c phi' = A (lambda - lambda_d) there: a step
-    of lambda_d makes the contact oscillate with sqrt(A k). With phi_d = -lambda_d / k and
+    A law that keeps phi'' + c phi' = 0 lets a step of lambda_d make the contact oscillate with
+    sqrt(A k). With phi_d = -lambda_d / k and
 
         phi'' - phi_d'' + c (phi' - phi_d') = 0,    so    u for lambda_d + A^-1 (c lambda_d' +
                                                           lambda_d'') / k,

@@ -1,23 +1,29 @@
 """Linear models of (1)-(3) and of closed loops: as they stand, and in minimal form on N*."""
 
 from dataclasses import dataclass
+from math import floor
 
 import casadi as ca
 import numpy as np
+import scipy.linalg
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.arrays import FloatArray, number, positive, show, vector
 from drake_dae.dae.manifold import coordinates
 from drake_dae.dae.signals import Indices, Signal
 from drake_dae.dae.structure import ConstraintStructure, constraint_structure_of
 from drake_dae.dae.system import DaeSystem
 from drake_dae.dae.tracking import TrackingLaw
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.round_off import equilibration, smallest_singular_value
+from drake_dae.trace.round_off import equilibration
 
-SINGULAR = 1e-12
-"""A loop of control and measured force has no solution below this singular value."""
+SAME = 1e-9  # Times that differ by less than this, in periods, count as equal.
+# A state counts as an equilibrium if its change within the time constant of the fastest pole is at
+# most this, relative to its scale.
+RESTS = 1e-4
+# The largest number of states, including delayed ones; for more, the poles would take minutes.
+MOST_STATES = 2000
 
 ComplexArray = np.typing.NDArray[np.complex128]
 
@@ -88,8 +94,7 @@ def linearize(
     p = system.num_controls
     u = np.zeros(p) if control is None else vector(f"{system.name}: control", control, p)
     plant = _PlantModel(structure, state, system.parameter_vector(parameters))
-    no_feedback = np.zeros((p, system.num_states + system.num_constraints))
-    return plant.linearization(u, no_feedback, np.eye(p))
+    return plant.linearization(u, np.zeros((p, system.num_states)), np.eye(p))
 
 
 @checked(ModelError)
@@ -101,37 +106,23 @@ def linearize_loop(
     parameters: ArrayLike | None = None,
 ) -> Linearization:
     """Linearizes a plant under the law (28), from R to the controlled outputs z."""
-    if law.integral.outputs:
+    if law.integral.outputs or law.control_takes_force:
+        what = "integrals" if law.integral.outputs else "a measured force in its control"
         raise ModelError(
-            f"{law.system.name}: a law with integral action has a state, which this function does "
-            "not support. Convert the loop's diagram to AutoDiffXd and use Drake's Linearize"
+            f"{law.system.name}: a law with {what} has a state in the loop that this model does "
+            "not include; take the law without it, or convert the loop's diagram to AutoDiffXd and "
+            "use Drake's Linearize"
         )
-    system, values = law.system, law.all_parameters()
+    system = law.system
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)
     plant = _PlantModel(law.structure, state, system.parameter_vector(parameters))
-    n, m, p = system.num_states, system.num_constraints, system.num_controls
-    free, _, by_control = plant.motion(np.zeros(p))
-    # u = u_0 + K_v v and v = v_0 + beta u: the law is affine in the measured force.
-    force = [np.zeros(m)] if law.measured_force else []
-    slope = law.function.derivative(
-        law.function.output_names.index("control"), range(2 + len(force))
-    )
-    control = law.function(plant.state, R, *force, values)[0].copy()
-    if law.measured_force:
-        gains = slope(plant.state, R, *force, values)[0].reshape(p, -1)[:, n + R.size :]
-        around = np.eye(p) - gains @ by_control[n:]
-        if smallest_singular_value(around) < SINGULAR:
-            raise ModelError(
-                f"{system.name}: the measured force and the control do not determine each other at "
-                f"x = {show(plant.state)}; take another force gain"
-            )
-        solved = np.linalg.solve(around, control + gains @ free[n:])
-        control = np.asarray(solved, dtype=np.float64)
-        force = [plant.motion(control)[0][n:]]
-    gains = slope(plant.state, R, *force, values)[0].reshape(p, -1)
-    by_force = gains[:, n + R.size :] if force else np.zeros((p, m))
-    feedback = np.hstack([gains[:, :n], by_force])
-    return plant.linearization(control, feedback, gains[:, n : n + R.size])
+    force = [np.zeros(system.num_constraints)] if law.measured_force else []
+    at = (plant.state, R, *force, law.all_parameters())
+    control = law.function(*at)[0].copy()
+    slope = law.function.derivative(law.function.output_names.index("control"), range(2))
+    gains = slope(*at)[0].reshape(control.size, -1)
+    n = system.num_states
+    return plant.linearization(control, gains[:, :n], gains[:, n:])
 
 
 class _PlantModel:
@@ -171,7 +162,7 @@ class _PlantModel:
     def linearization(
         self, control: FloatArray, feedback: FloatArray, forward: FloatArray
     ) -> Linearization:
-        """The linear models with du = feedback (dx, dv) + forward dw."""
+        """The linear models with du = feedback dx + forward dw."""
         system, structure, x = self.system, self.structure, self.system.state
         n, m, p = system.num_states, system.num_constraints, system.num_controls
         moved, by_state, by_control = self.motion(control)
@@ -184,20 +175,16 @@ class _PlantModel:
         function = system.trace("linearization", outputs, {"r": r, "v": v, "u": u}, often=False)
         mass, whole = function(self.state, rate, force, control, self.parameters)
         whole = whole.reshape(slopes.shape)
-        A, B, C = whole[: n + m, : n + m], whole[: n + m, n + m :], whole[n + m :, : n + m]
+        A, B, C = whole[: n + m, : n + m].copy(), whole[: n + m, n + m :], whole[n + m :, : n + m]
         # In descriptor form, in (x, v).
         E = np.zeros((n + m, n + m))
         E[:n, :n] = mass.reshape(n, n)
+        A[:, :n] += B @ feedback
         unknowns = (*system.state_signals, *system.constraint_input_signals)
         none = np.zeros((system.num_outputs, forward.shape[1]))
-        descriptor = LinearModel(
-            E, A + B @ feedback, B @ forward, C, none, unknowns, system.output_signals
-        )
-        # On N*: (dx', dv) = by_state dx + by_control du, and dv out of du.
-        of_x, of_v = feedback[:, :n], feedback[:, n:]
-        around = np.eye(p) - of_v @ by_control[n:]
-        by_state = by_state + by_control @ np.linalg.solve(around, of_x + of_v @ by_state[n:])
-        by_input = by_control @ np.linalg.solve(around, forward)
+        descriptor = LinearModel(E, A, B @ forward, C, none, unknowns, system.output_signals)
+        # On N*: (dx', dv) = by_state dx + by_control du.
+        by_state, by_input = by_state + by_control @ feedback, by_control @ forward
         gradients = structure.manifold.gradients(self.state, self.parameters)
         free, basis = coordinates(gradients, structure.scale)
         minimal = LinearModel(
@@ -211,3 +198,75 @@ class _PlantModel:
         )
         at = (self.state, rate, control, force)
         return Linearization(descriptor, minimal, structure.index, free, basis, *at)
+
+
+@checked(ModelError)
+def sampled_poles(
+    law: TrackingLaw,
+    reference: ArrayLike,
+    period: float,
+    delay: float = 0.0,
+    *,
+    state: ArrayLike | None = None,
+    parameters: ArrayLike | None = None,
+) -> ComplexArray:
+    """Returns the exact poles of a robot under a sampled law, about an equilibrium.
+
+    The law samples at t_k = k T; its control acts from t_k + d until t_(k+1) + d. About an
+    equilibrium a deviation x of the minimal states on N* has x' = A x without the law and x' = (A +
+    G) x with it. With d = n T + c, 0 <= c < T, and Gamma(t) = int_0^t exp(A s) ds,
+
+        x_(k+1) = exp(A T) x_k + Gamma(T - c) G x_(k-n) + exp(A (T - c)) Gamma(c) G x_(k-n-1).
+
+    The loop is stable where all of these poles, shape ((n + 2) k,) for k minimal states, largest
+    first, are within the unit circle; where T and d tend to 0 they tend to exp(p T) for the poles p
+    of the continuous loop, and to 0. A compliant constraint has further poles: `contact_damping`.
+    The state, the nominal consistent one if None, must be an equilibrium under the law with R.
+    """
+    period, delay = positive("period", period), number("delay", delay)
+    if delay < 0.0:
+        raise ModelError(f"delay must be 0 s or more, got {delay:g}")
+    loop = linearize_loop(law, reference, state, parameters=parameters)
+    plant = linearize(
+        law.system, loop.state, loop.control, structure=law.structure, parameters=parameters
+    )
+    A = plant.minimal.A
+    G = loop.minimal.A - A
+    _check_rest(law, loop, A + G)
+    size, late = len(A), floor(delay / period + SAME)
+    if (late + 2) * size > MOST_STATES:
+        raise ModelError(
+            f"a delay of {delay:g} s is {late} periods of {period:g} s, which needs "
+            f"{late + 2} x {size} states; at most {MOST_STATES} are allowed. Use a longer period"
+        )
+    rest = max(delay - late * period, 0.0)
+    begin, end = (_held(A, G, length) for length in (rest, period - rest))
+    matrix = np.eye((late + 2) * size, k=-size)
+    matrix[:size] = 0.0
+    matrix[:size, :size] = end[0] @ begin[0]
+    matrix[:size, late * size : (late + 1) * size] += end[1]
+    matrix[:size, (late + 1) * size :] += end[0] @ begin[1]
+    eigenvalues = np.linalg.eigvals(matrix).astype(complex)
+    return eigenvalues[np.argsort(-np.abs(eigenvalues), kind="stable")]
+
+
+def _held(A: FloatArray, G: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+    """Returns exp(A t) and Gamma(t) G."""
+    size = len(A)
+    both = np.block([[A, G], [np.zeros((size, 2 * size))]])
+    transition = scipy.linalg.expm(both * length)
+    return transition[:size, :size], transition[:size, size:]
+
+
+def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> None:
+    """Checks that a state is an equilibrium."""
+    moves = np.abs(loop.rate) / law.system.scale
+    fastest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
+    worst = int(np.argmax(moves))
+    if moves[worst] > RESTS * fastest:
+        signal = law.system.state_signals[worst]
+        raise ModelError(
+            f"{law.system.name}: poles are computed at an equilibrium under the law, but at this "
+            f"state {signal.name} changes by {loop.rate[worst]:.3g} {signal.unit} per second. Give "
+            "a constant reference, and its steady state"
+        )

@@ -26,20 +26,12 @@ from drake_dae.trace.newton import (
 )
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
-POLE = 1e-3
-"""A larger residual, over its usual change by the scale of the states, is no round-off."""
-
-NEAR_POLE = 1e-6, 1e-3
-"""The distances at which poles show, in states over their scale."""
-
-RESTARTS = 12
-"""The number of random starts of `Manifold.settle`."""
-
+POLE = 1e-3  # A larger residual, over its usual change by the scale of the states, is no round-off.
+NEAR_POLE = 1e-6, 1e-3  # The distances at which poles show, in states over their scale.
+RESTARTS = 12  # The number of random starts of `Manifold.settle`.
+# A velocity is kept if no state moves further for it than so many times the size of the state.
 FAR = 100.0
-"""A velocity is kept if no state moves further for it than so many times the size of the state."""
-
-FLOOR = 1e-12
-"""A distance from N* that is round-off even if all states are zero."""
+FLOOR = 1e-12  # A distance from N* that is round-off even if all states are zero.
 
 
 class Manifold:
@@ -99,10 +91,9 @@ class Manifold:
     def newton_step(self) -> TracedFunction:
         """The Newton step of least norm from a state, divided by the scale of the states.
 
-        A function of the state, a second state at which the gradients are taken, and parameters.
-        With C the gradients and S the scale it is -(C S)' N^-1 residual, N = C S (C S)', each row
-        by its largest entry: the squares of entries may be too large for a number. An error of N^-1
-        grows with the square of the condition of C, and only makes Newton's method slower.
+        A function of the state, another state at which the gradients C are taken, and parameters:
+        -(C S)' N^-1 residual, N = C S (C S)', with the scale S, and rows by their largest entries,
+        whose squares may be too large for a number. An error of N^-1 only makes Newton slower.
         """
         other, state = ca.SX.sym("other", self.system.num_states), self.system.state
         gradient = ca.substitute(self.short_gradient, state, other)

@@ -13,11 +13,10 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
+# Critical coefficients above this are meaningless: they occur where sliding is only round-off.
 MEANINGLESS = 1e6
-"""Critical coefficients above this are meaningless: they occur where sliding is only round-off."""
-
+# The fractions of the lowest critical friction so far for which a paradoxical state is sought.
 CLOSER = (0.9, 0.99)
-"""The fractions of the lowest critical friction so far for which a paradoxical state is sought."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,12 +16,10 @@ from drake_dae.trace.expressions import find_flaw
 from drake_dae.trace.newton import NewtonModel, newton
 from drake_dae.trace.round_off import unit_rows
 
+# Single states complete the chains if the sine of their smallest angle is above this.
 TRANSVERSAL = 0.05
-"""Single states complete the chains if the sine of their smallest angle is above this."""
-
-
+# xi, its signals, and the margin of the Jacobian of Phi.
 Completion = tuple[ca.SX, tuple[Signal, ...], RankMargin]
-"""xi, its signals, and the margin of the Jacobian of Phi."""
 
 
 @checked(ModelError)

@@ -25,30 +25,18 @@ from drake_dae.trace.expressions import result_of
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
 
+# A or B counts as singular below this fraction of its usual margin, also if it is a single number.
 VANISHED = 1e-9
-"""A or B counts as singular below this fraction of its usual margin, also if it is a single
-number."""
-
+# The tolerance of an integration step; the method overestimates its error by two orders.
 TOLERANCE = 1e-6
-"""The tolerance of an integration step; the method overestimates its error by two orders."""
-
-SHORTEST = 1e-6
-"""The smallest step, as a fraction of a time step, at which the motion ends."""
-
-JUMP = 0.1
-"""A correction above this, relative to the state, may lead to another solution."""
-
-MOST_STEPS = 20_000
-"""The largest number of steps of one motion, besides its given times."""
-
-GROWN = 1e8
-"""A state that has grown by this factor grows without bound."""
-
+SHORTEST = 1e-6  # The smallest step, as a fraction of a time step, at which the motion ends.
+JUMP = 0.1  # A correction above this, relative to the state, may lead to another solution.
+MOST_STEPS = 20_000  # The largest number of steps of one motion, besides its given times.
+GROWN = 1e8  # A state that has grown by this factor grows without bound.
+# A margin below this fraction of its largest value along the motion counts as tending to zero.
 LOST = 1e-2
-"""A margin below this fraction of its largest value along the motion counts as tending to zero."""
-
+# t -> R(t) = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), or t -> values of all parameters.
 TimeFunction = Callable[[float], FloatArray]
-"""t -> R(t) = (r_1, r_1', ..., r_1^(mu_1), r_2, ...), or t -> values of all parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +55,11 @@ class PinnedPoint:
     @cached_property
     def margins(self) -> tuple[float, float]:
         """The smallest singular values of A and B; infinite without constraints."""
-
-        def margin(matrix: FloatArray) -> float:
-            if matrix.size == 1:  # A(x) of one contact; LAPACK takes twenty times as long.
-                return abs(matrix.item())
-            values = np.linalg.svd(matrix, compute_uv=False)
-            return float(np.min(values, initial=np.inf))
-
-        return margin(self.A), margin(self.B)
+        a, b = (
+            float(np.min(np.linalg.svd(matrix, compute_uv=False), initial=np.inf))
+            for matrix in (self.A, self.B)
+        )
+        return a, b
 
     @cached_property
     def signs(self) -> tuple[float, ...]:
@@ -265,16 +250,15 @@ class EndCause(Enum):
     """The causes for the end of a motion with pinned outputs; the enum value is a description."""
 
     NO_START = "no state has the outputs that the reference begins with"
-    SINGULAR_START = "A(x) or B(x) is singular at the start, or the domain of the system ends"
+    SINGULAR_START = "A(x) or B(x) is singular, or the domain of the system ends, at the start,"
     REFERENCE_NOT_FINITE = "the reference is not finite"
-    UNBOUNDED = "the internal states grow without bound while the outputs follow"
-    TOO_FAST = "the motion is too fast to be followed so far"
+    UNBOUNDED = "the internal states grow without bound while the outputs follow,"
+    TOO_FAST = f"the motion is too fast to be followed in {MOST_STEPS} steps further than"
     NO_WAY_ON = (
-        "no state that continues the motion is found: the reference jumps, or the domain of the "
-        "system ends"
+        "the reference jumps, or the domain of the system ends: no state continues the motion"
     )
     OUT_OF_REACH = "the reference leaves what the system can reach"
-    SINGULAR = "the control would be unbounded. Lead the reference around"
+    SINGULAR = "the control would be unbounded; lead the reference around its course"
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,16 +346,15 @@ class _Follower:
         self._pinned, self._reference, self._parameters = pinned, reference, parameters
         self._system, self._times, self._time = pinned.system, times, times[0]
         self._remaining = MOST_STEPS + len(times)
-        first, when = self._at(self._time), f"t = {self._time:.6g} s"
+        first = self._at(self._time)
         try:
             start = first.state(guess)
         except InconsistentStateError as error:
-            text = f"{error} ({when})"
+            text = f"{error} (t = {self._time:.6g} s)"
             raise _Ended(MotionEnd(EndCause.NO_START, self._time, text)) from error
         self._last = first.point(start)
         if first.flaw(self._last):
-            text = f"at the start, {when}, x = {show(start)}: {EndCause.SINGULAR_START.value}"
-            raise self._stop(EndCause.SINGULAR_START, text)
+            raise self._stop(EndCause.SINGULAR_START, f"x = {show(start)}")
         self._largest = self._last.margins
 
     def points(self) -> Iterator[PinnedPoint]:
@@ -415,8 +398,7 @@ class _Follower:
                 worst = int(np.argmax(np.abs(integrator.y) / scale))
                 if abs(integrator.y[worst]) > bound * scale[worst]:
                     name = self._system.state_signals[worst].name
-                    value = f"{name} = {integrator.y[worst]:.3g} at t = {integrator.t:.6g} s"
-                    raise self._stop(EndCause.UNBOUNDED, f"{EndCause.UNBOUNDED.value}: {value}")
+                    raise self._stop(EndCause.UNBOUNDED, f"{name} = {integrator.y[worst]:.3g}")
                 if self._reach(integrator.t, integrator.y):
                     integrator.y, integrator.f = self._last.state.copy(), self._last.rate.copy()
                 else:
@@ -458,8 +440,7 @@ class _Follower:
         last = self._last
         self._remaining -= 1
         if self._remaining < 0:
-            text = f"after {MOST_STEPS} steps, at t = {self._time:.6g} s: {EndCause.TOO_FAST.value}"
-            raise self._stop(EndCause.TOO_FAST, text)
+            raise self._stop(EndCause.TOO_FAST, f"x = {show(last.state)}")
         pinned = self._at(time)
         projected, converged = pinned.project(state)
         near = JUMP * np.maximum(self._system.scale, np.abs(last.state))
@@ -479,7 +460,7 @@ class _Follower:
 
     def _end(self, ahead: float) -> _Ended:
         """Why the motion ends at the last point, also by the reference `ahead` seconds."""
-        last, system, when = self._last, self._system, f"at t = {self._time:.6g} s"
+        last, system = self._last, self._system
         shares = [
             now / largest if largest < np.inf else 1.0
             for now, largest in zip(last.margins, self._largest, strict=True)
@@ -493,24 +474,19 @@ class _Follower:
             size = np.maximum(1.0, np.abs(last.state) / system.scale)
             rates = np.abs(last.rate) / system.scale * elapsed / size
             worst = int(np.argmax(rates))
-            cause, where = EndCause.NO_WAY_ON, f"{when}, x = {show(last.state)}"
             if rates[worst] > GROWN:
-                cause = EndCause.UNBOUNDED
-                where = f"{system.state_signals[worst].name}' = {last.rate[worst]:.3g} {when}"
-            return self._stop(cause, f"{cause.value}: {where}")
+                rate = f"{system.state_signals[worst].name}' = {last.rate[worst]:.3g}"
+                return self._stop(EndCause.UNBOUNDED, rate)
+            return self._stop(EndCause.NO_WAY_ON, f"x = {show(last.state)}")
         ahead = min(ahead, self._times[-1] - self._time)
         pinned = self._at(self._time + ahead)
         guesses = last.state, last.state + ahead * last.rate
+        near = any(pinned.project(guess)[1] for guess in guesses)
         matrix, margin = "AB"[which], f"{last.margins[which]:.2g}"
-        singular = f"{matrix}(x) becomes singular, smallest singular value {margin}"
-        if any(pinned.project(guess)[1] for guess in guesses):
-            cause, text = EndCause.SINGULAR, f"{when} {singular}: {EndCause.SINGULAR.value}"
-        else:
-            cause = EndCause.OUT_OF_REACH
-            text = f"{EndCause.OUT_OF_REACH.value} {when}: {singular}"
-        return self._stop(cause, text, matrix)
+        detail = f"{matrix}(x) becomes singular, smallest singular value {margin}"
+        return self._stop(EndCause.SINGULAR if near else EndCause.OUT_OF_REACH, detail, matrix)
 
-    def _stop(self, cause: EndCause, text: str, matrix: str = "") -> _Ended:
+    def _stop(self, cause: EndCause, detail: str, matrix: str = "") -> _Ended:
         """The end of the motion at the last point."""
-        name, state = self._system.name, self._last.state
-        return _Ended(MotionEnd(cause, self._time, f"{name}: {text}", state, matrix))
+        text = f"{self._system.name}: {cause.value} at t = {self._time:.6g} s: {detail}"
+        return _Ended(MotionEnd(cause, self._time, text, self._last.state, matrix))

@@ -17,20 +17,19 @@ from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.newton import ROUND_OFF
 from drake_dae.trace.round_off import (
-    FLOOR,
     equilibrated,
     positive,
     rank_of,
+    row_lengths,
     significant,
     without_round_off,
 )
 
+# The largest number of steps to a state where all constraints hold; a dozen are enough.
 SEARCH = 200
-"""The largest number of steps to a state where all constraints hold; a dozen are enough."""
-
+# The next constraint to keep is the first whose independence of those already kept is at least
+# this fraction of the best.
 PREFERRED = 0.5
-"""The next constraint to keep is the first whose independence of those already kept is at least
-this fraction of the best."""
 
 
 @checked(ModelError)
@@ -178,9 +177,7 @@ class _Redundant(Manifold):
         scale = self.system.scale
         z = self.system.state_vector(state) / scale
         gradients = self.gradients(scale * z, parameters) * scale
-        length = np.linalg.norm(gradients, axis=1)
-        largest = float(np.max(length, initial=0.0))
-        length = positive(np.where(length > FLOOR * largest, length, largest))
+        length = row_lengths(gradients)
         residual = self.residual(scale * z, parameters) / length
         damping = 1.0
         for _ in range(SEARCH):
@@ -214,7 +211,7 @@ def _independent(samples: Samples) -> list[int]:
     """The indices of constraints that are well independent of each other at all samples."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
     scaled = [gradient * samples.system.scale for (gradient,) in values]
-    remainders = [equilibrated(significant(gradient)) for gradient in scaled]
+    remainders = [equilibrated(gradient) for gradient in scaled]
     kept: list[int] = []
     while len(kept) < min(map(rank_of, scaled)):
         independence = np.min([np.linalg.norm(matrix, axis=1) for matrix in remainders], axis=0)

@@ -16,20 +16,17 @@ from drake_dae.arrays import Booleans, FloatArray, show
 from drake_dae.dae.assumptions import Violation, ViolationKind, redundant_constraints
 from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
-from drake_dae.dae.family import VISIBLE, Family
+from drake_dae.dae.family import Family
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Samples, as_matrix, fields_at
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, ModelError
 from drake_dae.trace.factorization import nonzeros
-from drake_dae.trace.round_off import Sized, multiply
+from drake_dae.trace.round_off import MANY, VISIBLE, Sized, multiply
 
-MANY = 10
-"""A function that is zero at this many random states is zero."""
-
+# Rows of numbers at a state for values of all parameters, without round-off, with their sizes
+# before cancellation.
 Row = Callable[[FloatArray, FloatArray], Sized]
-"""Rows of numbers at a state for values of all parameters, without round-off, with their sizes
-before cancellation."""
 
 
 def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list[ca.SX]], Samples]:
@@ -50,7 +47,8 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
         for row, i in enumerate(undecided):
             order, name = len(chains[i]), (names[i],)
             if force_acts[row].all():
-                _refuse(others, i)
+                if i in others:  # For other parameters the degree is another one.
+                    raise others[i].error()
                 continue
             if force_acts[row].any():
                 state = samples.states[int(np.argmin(force_acts[row]))]
@@ -103,7 +101,8 @@ def output_chains(
         for row, i in enumerate(undecided):
             order, name = len(chains[i]), (names[i],)
             if acts[row].all():
-                _refuse(others, i)
+                if i in others:  # For other parameters the degree is another one.
+                    raise others[i].error()
                 drift[i], highest[i] = following[row], moving[row]
                 control_matrix[i, :] = rows[row, :]  # (16)
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
@@ -234,12 +233,6 @@ def _examine(
         deciding = Family(samples.manifold, samples.states).deciding(acts)
         if deciding:
             others[index] = replace(violation, deciding=deciding)
-
-
-def _refuse(others: dict[int, Violation], index: int) -> None:
-    """Raises AssumptionError if a degree is another one for other parameters."""
-    if index in others:
-        raise others[index].error()
 
 
 def _never(

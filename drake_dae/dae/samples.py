@@ -12,13 +12,12 @@ from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import NewtonModel, newton
-from drake_dae.trace.round_off import are_dependent, significant
+from drake_dae.trace.round_off import are_dependent
 
+# The allowed distance of a state from the box after Newton's method, relative to the box.
 SLACK = 1e-6
-"""The allowed distance of a state from the box after Newton's method, relative to the box."""
-
+# A gradient that changes a function by less than this fraction across the box counts as zero.
 FLAT = 1e-3
-"""A gradient that changes a function by less than this fraction across the box counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +185,7 @@ class Samples:
     def dependent(self, functions: ca.SX) -> bool:
         """Returns whether the differentials of functions are linearly dependent at every state."""
         gradients = self.values(gradient=ca.jacobian(functions, self.system.state))
-        return all(are_dependent(significant(gradient * self.scale)) for (gradient,) in gradients)
+        return all(are_dependent(gradient * self.scale) for (gradient,) in gradients)
 
     def surroundings(self) -> Region:
         """The box that the states span."""

@@ -19,19 +19,16 @@ from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.functions import TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps, steps_along
 
+# A function of the state and the parameters.
 AtState = Callable[[FloatArray, FloatArray], FloatArray]
-"""A function of the state and the parameters."""
-
+# Rows of the residual, the states that are new in them, and how many rates lead from velocities to
+# these states; None if their steps do not take the least kinetic energy.
 Level = tuple[Indices, Indices, int | None]
-"""Rows of the residual, the states that are new in them, and how many rates lead from velocities to
-these states; None if their steps do not take the least kinetic energy."""
-
+# A state counts as consistent, and is projected without a message, if its distance from N*
+# relative to its size is at most this; where gradients are dependent, if its residual is.
 CONSISTENT = 1e-8
-"""A state counts as consistent, and is projected without a message, if its distance from N*
-relative to its size is at most this; where gradients are dependent, if its residual is."""
-
+# Constraint forces do no work if they are along the gradients to this, as the sine of an angle.
 ALONG = 1e-6
-"""Constraint forces do no work if they are along the gradients to this, as the sine of an angle."""
 
 
 class Settling:

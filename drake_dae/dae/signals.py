@@ -15,12 +15,11 @@ from drake_dae.errors import ModelError
 
 Indices = np.typing.NDArray[np.intp]
 
+# The number of symbols for derivatives of an exogenous parameter; long chains need 8.
 DERIVATIVES = 10
-"""The number of symbols for derivatives of an exogenous parameter; long chains need 8."""
-
+# The largest value of a parameter; positive ones are at least its inverse. Equations multiply up
+# to five parameters before they divide.
 LARGEST = 1e60
-"""The largest value of a parameter; positive ones are at least its inverse. Equations multiply up
-to five parameters before they divide."""
 
 
 @checked(ModelError)

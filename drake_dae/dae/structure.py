@@ -36,8 +36,7 @@ from drake_dae.trace.round_off import equilibrated, equilibration, positive, sma
 
 Kind = TypeVar("Kind", bound="ConstraintStructure")
 
-PART = 0.1
-"""The least part of a constraint in a vanishing combination, relative to the largest."""
+PART = 0.1  # The least part of a constraint in a vanishing combination, relative to the largest.
 
 
 @checked(ModelError)
@@ -307,21 +306,17 @@ def _check_positive_definite(system: DaeSystem, key: str, states: FloatArray) ->
     function = system.trace(key, {"matrix": matrix}, often=False)
     for state in states:
         value = function(state, system.parameter_values)[0].reshape(matrix.shape)
-        if not _is_positive_definite(value):
+        length = np.sqrt(np.abs(np.diag(value)))
+        is_definite = bool(np.all(np.isfinite(value)) and np.all(length > 0.0))
+        if is_definite:
+            scaled = value / length / length[:, None]  # Independent of units.
+            is_symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
+            is_definite = bool(is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12)
+        if not is_definite:
             raise ModelError(
                 f"{system.name}: {key} is not symmetric and positive definite at x = "
                 f"{show(state)}. {REMEDIES[key]}"
             )
-
-
-def _is_positive_definite(matrix: FloatArray) -> bool:
-    """Whether a matrix is symmetric and positive definite, independent of units."""
-    length = np.sqrt(np.abs(np.diag(matrix)))
-    if not (np.all(np.isfinite(matrix)) and np.all(length > 0.0)):
-        return False
-    scaled = matrix / length / length[:, None]
-    is_symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
-    return bool(is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12)
 
 
 def examine_constraints(

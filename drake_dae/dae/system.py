@@ -39,10 +39,10 @@ class DaeSystem:
 
         x' = f(x) + g(x) v + h(x) u,    0 = k(x),    z = l(x) + m(x) v.
 
-    The fields are CasADi SX expressions of `state` and of the symbols of `parameters`; numbers are
-    constants. Exogenous signals w(t) are parameters with `exogenous=True`: in section 2, L_f then
-    becomes D = L_f + sum_j (d/dw^(j)) w^(j+1), and N* moves. With E the first equation is
-    E x' = f + g v + h u; giving M(q) costs far fewer operations than giving its inverse.
+    The fields are CasADi SX expressions of `state` and of the symbols of `parameters`. Exogenous
+    signals w(t) are parameters with `exogenous=True`: in section 2, L_f then becomes
+    D = L_f + sum_j (d/dw^(j)) w^(j+1), and N* moves. With E the first equation is
+    E x' = f + g v + h u; M(q) costs far fewer operations than its inverse.
 
     Attributes:
         state: The symbols x, shape (n, 1).
@@ -51,14 +51,13 @@ class DaeSystem:
         l, m: The controlled outputs z, shapes (q, 1) and (q, m). A law (28) needs q = p, or fewer
             with a `control_metric`; a system that is only simulated may have any number.
         parameters: Named numbers that the expressions depend on.
-        state_signals, constraint_input_signals, control_signals, constraint_output_signals,
-            output_signals: Names and units of x, v, u, y, z; "x0", "x1", ... where not given.
+        *_signals: Names and units of x, v, u, y, z; "x0", "x1", ... where not given.
         nominal_state: The initial guess for consistent states, shape (n,); zero if None.
-        state_scale: The size of each state, to which tolerances are relative; if None,
-            max(|nominal state|, 1): give it where a unit is far from the size of a state.
+        state_scale: The size of each state, to which tolerances are relative; max(|nominal|, 1) if
+            None: give it where a unit is far from the size of a state.
         mass_matrix: E, shape (n, n), symmetric positive definite; the identity if None.
-        implicit: (x', v) -> E x' - f - g v and the derivatives of L_f^(r_i - 1) k_i along x', if
-            that takes fewer operations: for a robot it is inverse dynamics.
+        implicit: (x', v) -> E x' - f - g v and the rates of L_f^(r_i - 1) k_i along x', if that
+            takes fewer operations: for a robot it is inverse dynamics.
         sharing: The forces of redundant constraints, from `share_forces`.
         control_metric, free_control: W, shape (p, p), and u_0: with more controls than outputs (28)
             takes u = u_0 + W^-1 B^T (B W^-1 B^T)^-1 (ubar - a - B u_0), nearest to u_0. Make the
@@ -204,6 +203,20 @@ class DaeSystem:
         if self.sharing is None:
             return constraint_input
         return ca.mtimes(self.sharing.split, constraint_input)
+
+    def implicit_with(
+        self, term: Callable[[ca.SX], ca.SX]
+    ) -> Callable[[ca.SX, ca.SX], tuple[ca.SX, ca.SX]] | None:
+        """Returns `implicit` with a term, a function of x', added to its balance; None if None."""
+        inner = self.implicit
+        if inner is None:
+            return None
+
+        def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
+            balance, constraint_rate = inner(rate, constraint_input)
+            return balance + term(rate), constraint_rate
+
+        return implicit
 
     def outputs(self, constraint_input: ca.SX) -> ca.SX:
         """Returns the controlled outputs z = l(x) + m(x) v (3), shape (p, 1)."""

@@ -52,7 +52,7 @@ class ClosedLoop:
         encoders: The sensor of the state for the law, or None.
         encoder_noise: The source of its noise, or None.
         observer: The observer of the disturbance or the state, or None.
-        memory: A cache for rollouts and starts.
+        memory: A cache for rollouts.
     """
 
     diagram: Diagram

@@ -7,8 +7,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.common import RandomDistribution
-from pydrake.systems.framework import DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import Adder, MatrixGain, RandomSource
+from pydrake.systems.framework import DiagramBuilder, System
+from pydrake.systems.primitives import RandomSource
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
@@ -270,23 +270,6 @@ def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
             "delay at each step of the plant needs no sampling"
         )
     return replace(sampling, delay=max(sampling.delay - step, 0.0))
-
-
-def connect_hold(
-    builder: DiagramBuilder, controller: Controller, sources: Sequence[OutputPort]
-) -> None:
-    """Connects what stops the integrals of a controller while it is not 0: for all, or for each."""
-    if not (sources and controller.HasInputPort("hold")):
-        return
-    count = controller.GetInputPort("hold").size()
-    total = builder.AddSystem(Adder(len(sources), count))
-    for index, source in enumerate(sources):
-        if source.size() != count:
-            spread = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-            builder.Connect(source, spread.get_input_port())
-            source = spread.get_output_port()
-        builder.Connect(source, total.get_input_port(index))
-    builder.Connect(total.get_output_port(), controller.GetInputPort("hold"))
 
 
 def add_exogenous(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, BinaryIO, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -237,7 +237,7 @@ class Record:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads a file of `save` or of a `RecordWriter`, which may be incomplete.
+        """Reads a file of `save`.
 
         Raises:
             ModelError: The file holds something else.
@@ -245,10 +245,6 @@ class Record:
         check_file(path, ModelError, MOST_RECORDED)
         try:
             with open_file(path) as rows:
-                is_part = rows.read(1) == b"{"
-                rows.seek(0)
-                if is_part:
-                    return _read_rows(rows, cls)
                 file = np.load(rows, allow_pickle=False)
                 names = [key for key in file.files if f"{key}.names" in file.files]
                 signals = {name: _read(file, name) for name in names}
@@ -261,8 +257,6 @@ class Record:
 
 RecordAfter = Callable[[float | None], Record]
 """From a time in s, or None, to what a run has recorded later."""
-
-R = TypeVar("R", bound=Record)
 
 
 def versions() -> dict[str, str]:
@@ -284,23 +278,6 @@ def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
     for values in columns:
         finite &= np.isfinite(values).all(axis=1)
     return count if finite.all() else int(np.argmin(finite))
-
-
-def _read_rows(file: BinaryIO, kind: type[R]) -> R:
-    """The rows of a `RecordWriter`; bytes after the last whole row are ignored."""
-    head = json.loads(file.readline())
-    labels = head["signals"]
-    named = {name: tuple(Signal(*label) for label in pairs) for name, pairs in labels.items()}
-    stops = np.cumsum([1, *map(len, named.values())])
-    data, width = file.read(), int(stops[-1])
-    count = len(data) // (8 * width)
-    rows = np.frombuffer(data, "<f8", count * width).reshape(count, width).astype(float)
-    # After a power failure, unsynced bytes may be zeros.
-    whole = int(np.argmin(np.append(np.diff(rows[:, 0]) > 0.0, False))) + 1
-    time, *columns = np.split(rows[:whole], stops, axis=1)[:-1]
-    pairs = zip(named.items(), columns, strict=True)
-    recorded = {name: Recorded(values, signals) for (name, signals), values in pairs}
-    return kind(time[:, 0], recorded, head.get("about", {}))
 
 
 def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:

@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System, TriggerType
-from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
+from pydrake.systems.primitives import LogVectorOutput, MatrixGain, Multiplexer, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.dae import Signal, TrackingLaw
@@ -18,7 +19,6 @@ from drake_dae.diagrams.parts import (
     add_signals,
     check_force_loop,
     check_parts,
-    connect_hold,
     hold_before,
     make_observer,
     make_sensor,
@@ -104,15 +104,7 @@ def wire_loop(
     scene_graph: SceneGraph | None = None,
     meshcat: Meshcat | None = None,
 ) -> ClosedLoop:
-    """Builds the closed loop of a plant and any controller, such as that of a task.
-
-    Without a `reference` the controller plans its references itself. Otherwise as
-    `make_closed_loop`.
-
-    Raises:
-        WiringError: The controller does not fit this plant or one of these parts; or as for
-            `make_closed_loop`.
-    """
+    """The closed loop of a plant and any controller, such as that of a task: `make_closed_loop`."""
     parts = settings or LoopSettings()
     controller.check_plant(plant)
     check_parts(plant, controller, reference, parts)
@@ -194,7 +186,13 @@ def wire_loop(
             state = observer.GetOutputPort("estimated_state")
             named["estimated_state"] = (state, dae.state_signals)
     connect(state, controller, "estimated_state")
-    connect_hold(builder, controller, [] if is_limited is None else [is_limited])
+    if is_limited is not None and controller.HasInputPort("hold"):
+        count = controller.GetInputPort("hold").size()
+        if is_limited.size() != count:  # It holds all integrals.
+            spread = builder.AddSystem(MatrixGain(np.ones((count, 1))))
+            builder.Connect(is_limited, spread.get_input_port())
+            is_limited = spread.get_output_port()
+        connect(is_limited, controller, "hold")
     add_signals(builder, controller, parts.signals)
     if limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
@@ -262,16 +260,14 @@ def wire_loop(
 
 
 def log_steps(builder: DiagramBuilder, ports: Sequence[OutputPort], plant: Plant) -> VectorLogSink:
-    """Adds one log of several ports, stacked, with one sample per step.
-
-    For a discrete plant the log is periodic, since after the last step of a run the state of the
-    plant belongs to a time that the run has not reached.
-    """
+    """Adds one log of several ports, stacked, with one sample per step."""
     stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
     stacked.set_name("logged_signals")
     for index, port in enumerate(ports):
         builder.Connect(port, stacked.get_input_port(index))
     port = stacked.get_output_port()
+    # After the last step of a run the state of a discrete plant belongs to a time that the run has
+    # not reached.
     if plant.time_step:
         triggers = {TriggerType.kPeriodic}
         log = builder.AddSystem(VectorLogSink(port.size(), triggers, plant.time_step))

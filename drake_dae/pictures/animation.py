@@ -16,7 +16,6 @@ from drake_dae.blocks.traced_system import context_in
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, phase_spans
 from drake_dae.errors import ModelError
-from drake_dae.pictures.events import events_of, kinds_of
 from drake_dae.pictures.motion import follow, run_points, run_view
 from drake_dae.robots import axes_along
 from drake_dae.scene.arrows import FORCE_COLOR, LEAST_SCALE, MOMENT_COLOR, PATH_COLOR, path_of
@@ -62,8 +61,8 @@ def make_animation(
     """Returns an animation of a recorded run in Meshcat, with the paths of the contact points.
 
     The page shows the time, the constraint forces as arrows with their sizes, and the actual path
-    over the desired one; it repeats the run. A time bar shows the phases of a task and the events
-    of the run, and jumps to any time; the address "page.html#t=2.5" shows the run at 2.5 s. An
+    over the desired one; it repeats the run. A time bar shows the phases of a task, and jumps to
+    any time; the address "page.html#t=2.5" shows the run at 2.5 s. An
     open contact has no arrow. A contact with friction has a friction cone.
 
     Args:
@@ -79,7 +78,7 @@ def make_animation(
         ModelError: The plant is not a robot.
     """
     motion, scene_graph = follow(loop, record, context), loop.scene_graph
-    model, acting, events = motion.model, motion.acting, events_of(record, motion.model)
+    model, acting = motion.model, motion.acting
     # The server starts here, so that runs without an animation do not open a port.
     meshcat = start_unwatched_meshcat()
     arrows = draw_scene(loop.plant, meshcat, scene_graph)
@@ -145,13 +144,11 @@ def make_animation(
         numbers = sorted({f"{coefficient:.3g}" for coefficient in cones.values()})
         legend.append((_hex(_CONE), f"friction cone, coefficient {' and '.join(numbers)}"))
     legend.append(("#bbbbbb", f"grid of {floor.cell:g} m"))
-    legend += [(kind.color, kind.label) for kind in kinds_of(events)]
     sizes = np.linalg.norm([wrench.forces for wrench in motion.wrenches], axis=2)
     overlay = {
         "title": title or model.dae.name,
         "legend": legend,
         "phases": [[span.begin, span.name] for span in phase_spans(record)],
-        "moments": [[event.time, event.kind.color, event.text] for event in events],
         "rate": FRAME_RATE,
         "start": motion.start_time,
         "end": motion.start_time + float(motion.times[-1]),

@@ -18,7 +18,6 @@ from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, Recorded, phase_spans
 from drake_dae.errors import ModelError
-from drake_dae.pictures.events import RunEvent, events_of, kinds_of
 from drake_dae.pictures.motion import ContactPath, contact_paths, follow
 from drake_dae.running.judgement import output_sizes
 
@@ -28,12 +27,8 @@ _FIRST = ("controlled_output", "constraint_force", "control", "state")
 _DERIVED = ("desired_output", "tracking_error", "predicted_error")
 """Signals whose entries have the names of the outputs, and are drawn with these."""
 
-_LEFT, _RIGHT, _ABOVE, _BELOW = 0.85, 0.2, 0.3, 0.5
-"""The space around axes, in inches: for tick labels, the title, and the label of the time."""
-
-_LINE, _HANDLE, _LETTER, _PHASE = 0.2, 0.65, 0.075, 0.11
-"""In inches: the height of a legend's line, the width of its sample of a curve and of a letter, and
-the width of a phase's name, which is vertical."""
+_PHASE = 0.11
+"""The width of a phase's name, which is vertical, in inches."""
 
 _WIDE: dict[str, Any] = {"linewidth": 4, "alpha": 0.4}
 """The style of predicted errors and desired paths, below the narrow actual ones."""
@@ -59,8 +54,8 @@ def plot_runs(
 ) -> Figure:
     """Plots signals of several runs over each other, outputs with dashed references.
 
-    A notebook displays the figure; its `savefig` writes a file. If there is only one run, its
-    phases and contact events are marked.
+    A notebook displays the figure; its `savefig` writes a file. If there is only one run, the
+    phases of its task are marked.
 
     Args:
         records: Label of a run -> its record.
@@ -88,7 +83,7 @@ def plot_runs(
             if group not in record.signals or signal not in record.signals[group].signals:
                 unit = signal.unit or "1"
                 raise ModelError(f"the run '{label}' has no {group} '{signal.name}' in {unit}")
-    return _draw(records, entries, errors, events_of(first) if len(records) == 1 else ())
+    return _draw(records, entries, errors)
 
 
 def save_plots(
@@ -100,8 +95,7 @@ def save_plots(
 ) -> None:
     """Writes the plots of a run of a loop of a robot as PNG files, `PLOTS`."""
     motion, predicted = follow(loop, record, context), loop.predicted_error(record)
-    events, limits = events_of(record, motion.model), motion.model.control_limits
-    figures = figures_of_run(record, predicted, limits, accuracy, events)
+    figures = figures_of_run(record, predicted, motion.model.control_limits, accuracy)
     if paths := contact_paths(motion):
         figures["path.png"] = plot_paths(paths)
     folder.mkdir(parents=True, exist_ok=True)
@@ -114,7 +108,6 @@ def figures_of_run(
     predicted: FloatArray,
     limits: FloatArray | None = None,
     accuracy: float | None = None,
-    events: Sequence[RunEvent] = (),
 ) -> dict[str, Figure]:
     """Name of a file -> its figure: outputs, errors, residual and controls of one run.
 
@@ -127,28 +120,26 @@ def figures_of_run(
     accurate_to = None if accuracy is None else accuracy * output_sizes(record, predicted)
     figures = {}
     if entries := _entries(record, "controlled_output"):
-        figures["outputs.png"] = _draw(run, entries, False, events)
-        figures["errors.png"] = _draw(run, entries, True, events, accurate_to=accurate_to)
-    figures["residual.png"] = _plot_residual(record, events)
+        figures["outputs.png"] = _draw(run, entries, False)
+        figures["errors.png"] = _draw(run, entries, True, accurate_to=accurate_to)
+    figures["residual.png"] = _plot_residual(record)
     if entries := _entries(record, "control"):
-        figures["controls.png"] = _draw(run, entries, False, events, limits)
+        figures["controls.png"] = _draw(run, entries, False, limits)
     return figures
 
 
-def _plot_residual(record: Record, events: Sequence[RunEvent]) -> Figure:
+def _plot_residual(record: Record) -> Figure:
     """Plots the constraint functions and their derivatives after each step, before projection."""
     residual = record.signals["constraint_residual"]
-    labels = [_labelled(signal) for signal in residual.signals]
-    kinds = [kind.label for kind in kinds_of(events)]
-    title = "|constraint residual| after each step"
-    figure, (axis,) = _figure([title], [*labels, "round-off", *kinds])
+    figure, (axis,) = _figure(["|constraint residual| after each step"])
     floor = round_off(np.ones(1))
-    for label, values in zip(labels, residual.values.T, strict=True):
-        axis.semilogy(record.time, np.maximum(np.abs(values), floor), label=label)
+    for signal, values in zip(residual.signals, residual.values.T, strict=True):
+        values = np.maximum(np.abs(values), floor)
+        axis.semilogy(record.time, values, label=_labelled(signal))
     axis.axhline(floor, color="0.5", linestyle=":", label="round-off")
     axis.set_yscale("log")
     _set_decades(axis, floor)
-    _mark(figure, record, events)
+    _mark(figure, record)
     _add_legend(figure)
     return figure
 
@@ -156,7 +147,7 @@ def _plot_residual(record: Record, events: Sequence[RunEvent]) -> Figure:
 def plot_paths(paths: Sequence[ContactPath]) -> Figure:
     """Plots the actual over the desired paths of points on surfaces, seen from the free side."""
     titles = [f"path on {_plain(path.name)}" for path in paths]
-    figure, axes = _figure(titles, ("desired", "actual", "start"), square=True)
+    figure, axes = _figure(titles, square=True)
     for axis, path in zip(axes, paths, strict=True):
         axis.plot(*path.desired.T, color="C1", label="desired", **_WIDE)
         axis.plot(*path.actual.T, color="C0", label="actual")
@@ -168,6 +159,7 @@ def plot_paths(paths: Sequence[ContactPath]) -> Figure:
         right = -half if path.points_left else half
         axis.set_xlim(middle[0] - right, middle[0] + right)
         axis.set_ylim(middle[1] - half, middle[1] + half)
+        axis.set_box_aspect(1.0)
         axis.locator_params(nbins=6)
         axis.set_xlabel("along the surface [m]", fontsize=10)
         axis.set_ylabel("across [m]", fontsize=10)
@@ -197,7 +189,6 @@ def _draw(
     records: Mapping[str, Record],
     entries: Sequence[Entry],
     errors: bool,
-    events: Sequence[RunEvent],
     limits: FloatArray | None = None,
     accurate_to: FloatArray | None = None,
 ) -> Figure:
@@ -208,10 +199,7 @@ def _draw(
     if limits is not None:
         bounds = [f", limit ±{most:g}" if np.isfinite(most) else "" for most in limits]
         titles = [title + bound for title, bound in zip(titles, bounds, strict=True)]
-    labels = [*records, "predicted" if errors else "reference"]
-    if accurate_to is not None:
-        labels.append("below the integrator's accuracy")
-    figure, axes = _figure(titles, [*labels, *(kind.label for kind in kinds_of(events))])
+    figure, axes = _figure(titles)
     own_color = "C1" if len(records) == 1 else None
     for axis, (group, at), signal in zip(axes, entries, signals, strict=True):
         drawn, floors = list[FloatArray](), list[float]()
@@ -238,8 +226,8 @@ def _draw(
         if errors:
             axis.plot([], [], label="predicted", **style, **_WIDE)
             if accurate_to is not None:
-                top = float(accurate_to[at])
-                axis.axhspan(min(floors) / 3.0, top, color="0.88", zorder=0.5, label=labels[-1])
+                label, top = "below the integrator's accuracy", float(accurate_to[at])
+                axis.axhspan(min(floors) / 3.0, top, color="0.88", zorder=0.5, label=label)
             _set_decades(axis, min(floors))
             continue
         if group == _FIRST[0]:
@@ -251,31 +239,21 @@ def _draw(
                 if low - 0.5 * (high - low) <= bound <= high + 0.5 * (high - low):
                     axis.axhline(bound, color="C3", linestyle=":")
     if len(records) == 1:
-        _mark(figure, first, events)
+        _mark(figure, first)
     _add_legend(figure)
     return figure
 
 
-def _figure(
-    titles: Sequence[str], labels: Sequence[str], square: bool = False
-) -> tuple[Figure, list[Axes]]:
-    """A figure with space for a legend above its axes, which have a common time unless square.
-
-    The positions are computed here, since Matplotlib's automatic layout takes longer than drawing.
-    """
+def _figure(titles: Sequence[str], square: bool = False) -> tuple[Figure, list[Axes]]:
+    """A figure, with axes that have a common time unless square."""
     columns = min(len(titles), 3) if square else 1 if len(titles) <= 2 else 2
-    rows, cell = -(-len(titles) // columns), 4.65 if square else 6.0
-    width, height = cell - _LEFT - _RIGHT, 3.6 if square else 1.4
-    wide = max(cell * columns, 6.0)
-    top = _LINE * -(-len(labels) // _legend_columns(labels, wide)) + 0.1
-    high = rows * (_ABOVE + height + _BELOW) + top
-    figure, axes = ShownFigure(figsize=(wide, high)), list[Axes]()
+    rows, (wide, high) = -(-len(titles) // columns), (4.65, 4.4) if square else (6.0, 2.2)
+    size = max(columns * wide, 6.0), rows * high + 0.4
+    figure, axes = ShownFigure(figsize=size, layout="constrained"), list[Axes]()
     for i, title in enumerate(titles):
-        row, column = divmod(i, columns)
-        low = high - top - (row + 1) * (_ABOVE + height) - row * _BELOW
-        box = (column * cell + _LEFT) / wide, low / high, width / wide, height / high
-        axis = figure.add_axes(box, sharex=axes[0] if axes and not square else None)
-        axis.set_title(title, y=1.0, fontsize=10)  # With y, Matplotlib does not search a position.
+        shared = axes[0] if axes and not square else None
+        axis = figure.add_subplot(rows, columns, i + 1, sharex=shared)
+        axis.set_title(title, fontsize=10)
         axis.grid(True, alpha=0.3)
         if not square and i + columns >= len(titles):
             axis.set_xlabel("time [s]", fontsize=10)
@@ -283,33 +261,19 @@ def _figure(
     return figure, axes
 
 
-def _legend_columns(labels: Sequence[str], width: float) -> int:
-    """The columns of a legend of a figure of this width, in inches."""
-    if sum(_HANDLE + _LETTER * len(label) for label in labels) <= width - 0.2:
-        return len(labels)
-    return max(1, int((width - 0.2) / (_HANDLE + _LETTER * max(map(len, labels)))))
-
-
 def _add_legend(figure: Figure) -> None:
     """Adds one legend above all axes, with the labels of the curves in the first."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    columns = _legend_columns(labels, figure.get_figwidth())
-    top = 0.5, 1.0 - 0.05 / figure.get_figheight()
-    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": top, "borderaxespad": 0.0}
-    figure.legend(handles, labels, ncols=columns, fontsize=9, **place)
+    columns = max(1, int(figure.get_figwidth() / (0.7 + 0.08 * max(map(len, labels)))))
+    figure.legend(handles, labels, ncols=columns, fontsize=9, loc="outside upper center")
 
 
-def _mark(figure: Figure, record: Record, events: Sequence[RunEvent]) -> None:
-    """Marks events on all axes of time, shades every second phase, and writes the phases' names."""
+def _mark(figure: Figure, record: Record) -> None:
+    """Shades every second phase of a task on all axes of time, and writes the phases' names."""
     spans = phase_spans(record)
-    mark: dict[str, Any] = {"linestyle": "", "marker": "^", "markersize": 5, "clip_on": False}
     for axis in figure.axes:
-        below = axis.get_xaxis_transform()
-        for kind in kinds_of(events):
-            times = [event.time for event in events if event.kind is kind]
-            mark |= {"color": kind.color, "label": kind.label}
-            axis.plot(times, [0.0] * len(times), transform=below, zorder=3.0, **mark)
         axis.margins(x=0.01)
+        below = axis.get_xaxis_transform()
         width = axis.get_position().width * figure.get_figwidth()
         # The names of short phases are moved to the right, so that they do not overlap.
         apart = _PHASE / width * float(record.time[-1] - record.time[0]) if spans else 0.0

@@ -8,7 +8,7 @@ from drake_dae.references.formulas import (
     PointToPointReference,
     SinusoidReference,
 )
-from drake_dae.references.paths import CircleReference, LineReference, PathLimits, SpiralReference
+from drake_dae.references.paths import CircleReference, LineReference, PathLimits
 from drake_dae.references.reference import Reference, stack_references
 from drake_dae.references.splines import PolylineReference, WaypointsReference
 
@@ -24,7 +24,6 @@ __all__ = [
     "Reference",
     "ReferenceRows",
     "SinusoidReference",
-    "SpiralReference",
     "WaypointsReference",
     "references_by_name",
     "stack_references",

@@ -1,4 +1,4 @@
-"""Lines, circles and spirals, from rest to rest within limits."""
+"""Lines and circles, from rest to rest within limits."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -242,7 +242,8 @@ class CircleReference(PathReference):
     size = 2
 
     def __post_init__(self) -> None:
-        _check_center(self)
+        center = vector("center", self.center, 2, ReferenceSignalError)
+        object.__setattr__(self, "center", tuple(center.tolist()))
         positive("radius", self.radius, ReferenceSignalError)
         check_order(self.order, 2, 12)
         if (self.period is None) == (self.limits is None):
@@ -276,71 +277,3 @@ class CircleReference(PathReference):
 
     def _at(self, angle: ca.SX) -> ca.SX:
         return ca.DM(self.center) + self.radius * ca.vertcat(ca.cos(angle), ca.sin(angle))
-
-
-@checked(ReferenceSignalError)
-@dataclass(frozen=True)
-class SpiralReference(PathReference):
-    """An Archimedean spiral between two radii, from rest to rest, for two outputs.
-
-    With b = pitch / (2 pi) it is r = center + b a (cos, sin)(a + const), and a goes as
-
-        a(s) = sqrt((a_0 + 1)^2 + 2 s / b) - 1,   so that   |dr/ds| = sqrt(1 + a^2) / (1 + a)
-
-    is from 0.71 (at a = 1) to 1: the speed is nearly constant, and smooth at the center.
-
-    Attributes:
-        center: The center, in the outputs' unit, shape (2,).
-        start_radius: The radius at the start, in the outputs' unit; larger than `end_radius` to
-            move inward.
-        end_radius: The radius at the end, in the outputs' unit.
-        pitch: The distance between neighbouring turns, in the outputs' unit.
-        limits: The largest speed, acceleration and jerk.
-        phase: The angle at the start, in rad.
-        start_time: The start of the motion, in s.
-        order: The number of continuous derivatives, from 2 to 12; at least mu of the outputs.
-
-    Raises:
-        ReferenceSignalError: A number is not valid.
-    """
-
-    center: ArrayLike
-    start_radius: float
-    end_radius: float
-    pitch: float
-    limits: PathLimits
-    phase: float = 0.0
-    start_time: float = 0.0
-    order: int = 4
-
-    size = 2
-
-    def __post_init__(self) -> None:
-        _check_center(self)
-        positive("pitch", self.pitch, ReferenceSignalError)
-        check_order(self.order, 2, 12)
-        if min(self.start_radius, self.end_radius) < 0 or self.start_radius == self.end_radius:
-            raise ReferenceSignalError(
-                "start_radius and end_radius must differ and not be negative, got "
-                f"{self.start_radius:g} and {self.end_radius:g}"
-            )
-
-    @property
-    def length(self) -> float:
-        low, high = sorted((self.start_radius, self.end_radius))
-        b = self.pitch / tau
-        return b / 2 * ((high / b + 1) ** 2 - (low / b + 1) ** 2)
-
-    def point(self, distance: ca.SX) -> ca.SX:
-        b = self.pitch / tau
-        is_outward = self.start_radius < self.end_radius
-        outward = distance if is_outward else self.length - distance
-        low = min(self.start_radius, self.end_radius) / b
-        a = ca.sqrt((low + 1) ** 2 + 2 * outward / b) - 1
-        angle = self.phase + a - self.start_radius / b
-        return ca.DM(self.center) + b * a * ca.vertcat(ca.cos(angle), ca.sin(angle))
-
-
-def _check_center(reference: CircleReference | SpiralReference) -> None:
-    center = vector("center", reference.center, 2, ReferenceSignalError)
-    object.__setattr__(reference, "center", tuple(center.tolist()))

@@ -2,5 +2,4 @@
 
 from .export.controller import export_controller as export_controller
 from .export.loop import export_loop as export_loop
-from .record_writer import RecordWriter as RecordWriter
 from .rollout import start_values as start_values

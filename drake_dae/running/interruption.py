@@ -6,13 +6,9 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Self
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, the signals of batch systems and `kill`, and a closed terminal."""
-
-PATIENCE = 1.0
-"""The time in s after a signal at which a step is ended in its middle."""
 
 AGAIN = 1e-3
 """The delay in s after which a signal during a call of CasADi is raised again."""
@@ -72,27 +68,8 @@ class Interruption:
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
-        self.is_over = False
-        """Whether the signal came again by itself."""
-        self._timer = threading.Timer(PATIENCE, self._again)
-        self._timer.daemon = True
 
     def __call__(self, number: signal.Signals) -> None:
         if self.signal is not None:
             end_at_once(number)
         self.signal = number
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._timer.cancel()
-
-    def insist(self) -> None:
-        """Sends the signal once more if the block lasts."""
-        self._timer.start()
-
-    def _again(self) -> None:
-        assert self.signal is not None
-        self.is_over = True
-        os.kill(os.getpid(), self.signal)

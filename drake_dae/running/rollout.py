@@ -20,9 +20,10 @@ from drake_dae.blocks.failures import (
     off_manifold,
     spoilt_step,
 )
-from drake_dae.blocks.interpreted import PACE_STEPS, run_interpreted
+from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
 from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepSettings
+from drake_dae.blocks.trials import PACE_STEPS
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
 from drake_dae.errors import (
@@ -100,7 +101,7 @@ def start_values(loop: ClosedLoop | Diagram, context: Context) -> tuple[FloatArr
     return np.concatenate([state[: program.num_states], held[program.kept_places]]), values
 
 
-@checked(ModelError)
+@checked(ModelError, lasts=True)
 def rollout(
     loop: ClosedLoop | Diagram,
     starts: ArrayLike,

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, Diagram, PortDataType
 from pydrake.systems.primitives import RandomSource
 
+from drake_dae.arguments import uncollected
 from drake_dae.arrays import FloatArray, brief, by_columns, numbers
 from drake_dae.blocks.block import Block, Held, stacked
 from drake_dae.blocks.compose import Leaves, compose, laws_of, leaf_inputs
@@ -53,6 +54,7 @@ class RolloutProgram:
         choice: Whether it becomes machine code by default.
     """
 
+    @uncollected
     def __init__(
         self,
         loop: ClosedLoop | Diagram,

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from difflib import get_close_matches
-from functools import cache
 from math import isfinite
 
 import numpy as np
@@ -23,6 +21,7 @@ from pydrake.systems.primitives import Integrator, VectorLogSink
 from tqdm import tqdm
 
 from drake_dae.arguments import checked
+from drake_dae.arrays import unknown_name
 from drake_dae.blocks.traced_system import check_context
 from drake_dae.errors import DrakeDaeError, InconsistentStateError, ModelError
 from drake_dae.running.compiled_run import NO_EVENTS, CompiledRun
@@ -48,7 +47,7 @@ class RunStatistics:
         return self.simulated_time / max(self.wall_time, 1e-9)
 
 
-@checked(ModelError)
+@checked(ModelError, lasts=True)
 def simulate(
     diagram: System,
     context: Context,
@@ -69,9 +68,8 @@ def simulate(
     A run whose start_time is the end of an earlier run appends to its logs. A run that starts
     earlier clears them.
 
-    Ctrl-C, SIGTERM and SIGHUP end the run after the current step, or within it after a second; a
-    second signal ends it immediately with a KeyboardInterrupt. Logs are kept, also if an exception
-    ends the run.
+    Ctrl-C, SIGTERM and SIGHUP end the run after the current step; a second signal ends it
+    immediately with a KeyboardInterrupt. Logs are kept, also if an exception ends the run.
 
     Args:
         diagram: The system.
@@ -81,7 +79,7 @@ def simulate(
         progress: Shows simulated time and speed on stderr.
         may_diverge: Whether a diverging run continues.
         look: A function that is called with the context after some steps, at least after every
-            32nd, such as `RecordWriter.update`.
+            32nd.
 
     Raises:
         ModelError: The duration or the settings are not valid.
@@ -105,17 +103,13 @@ def simulate(
     start, going_on = context.get_time(), EventStatus.DidNothing()
     began, composed = 0.0, None
     watch = RunWatch(diagram, context, config, duration)
-    accepted = start, context.get_continuous_state_vector().CopyToVector()
 
     def stop(number: signal.Signals) -> None:
         ending(number)
         if began:
             simulator.set_monitor(monitor)
-            ending.insist()  # It ends a long step between two evaluations.
 
     def seen(current: Context, steps: int) -> bool:
-        nonlocal accepted
-        accepted = current.get_time(), current.get_continuous_state_vector().CopyToVector()
         bar.show(current.get_time() - start)
         if look is not None:
             look(current)
@@ -128,7 +122,8 @@ def simulate(
         return EventStatus.ReachedTermination(diagram, "interrupted")
 
     bar = _Progress(duration, progress)
-    with closing(bar), Interruption() as ending, ending_signals(stop):
+    ending = Interruption()
+    with closing(bar), ending_signals(stop):
         try:
             simulator.Initialize()
             began = time.perf_counter()
@@ -149,11 +144,6 @@ def simulate(
                 steps = 0
             elapsed = time.perf_counter() - began
             watch.look(context, is_last=True)
-        except KeyboardInterrupt:
-            if not ending.is_over:
-                raise
-            context.SetTimeAndContinuousState(*accepted)
-            steps, elapsed = simulator.get_num_steps_taken(), time.perf_counter() - began
         except (DrakeDaeError, RuntimeError) as error:
             if not began and isinstance(error, InconsistentStateError):
                 raise  # The start state: its message says what to do.
@@ -183,30 +173,13 @@ def check_duration(duration: float) -> None:
         raise ModelError(f"a duration must be positive, got {duration} s")
 
 
-@cache
-def _schemes() -> dict[str, bool]:
-    """The schemes of Drake, and whether they have error control; CENIC needs a MultibodyPlant."""
-    found = dict[str, bool]()
-    for name in GetIntegrationSchemes():
-        if name != "cenic":
-            trial = Simulator(Integrator(1))
-            config = SimulatorConfig(integration_scheme=name, use_error_control=True)
-            ApplySimulatorConfig(config, trial)
-            found[name] = not trial.get_integrator().get_fixed_step_mode()
-    return found
-
-
 def check_config(config: SimulatorConfig) -> None:
     """Checks for settings that Drake accepts but that hang, fail late, or are ignored."""
     scheme = config.integration_scheme
-    schemes = _schemes()
+    schemes = [name for name in GetIntegrationSchemes() if name != "cenic"]  # Of MultibodyPlants.
     if scheme not in schemes:
-        near = get_close_matches(scheme, schemes, n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        raise ModelError(
-            f"integration_scheme: no scheme '{scheme}' for these systems; {hint}there are "
-            f"{', '.join(schemes)}"
-        )
+        text = unknown_name("scheme", scheme, schemes)
+        raise ModelError(f"integration_scheme: {text}")
     for name in ("accuracy", "max_step_size"):
         value = getattr(config, name)
         if not (isfinite(value) and value > 0.0):
@@ -216,7 +189,9 @@ def check_config(config: SimulatorConfig) -> None:
             f"target_realtime_rate must not be negative, got {config.target_realtime_rate}; 0 is "
             "as fast as possible"
         )
-    if config.use_error_control and not schemes[scheme]:
+    trial = Simulator(Integrator(1))
+    ApplySimulatorConfig(config, trial)
+    if config.use_error_control and trial.get_integrator().get_fixed_step_mode():
         raise ModelError(
             f"use_error_control: {scheme} has none; set it to false and max_step_size to the "
             "step, or choose runge_kutta5"

@@ -1,6 +1,6 @@
 """A judged run as text of at most a page, as data, and as figures for tables of many runs."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from math import isfinite
 from textwrap import fill
@@ -34,6 +34,9 @@ EXPECTED = (FindingKind.PREDICTION,)
 UNEXCITED = 0.5
 """A parameter is not excited if its deviation stays above this share of that of its bounds."""
 
+SURE = 2.0
+"""The number of standard deviations from which an estimate differs from what the law believes."""
+
 _FORCES = (LimitKind.FORCE, LimitKind.CONTROL, LimitKind.EFFORT)
 
 
@@ -42,7 +45,8 @@ class RunSummary:
     """What is told about a run: `text` and `data` say the same.
 
     `remedies` are what to look at beside the causes of the findings, `notes` what is approximate,
-    and `accuracy` that of error control; statistics are None for a failed run.
+    `accuracy` that of error control, and `named` the parameters that the user had estimated;
+    statistics are None for a failed run.
     """
 
     judgement: Judgement
@@ -52,6 +56,7 @@ class RunSummary:
     remedies: Sequence[str] = ()
     notes: Sequence[str] = ()
     accuracy: float | None = None
+    named: Collection[str] = ()
 
     @property
     def missed(self) -> bool:
@@ -165,7 +170,7 @@ class RunSummary:
             )
         if nearest := _nearest(self.judgement.ranges):
             yield f"nearest to a limit   {nearest}"
-        lines = [*_identified(self.record), *(("note", note) for note in self.notes)]
+        lines = [*_identified(self.record, self.named), *(("note", note) for note in self.notes)]
         for title, text in (*lines, *(("look next", text) for text in self.look_next)):
             yield fill(f"{title:21}{text}", WIDTH, subsequent_indent=" " * 21)
 
@@ -182,8 +187,8 @@ def _nearest(ranges: Sequence[SignalRange]) -> str:
     return "; ".join(texts)
 
 
-def _identified(record: Record) -> Iterator[tuple[str, str]]:
-    """What an estimator found at the end, with standard deviations, and what it could not find."""
+def _identified(record: Record, named: Collection[str]) -> Iterator[tuple[str, str]]:
+    """What an estimator found at the end that is new or that the user named, and how many more."""
     if "identified" not in record.signals:
         if "friction" in record.signals:
             recorded = record.signals["friction"]
@@ -191,14 +196,23 @@ def _identified(record: Record) -> Iterator[tuple[str, str]]:
             yield "identified", ", ".join(f"{signal.name} = {value:.3g}" for signal, value in pairs)
         return
     recorded, deviations = record.signals["identified"], record["identified_deviation"]
+    believed, found, own = recorded.values[0], recorded.values[-1], deviations[-1]
     # The first row has the deviations of values that are equally likely within their bounds.
-    is_excited = deviations[-1] < UNEXCITED * deviations[0]
-    for i in np.flatnonzero(is_excited):
-        signal, value, own = recorded.signals[i], recorded.values[-1, i], deviations[-1, i]
-        yield "identified", f"{signal.name} = {value:.3g} +- {own:.1g} {signal.unit}".rstrip()
-    if not is_excited.all():
-        names = ", ".join(recorded.signals[i].name for i in np.flatnonzero(~is_excited))
+    is_excited = own < UNEXCITED * deviations[0]
+    is_named = np.array([s.name.partition("[")[0] in named for s in recorded.signals])
+    is_told = is_excited & (is_named | (np.abs(found - believed) > SURE * own))
+    for i in np.flatnonzero(is_told):
+        signal = recorded.signals[i]
+        yield "identified", f"{signal.name} = {found[i]:.3g} +- {own[i]:.1g} {signal.unit}".rstrip()
+    if (is_named & ~is_excited).any():
+        names = ", ".join(recorded.signals[i].name for i in np.flatnonzero(is_named & ~is_excited))
         yield "not identified", f"{names}: this motion does not excite them"
+    counts = (
+        (np.sum(is_excited & ~is_told), "more within two deviations of what the law believes"),
+        (np.sum(~is_excited & ~is_named), "more that this motion does not excite"),
+    )
+    if texts := [f"{count} {text}" for count, text in counts if count]:
+        yield "estimated", ", ".join(texts)
 
 
 def _named(values: dict[str, Any]) -> dict[str, Any]:

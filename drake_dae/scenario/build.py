@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
-from drake_dae.arguments import checked
+from drake_dae.arguments import checked, uncollected
 from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.blocks.block import NOTHING, Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
@@ -73,6 +73,7 @@ def build_scenario(
     return loop, start_scenario(completed.scenario, loop)
 
 
+@uncollected
 def build_completed(
     scenario: Scenario,
     meshcat: Meshcat | None = None,
@@ -180,7 +181,6 @@ def build_completed(
         keys += ["sensors.force"] if sensor is not None or keys else []
         with at(" or ".join(keys) or "start.positions"):
             loop = make_closed_loop(plant, law, references, settings, **drawn)
-    loop.memory["gains"] = {repr(scenario.law.gains): None}  # Those of the law.
     return Completed(scenario, (*completed.notes, *chosen.notes)), loop
 
 
@@ -211,22 +211,22 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
         if estimator.rate is None:
             text = "needed, since no gains are computed; leave `law.gains` out with Drake's contact"
             raise ScenarioError(("estimator.rate", text))
-        with at("estimator"):
-            if scenario.exogenous:
-                raise ModelError("not beside exogenous signals, whose port it feeds")
-            known = [parameter.name for parameter in model.dae.parameters]
-            names = estimator.parameters or []
-            for name in names:
-                if name not in known:
-                    hint = "; give the constraint friction: 0.0 if it is unknown"
-                    text = unknown_name("parameter", name, known)
-                    raise ModelError(f"parameters: {text}{hint * name.endswith('.friction')}")
+        if scenario.exogenous:
+            text = "not beside exogenous signals, whose port it feeds"
+            raise ScenarioError(("estimator", text))
+        known, names = [p.name for p in model.dae.parameters], estimator.parameters or []
+        for name in names:
+            if name not in known:
+                text = f"parameters: {unknown_name('parameter', name, known)}"
+                hint = "; give the constraint friction: 0.0 if it is unknown"
+                raise ScenarioError(("estimator", text + hint * name.endswith(".friction")))
+        with at("estimator.parameters"):
             velocities = [signal.name for signal in model.links.velocity_signals]
-            with at("estimator.parameters"):
-                observed = with_disturbance(model.dae, velocities, names)
-                friction = {contact.friction for contact in model.dae.contacts}
-                others = [p for p in model.dae.parameters if p.name in {*names} - friction]
-                estimated_within(others, estimator.ranges)
+            observed = with_disturbance(model.dae, velocities, names)
+            friction = {contact.friction for contact in model.dae.contacts}
+            others = [p for p in model.dae.parameters if p.name in {*names} - friction]
+            estimated_within(others, estimator.ranges)
+        with at("estimator"):
             structure = find_structure(observed)
     # The mean time from a sample to the moment when its control acts, for rigid joints. A plant
     # that steps by h damps with the speed at the end of each step: h / 2 later than the mean, and h
@@ -258,11 +258,8 @@ def check_task(scenario: Scenario) -> None:
     names = [name for name in task.make().watched("signal") if name not in task.signals]
     problems += [(f"task.signals.{name}", "needed: a phase watches it") for name in names]
     if scenario.plant.material is None:
-        text = (
-            "ideal constraints neither open nor strike, as a task needs it: take !CompliantContact "
-            "or !MultibodyPlant"
-        )
-        problems.append(("plant", text))
+        ideal = "ideal constraints neither open nor strike, as a task needs it"
+        problems.append(("plant", f"{ideal}: take !CompliantContact or !MultibodyPlant"))
     if scenario.start.errors:
         problems.append(("start.errors", "a task begins at start.positions; leave them out"))
     if problems:
@@ -287,18 +284,14 @@ def _task_controller(
     return TaskController(task.make(noise), law, free_law, sample_period=period or 1e-3)
 
 
-class _NoLaw:
-    """Has of a law what records ask for, its system; all else of a law is an error."""
-
-    structure = None
-
-    def __init__(self, system: DaeSystem) -> None:
-        self.system = system
-
-    def __getattr__(self, name: str) -> Any:
-        raise ModelError(
-            f"robot.actuators is [], and there is no law with {name}; simulate runs it"
-        )
+def _mechanism(scenario: Scenario, model: RobotModel, **drawn: Any) -> ClosedLoop:
+    """The loop of a mechanism that nothing drives."""
+    for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
+        if getattr(scenario, key):
+            raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
+    structure = find_constraint_structure(model.dae)
+    plant = make_plant(scenario, model, structure)
+    return wire_loop(plant, _NoController(structure), **drawn)
 
 
 class _NoController(TracedSystem, Controller):
@@ -310,8 +303,7 @@ class _NoController(TracedSystem, Controller):
         self._structure = structure
         self.law = cast(TrackingLaw, _NoLaw(structure.system))
         x = ca.SX.sym("x", structure.system.num_states)
-        ports = {"estimated_state": x}, {"control": NOTHING}
-        super().__init__(Block("no_controller", *ports))
+        super().__init__(Block("no_controller", {"estimated_state": x}, {"control": NOTHING}))
 
     @property
     def start_structure(self) -> ConstraintStructure:
@@ -330,11 +322,14 @@ class _NoController(TracedSystem, Controller):
         return np.zeros((times.size, 0))
 
 
-def _mechanism(scenario: Scenario, model: RobotModel, **drawn: Any) -> ClosedLoop:
-    """The loop of a mechanism that nothing drives."""
-    for key in ("sampling", "estimator", "task", "references", "saturation", "exogenous"):
-        if getattr(scenario, key):
-            raise ScenarioError((key, "robot.actuators is [], and there is nothing to control"))
-    structure = find_constraint_structure(model.dae)
-    plant = make_plant(scenario, model, structure)
-    return wire_loop(plant, _NoController(structure), **drawn)
+class _NoLaw:
+    """Has of a law what records ask for, its system; all else of a law is an error."""
+
+    structure = None
+
+    def __init__(self, system: DaeSystem) -> None:
+        self.system = system
+
+    def __getattr__(self, name: str) -> Any:
+        text = f"robot.actuators is [], and there is no law with {name}; simulate runs it"
+        raise ModelError(text)

@@ -25,8 +25,7 @@ from drake_dae.scenario.start import start_scenario
 class Commanded:
     """A loop that a person can change while it runs, and its start.
 
-    The completed scenario has the added parameters and wrenches; `left_out` is a sentence for each
-    kind of change that is not possible.
+    `left_out` is a sentence for each kind of change that is not possible.
     """
 
     scenario: Scenario
@@ -41,16 +40,10 @@ def build_commanded(scenario: Scenario) -> Commanded:
 
     Without commands the loop behaves as in the scenario: surfaces are fixed, and wrenches and
     additional friction are zero. Signals for which a task waits are inputs of the diagram.
-
-    Raises:
-        ScenarioError: The scenario itself is not valid, or its plant has Drake's hydroelastic
-            contact, which cannot be traced; the message contains the key. Point contact can.
     """
     scenario, remark = for_rollout(scenario)
     if scenario.plant.carries:
-        text = (
-            "Drake's hydroelastic contact cannot be traced: take a !CompliantContact in its place"
-        )
+        text = "Drake's hydroelastic contact cannot be traced: take a !CompliantContact instead"
         raise ScenarioError(("plant", text))
     extended, left_out = scenario, [f"Drake's plant: {remark}"] if remark else []
     parts: Mapping[str, Callable[[Scenario], Scenario]] = {
@@ -75,18 +68,18 @@ def build_commanded(scenario: Scenario) -> Commanded:
 
 def _with_friction(scenario: Scenario) -> Scenario:
     """Adds a coefficient of friction of 0 to frictionless contacts."""
-    constraints = [
-        replace(constraint, friction=0.0)
-        if isinstance(constraint, PointOnSurface) and constraint.friction is None
-        else constraint
+    bare = [
+        constraint
         for constraint in scenario.constraints
+        if isinstance(constraint, PointOnSurface) and constraint.friction is None
     ]
     # A compliant contact has its friction in the material.
-    if constraints == scenario.constraints or scenario.plant.material is not None:
+    if not bare or scenario.plant.material is not None:
         return scenario
     if scenario.actuation:
         raise ModelError("the law would differentiate it; give the constraint a friction")
-    return replace(scenario, constraints=constraints)
+    rough = [replace(c, friction=0.0) if c in bare else c for c in scenario.constraints]
+    return replace(scenario, constraints=rough)
 
 
 def _with_moving_surfaces(scenario: Scenario) -> Scenario:

@@ -60,18 +60,14 @@ def each(key: str, items: Iterable[S], make: Callable[[S], T]) -> list[T]:
     return results
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Family:
-    """The classes among which a tag chooses, the first one without a tag.
-
-    `plain` is a type that may stand in place of a member: str or float.
-    """
+    """The classes among which a tag chooses, the first without a tag; `plain` is str or float."""
 
     members: Mapping[str, type]
     plain: type | None = None
 
     def tag_of(self, data: Any) -> str | None:
-        """The tag that data have, or stand for."""
         if isinstance(data, dict):
             return str(data.get(TAG, next(iter(self.members))))
         kinds = (int, float) if self.plain is float else (self.plain or (),)
@@ -89,11 +85,7 @@ class Key:
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Annotates data like a hint, of which `convert` makes a value; `words` answer all other data.
-
-    `convert` takes the data and, as a second argument if it has one, pydantic's information, whose
-    context is the folder of the file.
-    """
+    """Annotates data like a hint; `convert` makes a value of it, `words` answer all other data."""
 
     words: str
     hint: Any
@@ -129,12 +121,9 @@ def in_folder(name: str, info: pydantic.ValidationInfo) -> str:
         raise ValueError from None
 
 
-def _fixed(size: int) -> Expected:
-    length = pydantic.Field(min_length=size, max_length=size)
-    return Expected(f"{size} numbers", Annotated[list[float], length], tuple)
-
-
-PAIR, TRIPLE = _fixed(2), _fixed(3)
+_TWO, _THREE = (pydantic.Field(min_length=size, max_length=size) for size in (2, 3))
+PAIR = Expected("2 numbers", Annotated[list[float], _TWO], tuple)
+TRIPLE = Expected("3 numbers", Annotated[list[float], _THREE], tuple)
 NUMBERS = Expected(
     "a number, a list of numbers, or a matrix as a list of rows of one length",
     float | list[float] | list[list[float]],
@@ -143,7 +132,7 @@ NUMBERS = Expected(
 NUMBER_OR_LIST = Expected("a number or a list of numbers", float | list[float])
 INTERVAL = Expected(
     "a lowest and a highest value, each a number or a list of numbers",
-    Annotated[list[float | list[float]], pydantic.Field(min_length=2, max_length=2)],
+    Annotated[list[float | list[float]], _TWO],
     tuple,
 )
 COMPILED = Expected("true, false or auto", bool | Literal["auto"])
@@ -175,8 +164,8 @@ _WORDS = {
 class Reader(Generic[T]):
     """Makes a dataclass of plain data, and plain data of it.
 
-    `families` and `values` are what stands in data for types in annotations; `keys` are those of
-    classes that are no dataclasses, or have other keys than their fields.
+    `families` and `values` stand in data for types in annotations; `keys` are those of classes that
+    are no dataclasses, or have other defaults.
     """
 
     def __init__(
@@ -189,6 +178,7 @@ class Reader(Generic[T]):
         self._form, self._families, self._values, self._keys = form, families, values, keys
         self._types = dict[Any, Any]()
         self._tags = {c: t for f in families.values() for t, c in f.members.items()}
+        self.tags = list(dict.fromkeys(self._tags.values()))
         self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(self._type(form))
 
     @cached_property
@@ -198,21 +188,13 @@ class Reader(Generic[T]):
         text = json.dumps(self._adapter.json_schema()).replace('"oneOf"', '"anyOf"')
         return dict(json.loads(text))
 
-    @property
-    def tags(self) -> list[str]:
-        """All tags."""
-        return list(dict.fromkeys(self._tags.values()))
-
     def read(
         self,
         data: Any,
         folder: Path | None = None,
         place_of: Callable[[str], str] = lambda key: "",
     ) -> T:
-        """Makes the dataclass of plain data; names of files are relative to a folder.
-
-        `place_of` says where a key stands, for the messages.
-        """
+        """Makes the dataclass; files are in `folder`, and `place_of` tells where a key stands."""
         try:
             return self._adapter.validate_python(data, context=folder)
         except pydantic.ValidationError as error:

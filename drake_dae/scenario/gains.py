@@ -15,19 +15,21 @@ from drake_dae.dae import (
     SensedContact,
     SensorNoise,
     Structure,
+    ZeroDynamics,
     advised_gains,
     contact_gains,
 )
-from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR
+from drake_dae.dae.beyond.advised_gains import EVERY, MODEL_ERROR, settles_along
 from drake_dae.dae.law_model import damping_gains
-from drake_dae.errors import ScenarioError
+from drake_dae.dae.margins import ContactMargins
+from drake_dae.errors import DrakeDaeError, GainError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, velocities_are_rates
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.completion import Completed
 from drake_dae.scenario.estimated import estimates_all
 from drake_dae.scenario.form import at
-from drake_dae.scenario.model import references_of
+from drake_dae.scenario.model import exogenous_references, reference_and_start, references_of
 from drake_dae.scenario.parts import ScenarioTask
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact
@@ -45,6 +47,12 @@ _FORCE = 10.0
 
 _SHARE = 0.003
 """The default of the largest roughness, as a fraction of the largest effort limit."""
+
+_STATES = 33
+"""The number of states along the references at which friction is compared with what jams."""
+
+_DEVELOPED = 10.0
+"""The factor of velocities, so that friction of the model is that of a contact that slides."""
 
 _PERIODS = 3
 """The number of oscillations of the contact after the force of a touch has reached its goal."""
@@ -106,9 +114,17 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         bounds = {} if law.largest_errors is None else vars(law.largest_errors)
         errors = {f"{name}_error": most for name, most in bounds.items() if most is not None}
         with at("law.gains"):
-            best = advised_gains(sensed, roughness, **errors)
+            try:
+                best, bare = advised_gains(sensed, roughness, **errors), ""
+            except GainError:
+                # Gains of a contact of half the stiffness are stable up to twice that.
+                softer = replace(sensed, stiffness=stiffness / 2.0)
+                if settles_along(sensed) or not settles_along(softer):
+                    raise
+                best = advised_gains(softer, roughness, **errors)
+                bare = ". A contact that is stiffer than stated may be unstable: sample more often"
         contact, fast = best.gains, best.state_rate
-        known_by, outlook = "these encoders", f". {_predicted(best)}"
+        known_by, outlook = "these encoders", f". {_predicted(best)}{bare}"
     names = [signal.name for signal in model.dae.output_signals]
     positions, forces = np.split(np.array(names), [len(model.position_signals)])
     points = _moved_points(model)
@@ -193,7 +209,46 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
         f"{outlook}"
         f"{touch_note}"
     )
-    return Completed(chosen, (note,))
+    jam = _jam(scenario, model, structure, material.friction)
+    return Completed(chosen, (note, jam) if jam else (note,))
+
+
+def _jam(
+    scenario: Scenario, model: RobotModel, structure: Structure, friction: float | None
+) -> str:
+    """Where friction of the plant makes contacts jam along the references, as a sentence.
+
+    Along a normal that hardly moves, friction that the law does not know may move the tool into
+    the surface by more than the normal force moves it out: mu A_nt > A_nn, the Painleve paradox.
+    """
+    system = model.dae
+    if scenario.task is not None or not (system.frictional_contacts and friction):
+        return ""
+    begin = scenario.integrator.start_time
+    times = np.linspace(begin, begin + scenario.duration, _STATES)
+    try:
+        reference, start = reference_and_start(scenario, model, structure)
+        exogenous = exogenous_references(scenario, system)
+        motion = ZeroDynamics(system, structure=structure).motion(
+            reference, times, start, exogenous=exogenous
+        )
+    except DrakeDaeError:  # What is wrong with references and start is told where they are used.
+        return ""
+    if not motion.times.size:
+        return ""
+    states = motion.states.copy()
+    states[:, model.links.q.numel() :] *= _DEVELOPED
+    margins = ContactMargins(system, structure.elimination.constraint_matrix)
+    margin = margins.along(motion.times, states, motion.parameters)
+    if not margin.lowest <= friction:
+        return ""
+    name = max(margin.critical_friction, key=margin.critical_friction.__getitem__)
+    return (
+        f"no gains are stable here: with {name} of {margin.lowest:.2g} or more the contact jams at "
+        f"t = {margin.time:.3g} s (the Painleve paradox: friction presses the tool on by more than "
+        f"the surface presses it back), and the plant has {friction:g}; start in a posture from "
+        "which the tool moves more easily along the normal, or reduce the friction"
+    )
 
 
 def _fed_ahead(scenario: Scenario, structure: Structure, stiffness: float) -> float | None:

@@ -1,7 +1,7 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any
 
 import casadi as ca
@@ -44,7 +44,6 @@ from drake_dae.scenario.model import (
     scenario_structure,
 )
 from drake_dae.scenario.scenario import Scenario
-from drake_dae.trace.functions import TracedFunction
 
 SAMPLES, MOST_SAMPLES = 1001, 20_000
 """The smallest number of examined times along a reference, and the largest along a fast one."""
@@ -65,19 +64,11 @@ WRONG_SIDE = "turn its normal around if its free side is the other one, or choos
 
 @dataclass(frozen=True, eq=False)
 class Feasibility:
-    """The analysis of a scenario's robot, and the requirements of its reference.
+    """The analysis of a scenario's robot, and what its reference requires at least, without errors.
 
-    All numbers are those of the law's model without errors: the minimum requirements.
-
-    Attributes:
-        analysis: The result of `analyze`, around the start and along the reference.
-        duration: The duration of the scenario, in s.
-        gains: Why no gains can be computed where they are left out, else empty.
-        is_resolved: Whether the times resolve the reference; otherwise values between them are not
-            known.
-        ranges: Controls, joint forces, positions and speeds of joints, and constraint forces.
-        behind: Links that move behind a contact surface.
-        slowing: How much slower the references keep all limits; None where they keep them.
+    `gains` is why none can be computed where they are left out. Unless `is_resolved`, values
+    between the examined times are not known. `slowing` is how much slower the references keep all
+    limits, and None where they do.
     """
 
     analysis: Analysis
@@ -90,12 +81,9 @@ class Feasibility:
 
     def of(self, *kinds: LimitKind) -> tuple[SignalRange, ...]:
         """The ranges of some kinds; of joints only those with limits."""
-        joints = (LimitKind.POSITION, LimitKind.SPEED)
-        return tuple(
-            r
-            for r in self.ranges
-            if r.kind in kinds and (r.kind not in joints or np.isfinite([r.low, r.high]).any())
-        )
+        free = {LimitKind.POSITION, LimitKind.SPEED}
+        ranges = (r for r in self.ranges if r.kind in kinds)
+        return tuple(r for r in ranges if {r.kind} - free or np.isfinite([r.low, r.high]).any())
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -107,7 +95,6 @@ class Feasibility:
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as plain numbers, lists and texts."""
         groups = {
             "controls": self.of(LimitKind.CONTROL),
             "joint_forces": self.of(LimitKind.EFFORT),
@@ -132,9 +119,8 @@ class Feasibility:
             limits = "none" if np.isinf([r.low, r.high]).all() else limits
             # The extremes of a constant are round-off, and have no times.
             moves = r.largest - r.least > 1e-9 * max(abs(r.least), abs(r.largest))
-            times = (f"{t:.4g} s" if moves else "" for t in (r.least_time, r.largest_time))
-            (low, high), left = times, r.beyond_time
-            remark = "" if left is None else f"left at {left:.4g} s"
+            low, high = (f"{t:.4g} s" * moves for t in (r.least_time, r.largest_time))
+            remark = "" if r.beyond_time is None else f"left at {r.beyond_time:.4g} s"
             row = [digits(r.least), low, digits(r.largest), high, limits, remark]
             rows.append([r.signal.name, r.signal.unit or "1", *row])
         parts = list(self.analysis.parts())
@@ -156,18 +142,17 @@ class Feasibility:
 
 def find_feasibility(scenario: Scenario) -> Feasibility:
     """Analyzes the robot of a scenario, and what its reference requires of drives and joints."""
+    # The robot, and gains for it if they are left out.
     check_task(scenario)
     completed, model, _ = completed_model(scenario)
-    scenario, examined, law, gains = completed.scenario, None, None, ""
+    scenario, gains = completed.scenario, ""
     try:
-        if scenario.task is None:
-            examined = examine_scenario(model)
-        if examined is None or examined.structure is None or examined.problems:
-            structure = scenario_structure(model)
-        else:
-            structure = examined.structure
+        examined = examine_scenario(model) if scenario.task is None else None
+        structure = None if examined is None or examined.problems else examined.structure
+        structure = structure or scenario_structure(model)
     except AssumptionError:
         return Feasibility(analyze(model.dae), scenario.duration)
+    law = None
     try:
         law = tracking_law(advised(scenario, model, structure).scenario, model, structure)
     except ScenarioError as error:
@@ -176,6 +161,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
         gains = str(error)
     if examined is None:
         return Feasibility(analyze(model.dae), scenario.duration, gains)
+
+    # The motion along the reference, at times that resolve it.
     reference, start = reference_and_start(scenario, model, structure)
     degrees = None if law is None or scenario.estimator is not None else law.exogenous_degrees
     exogenous = exogenous_references(scenario, model.dae, degrees)
@@ -193,6 +180,8 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     motion, found = analysis.motion, (scenario.duration, gains, is_resolved)
     if motion is None or not motion.times.size:
         return Feasibility(analysis, *found)
+
+    # Its limits.
     with at("judgement.friction_cones"):
         limits = robot_limits(model, scenario.judgement.friction_cones)
     ranges = limits.ranges(motion.times, limits.of_motion(motion))
@@ -289,6 +278,24 @@ def judge_run(
     config = scenario.integrator
     fixed = loop.plant.time_step or not config.use_error_control
     accuracy = None if fixed else config.accuracy
+    # Friction of the plant's material alone, at a contact for which the law has none.
+    material = scenario.plant.material
+    frictionless = any(
+        any(c.is_unilateral) and c.friction_parameter is None for c in model.constraints
+    )
+    reasons = {
+        "the drives were saturated": "excess" in record and bool(record["excess"].any()),
+        "parameters of the plant differ from those of the law": scenario.plant.parameters,
+        "the plant carries payloads that the law does not know": scenario.plant.payloads,
+        "disturbances act on the plant, unknown to the law": scenario.plant.disturbances,
+        "the contact has friction that the law does not know": (
+            material is not None and material.friction and frictionless
+        ),
+        "the contact is compliant": not loop.plant.is_ideal,
+        "the force is measured by a sensor": scenario.sensors.force is not None,
+        "the state is measured by encoders": scenario.sensors.encoders is not None,
+        "the law is sampled": scenario.sampling is not None,
+    }
     judgement = judge(
         record,
         loop.predicted_error(record),
@@ -297,11 +304,12 @@ def judge_run(
         changes=changes,
         ended=ended,
         accuracy=accuracy,
-        reasons=_reasons(scenario, loop, record),
+        reasons=[reason for reason, holds in reasons.items() if holds],
         more=behind,
     )
     told = tuple(dict.fromkeys(filter(None, notes)))
-    return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy)
+    named = (scenario.estimator.parameters if scenario.estimator else None) or ()
+    return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy, named)
 
 
 def _beyond_edge(
@@ -314,10 +322,8 @@ def _beyond_edge(
     coordinates = constraint.coordinates(model.links)
     if any(ca.depends_on(coordinates, p.symbol) for p in dae.exogenous.moving):
         return ""  # The record does not contain the position of a moving surface.
-    inputs = {"q": model.links.q, "parameters": dae.parameter_symbol}
-    function = TracedFunction("coordinates", inputs, {"coordinates": coordinates})
-    positions = record["state"][:, : model.links.q.numel()]
-    places = np.array([function(q, dae.parameter_values)[0] for q in positions])
+    function = dae.trace("coordinates", {"coordinates": coordinates})
+    places = np.array([function(x, dae.parameter_values)[0] for x in record["state"]])
     beyond = np.max(np.maximum(extent[0] - places, places - extent[1]), axis=1)
     if not np.any(beyond > 0.0):
         return ""
@@ -332,30 +338,8 @@ def _remarks(value: Any) -> Iterator[str]:
     """The approximations of references in lists, mappings and dataclasses."""
     if isinstance(value, Reference):
         yield value.remark
-    elif isinstance(value, (list, tuple, dict)):
-        for inner in value.values() if isinstance(value, dict) else value:
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
             yield from _remarks(inner)
-    elif is_dataclass(value):
-        for field in fields(value):
-            yield from _remarks(getattr(value, field.name))
-
-
-def _reasons(scenario: Scenario, loop: ClosedLoop, record: Record) -> list[str]:
-    """Why errors may deviate from the prediction, which is that of an ideal run."""
-    material, model = scenario.plant.material, loop.plant.robot("a scenario")
-    of_plant_alone = [
-        any(c.is_unilateral) and c.friction_parameter is None for c in model.constraints
-    ]
-    rubs = material is not None and bool(material.friction) and any(of_plant_alone)
-    reasons = {
-        "the drives were saturated": "excess" in record and bool(record["excess"].any()),
-        "parameters of the plant differ from those of the law": bool(scenario.plant.parameters),
-        "the plant carries payloads that the law does not know": bool(scenario.plant.payloads),
-        "disturbances act on the plant, unknown to the law": bool(scenario.plant.disturbances),
-        "the contact has friction that the law does not know": rubs,
-        "the contact is compliant": not loop.plant.is_ideal,
-        "the force is measured by a sensor": scenario.sensors.force is not None,
-        "the state is measured by encoders": scenario.sensors.encoders is not None,
-        "the law is sampled": scenario.sampling is not None,
-    }
-    return [reason for reason, holds in reasons.items() if holds]
+    elif isinstance(value, dict) or is_dataclass(value):
+        yield from _remarks([*(value if isinstance(value, dict) else vars(value)).values()])

@@ -57,7 +57,7 @@ _SLACK = 1e-6
 """The excess over a limit that counts, in its unit."""
 
 _LARGE = 30.0
-"""The ratio of the size of a surface to that of the robot above which its unit is doubtful."""
+"""The size of a surface in that of the robot above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -112,7 +112,7 @@ def completed_model(
         robot = robot_links(scenario.robot, scene_graph or SceneGraph(), payloads, drawn)
     links, loops = robot
     constraints = _checked_constraints(scenario, links, loops)
-    best, its_problem = None, ""
+    found = list[tuple[bool, str, Completed, RobotModel, Structure | None]]()
     for completed in completions(scenario, links, constraints, start_guess(scenario, links)):
         model, structure = _model(completed.scenario, links, constraints), None
         if completed.scenario is scenario or scenario.task is not None:
@@ -124,13 +124,11 @@ def completed_model(
             problem = str(error)
         if not problem:
             return completed, model, structure
-        if best is None or (best[2] is None and structure is not None):
-            best, its_problem = (completed, model, structure), problem
-    assert best is not None  # There is a completion, or an error.
-    completed, model, structure = best
+        found.append((structure is None, problem, completed, model, structure))
+    _, problem, completed, model, structure = min(found, key=lambda entry: entry[0])
     note = (
         f"{NOTHING_FOUND} from which the robot keeps its limits along the references; with this "
-        f"one {its_problem}. Move the surface or the references, make them slower, or give other "
+        f"one {problem}. Move the surface or the references, make them slower, or give other "
         "outputs or start.positions"
     )
     return Completed(completed.scenario, (*completed.notes, note)), model, structure
@@ -140,7 +138,7 @@ def _checked_constraints(
     scenario: Scenario, links: MultibodyExpressions, loops: Sequence[Constraint]
 ) -> list[Constraint]:
     """The constraints, and a check of every key that the model takes, for errors with its place."""
-    robot, forces, actuation = scenario.robot, scenario.forces, scenario.actuation
+    robot, forces = scenario.robot, scenario.forces
     constraints = each("constraints", scenario.constraints, lambda form: make(form, ()))
     names = [constraint.name for constraint in (*plant_constraints(links), *loops)]
     for index, constraint in enumerate(constraints):
@@ -163,10 +161,11 @@ def _checked_constraints(
         )
         raise ScenarioError(("robot.actuators", text))
     _outputs(scenario, constraints, links)
+    attached = list[Any]()
     if links.actuator_signals:
-        each("actuation", actuation, lambda stage: stage.attach(links))
+        attached = each("actuation", scenario.actuation, lambda stage: stage.attach(links))
     with at("actuation"):
-        chain(actuation, links)
+        chain(scenario.actuation, links)
     each("forces", forces or (), lambda f: force_rows(as_force_outputs([f], bound), bound, links))
     with at("forces"):
         as_force_outputs(forces, bound)
@@ -177,13 +176,11 @@ def _checked_constraints(
     each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
     with at("law.control_weights"):
         choice = control_choice(robot.title, scenario.law.control_weights or None, actuators)
-    attached = [stage.attach(links) for stage in actuation] if scenario.exogenous else []
     parts: tuple[Any, ...] = (links, *constraints, *robot.known_forces, *attached)
     parameters = [p.name for p in (*choice, *(p for part in parts for p in part.parameters))]
     for moving in scenario.exogenous:
         if moving not in parameters:
-            text = unknown_name("parameter", moving, parameters)
-            raise ScenarioError(("exogenous", text))
+            raise ScenarioError(("exogenous", unknown_name("parameter", moving, parameters)))
     return constraints
 
 
@@ -247,19 +244,16 @@ def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
     extent = getattr(getattr(constraint, "surface", None), "extent", None)
     if extent is None:
         return
-    plant = links.plant
-    context = plant.CreateDefaultContext()
-    bodies = (plant.get_body(BodyIndex(i)) for i in range(plant.num_bodies()))
-    places = [plant.EvalBodyPoseInWorld(context, body).translation() for body in bodies]
-    robot = float(np.linalg.norm(np.ptp(places, axis=0)))
-    size = float(np.max(extent[1] - extent[0]))
+    plant, size = links.plant, float(np.max(extent[1] - extent[0]))
+    context, bodies = plant.CreateDefaultContext(), map(BodyIndex, range(plant.num_bodies()))
+    poses = [plant.EvalBodyPoseInWorld(context, plant.get_body(index)) for index in bodies]
+    robot = float(np.linalg.norm(np.ptp([pose.translation() for pose in poses], axis=0)))
     if size > _LARGE * robot > 0.0:
-        warnings.warn(
+        text = (
             f"the surface of '{constraint.name}' is {size:.3g} m long, and the robot "
-            f"{robot:.2g} m: if a unit of its file is a millimetre, write scale: 0.001",
-            GeometryWarning,
-            stacklevel=2,
+            f"{robot:.2g} m: if a unit of its file is a millimetre, write scale: 0.001"
         )
+        warnings.warn(text, GeometryWarning, stacklevel=2)
 
 
 def _outputs(
@@ -308,26 +302,21 @@ def reference_and_start(
     names = [signal.name for signal in model.dae.output_signals]
     degrees = structure.layout.reference_degrees
     stacked = stack_references(references_of(scenario, names, degrees), degrees)
-
-    def reference(time: float) -> FloatArray:
-        return stacked(time).copy()
-
-    outputs = reference(scenario.integrator.start_time)[structure.layout.lowest]
+    outputs = stacked(scenario.integrator.start_time).copy()[structure.layout.lowest]
     parameters = model.dae.parameter_values
     with at("start"):
-        return reference, start_state(scenario, model, outputs, parameters, parameters)
+        start = start_state(scenario, model, outputs, parameters, parameters)
+    return lambda time: stacked(time).copy(), start
 
 
 def in_the_way(scenario: Scenario, model: RobotModel, structure: Structure) -> str:
     """What is in the way along the references, as a sentence; empty if nothing is."""
+    times = scenario.integrator.start_time + np.linspace(0.0, scenario.duration, _TIMES)
     try:
         reference, start = reference_and_start(scenario, model, structure)
-        begin, end = scenario.integrator.start_time, scenario.duration
-        times = begin + np.linspace(0.0, end, _TIMES)
         exogenous = exogenous_references(scenario, model.dae)
-        motion = ZeroDynamics(model.dae, structure=structure).motion(
-            reference, times, start, exogenous=exogenous
-        )
+        dynamics = ZeroDynamics(model.dae, structure=structure)
+        motion = dynamics.motion(reference, times, start, exogenous=exogenous)
     except DrakeDaeError as error:
         return str(error)
     if motion.ending is not None:

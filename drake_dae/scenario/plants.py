@@ -34,12 +34,11 @@ class ScenarioPlant(ABC):
     1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
     2. With `carries`, this plant includes payloads, disturbances and changed parameters. Otherwise
        the scenario makes a model with these payloads and disturbances, and sets the parameters in
-       the context. A plant that `carries` has `pushes` of its own.
+       the context.
     3. `material` is the material of compliant contacts, and None for ideal contacts.
     4. `rolled` is the member that a rollout runs instead: this member, or one with a traced plant.
-    5. With `adjusts`, the parameters of the plant can be set in a context. `in_context` are the
-       keys of numbers that `begin` sets in a context, even if the plant was made with other
-       numbers.
+    5. `in_context` are the keys of numbers that `begin` sets in a context, even if the plant was
+       made with other numbers. Without `adjusts` the plant is made anew for each payload and force.
 
     Attributes:
         parameters: Parameter name -> the plant's value, unknown to the law's model; one number for
@@ -57,12 +56,10 @@ class ScenarioPlant(ABC):
 
     @property
     def material(self) -> PointMaterial | None:
-        """The material of compliant contacts; None for ideal ones."""
         return None
 
     @property
     def rolled(self) -> "ScenarioPlant":
-        """The plant that a rollout uses in place of this one; itself if it is traced."""
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
@@ -126,9 +123,7 @@ class CompliantContact(PointMaterial, ScenarioPlant):
     continuous.
     """
 
-    in_context: ClassVar[frozenset[str]] = frozenset(
-        {"stiffness", "dissipation", "friction", "radius"}
-    )
+    in_context: ClassVar = frozenset({"stiffness", "dissipation", "friction", "radius"})
 
     @property
     def material(self) -> PointMaterial:
@@ -169,8 +164,7 @@ class OwnPlant(ScenarioPlant):
         module, _, name = self.maker.partition(":")
         with at("plant.maker"):
             try:
-                kind = getattr(import_module(module), name)
-                plant = kind(model, structure)
+                plant = getattr(import_module(module), name)(model, structure)
             except DrakeDaeError:
                 raise
             except Exception as error:

@@ -10,10 +10,7 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arrays import FloatArray
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.parts import (
-    ENCODER_NOISE,
-    encoder_seed,
-)
+from drake_dae.diagrams.parts import ENCODER_NOISE, encoder_seed
 from drake_dae.diagrams.record import Record, RecordAfter
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running.divergence import DivergenceWatch

@@ -26,32 +26,12 @@ from drake_dae.files import read_text
 from drake_dae.references import Reference
 from drake_dae.robots import ForceOutput, Load, Pair, Stage, Surface, Vector
 from drake_dae.running.simulate import check_config
-from drake_dae.scenario import form, parts, plants
+from drake_dae.scenario import form, parts, plants, typed_yaml
 from drake_dae.scenario.form import Family, Key, Reader, keys_of
-from drake_dae.scenario.parts import (
-    Estimator,
-    Judgement,
-    Law,
-    ScenarioTask,
-    Sensors,
-    Start,
-    Write,
-    WrittenConstraint,
-    WrittenOutput,
-)
-from drake_dae.scenario.plants import IdealConstraints, ScenarioPlant
 from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
-from drake_dae.scenario.typed_yaml import (
-    MOST_TEXT,
-    TAG,
-    dump_yaml,
-    first_name,
-    load_lines,
-    load_yaml,
-)
 from drake_dae.systems.control.drives import Sampling
-from drake_dae.systems.task import phases
+from drake_dae.systems.task import phases as ps
 from drake_dae.trace.compiled import Compiled
 
 
@@ -119,32 +99,30 @@ class Scenario:
 
     description: str = field(default="", kw_only=True)
     robot: Robot
-    constraints: list[WrittenConstraint] = field(default_factory=list)
+    constraints: list[parts.WrittenConstraint] = field(default_factory=list)
     compliances: dict[str, float] | None = None
-    outputs: list[WrittenOutput] = field(default_factory=list)
+    outputs: list[parts.WrittenOutput] = field(default_factory=list)
     tool_axis: Literal["normal", "fixed", "free"] = "normal"
     forces: list[str | ForceOutput] | None = None
     actuation: list[Stage] = field(default_factory=list)
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
     bounds: dict[str, Annotated[Any, form.INTERVAL]] = field(default_factory=dict)
     exogenous: dict[str, list[Reference | float]] = field(default_factory=dict)
-    plant: ScenarioPlant = field(default_factory=IdealConstraints)
-    law: Law = field(default_factory=Law)
+    plant: plants.ScenarioPlant = field(default_factory=plants.IdealConstraints)
+    law: parts.Law = field(default_factory=parts.Law)
     sampling: Sampling | None = None
-    sensors: Sensors = field(default_factory=Sensors)
-    estimator: Estimator | None = None
+    sensors: parts.Sensors = field(default_factory=parts.Sensors)
+    estimator: parts.Estimator | None = None
     saturation: bool = False
-    judgement: Judgement = field(default_factory=Judgement)
+    judgement: parts.Judgement = field(default_factory=parts.Judgement)
     references: dict[str, Reference | float] = field(default_factory=dict)
-    task: ScenarioTask | None = None
-    start: Start = field(default_factory=Start)
+    task: parts.ScenarioTask | None = None
+    start: parts.Start = field(default_factory=parts.Start)
     duration: Annotated[float, Field(gt=0.0)] = 10.0
     integrator: Annotated[SimulatorConfig, AfterValidator(_valid)] = field(
-        default_factory=lambda: SimulatorConfig(
-            **{n: value for n, (value, _) in _INTEGRATOR.items()}
-        )
+        default_factory=lambda: SimulatorConfig(**{n: v for n, (v, _) in _INTEGRATOR.items()})
     )
-    write: Write = field(default_factory=Write)
+    write: parts.Write = field(default_factory=parts.Write)
     compiled: Compiled = "auto"
 
     @property
@@ -153,12 +131,8 @@ class Scenario:
         return self.law.gains is None and self.plant.material is not None
 
     def __repr__(self) -> str:
-        names = listed(constraint.name for constraint in self.constraints)
-        file = Path(self.robot.file).name
-        return (
-            f"Scenario('{self.description}', robot='{file}', constraints={names}, "
-            f"duration={self.duration:g} s)"
-        )
+        file, names = Path(self.robot.file).name, listed(c.name for c in self.constraints)
+        return f"Scenario('{self.description}', robot='{file}', constraints={names})"
 
     def __eq__(self, other: object) -> bool:
         # Arrays and Drake's SimulatorConfig cannot be compared directly.
@@ -175,12 +149,10 @@ _REFERENCES: dict[str, type] = {
     "!PointToPoint": rs.PointToPointReference,
     "!Line": rs.LineReference,
     "!Circle": rs.CircleReference,
-    "!Spiral": rs.SpiralReference,
     "!Polyline": rs.PolylineReference,
     "!Waypoints": rs.WaypointsReference,
     "!Csv": rs.CsvReference,
 }
-
 # What stands in a scenario for the types in annotations. A new member is one line here.
 FAMILIES: dict[type, Family] = {
     Surface: _family(
@@ -216,13 +188,11 @@ FAMILIES: dict[type, Family] = {
     Stage: _family(robots.FlexibleJoints, robots.DcMotors, robots.ElectrohydraulicServos),
     Reference: Family(_REFERENCES, float),
     Load: _family(robots.KnownForce, robots.JointFriction),
-    ScenarioPlant: _family(
-        IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
+    plants.ScenarioPlant: _family(
+        plants.IdealConstraints, plants.MultibodyPlant, plants.CompliantContact, plants.OwnPlant
     ),
     parts.Gains: _family(parts.Poles, parts.Coefficients, parts.Matrices),
-    phases.Phase: _family(
-        phases.Approach, phases.Press, phases.Move, phases.Dwell, phases.Release, phases.Retreat
-    ),
+    ps.Phase: _family(ps.Approach, ps.Press, ps.Move, ps.Dwell, ps.Release, ps.Retreat),
 }
 
 _VALUES: dict[Any, Any] = {
@@ -294,52 +264,41 @@ def load_scenario(path: str | Path, settings: Sequence[str] = ()) -> Scenario:
     """
     path = find_scenario(str(path))
     try:
-        text = read_text(path, 4 * MOST_TEXT)
+        text = read_text(path, 4 * typed_yaml.MOST_TEXT)
         is_shipped = path in shipped_scenarios().values()
         folder = Path().absolute() if is_shipped else path.absolute().parent
     except UnicodeDecodeError:
         raise ScenarioError((str(path), "the file is not UTF-8 text; save it as such")) from None
     except (OSError, ValueError) as error:  # It is larger.
         raise ScenarioError((str(path), getattr(error, "strerror", None) or str(error))) from None
-    if _is_robot(text):
+    robot = r"\A\s*(<.*)?<(robot|sdf|mujoco)\b|^directives\s*:"
+    if re.search(robot, text, re.DOTALL | re.MULTILINE):
         problem = (
             f"this is a robot, not a scenario; `drake-dae new {path}` writes a scenario with it, "
             "and in one of your own it is robot.file"
         )
         raise ScenarioError((str(path), problem))
-    data, line_of = load_lines(text, str(path))
+    data, line_of = typed_yaml.load_lines(text, str(path))
     data = {} if data is None else data
     if isinstance(data, dict):
         # Drake's convention: keys with an underscore are a place for anchors.
-        data = {key: data[key] for key in data if key == TAG or not key.startswith("_")}
+        data = {key: data[key] for key in data if key == typed_yaml.TAG or not key.startswith("_")}
     changed = []
     for setting in settings:
         key, separator, value = setting.partition("=")
         if not separator or not all(key.split(".")):
             raise ScenarioError((f"--set {setting}", "expected key=value, for example duration=5"))
-        scenario_reader().put(data, key, load_yaml(value, key))
+        scenario_reader().put(data, key, typed_yaml.load_yaml(value, key))
         changed.append(key)
 
     def place_of(key: str) -> str:
-        """Where a key stands in the file; empty if it is one of the settings."""
-        is_set = first_name(changed, key) is not None
-        line = None if is_set else line_of(key)
+        line = None if typed_yaml.first_name(changed, key) is not None else line_of(key)
         return "" if line is None else f"[{path.name}:{line}]"
 
     return scenario_reader().read(data, folder, place_of)
 
 
-def _is_robot(text: str) -> bool:
-    """Whether a text is a robot's file: markup, or Drake's model directives."""
-    if text.lstrip().startswith("<"):
-        return re.search(r"<(?:robot|sdf|mujoco)\b", text) is not None
-    return re.search(r"^directives\s*:", text, re.MULTILINE) is not None
-
-
 def save_scenario(scenario: Scenario, path: str | Path, comment: str = "") -> None:
-    """Writes a file that `load_scenario` reads back equal: what differs from defaults.
-
-    `comment` is a first line, with its "#".
-    """
+    """Writes what differs from defaults, after a first line "# ..." that may be empty."""
     head = f"{comment}\n" if comment else ""
-    Path(path).write_text(head + dump_yaml(scenario_data(scenario)), encoding="utf-8")
+    Path(path).write_text(head + typed_yaml.dump_yaml(scenario_data(scenario)), encoding="utf-8")

@@ -23,8 +23,7 @@ limit. Also the allowed depth behind a surface, in m."""
 def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     """A context of a closed loop at a scenario's start; see `Start`.
 
-    start, plant.parameters, integrator, the numbers of uncoupled gains, and the seed of the sensor
-    may be others than those that the loop was built with.
+    start, plant.parameters, integrator, numbers of gains and seeds may differ from the loop's.
     """
     context, plant, controller = loop.diagram.CreateDefaultContext(), loop.plant, loop.controller
     _set_numbers(scenario, loop, context)
@@ -75,39 +74,32 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
         raise ScenarioError(("integrator.start_time", f"{text}, got {begin:g} s"))
     context.SetTime(begin)
     at_plant, of_plant = plant.GetMyMutableContextFromRoot(context), scenario.plant
+    numbers = dict[str, dict[str, ArrayLike]]()
     if not of_plant.carries:
-        numbers: dict[str, dict[str, ArrayLike]] = {
-            "plant.parameters": dict(of_plant.parameters),
-            "plant.payloads": {f"{p.name}.mass": p.mass for p in of_plant.payloads},
-            "plant.disturbances": {
-                f"plant_disturbance_{i}.force": d.force for i, d in enumerate(of_plant.disturbances)
-            },
-        }
-        before = plant.parameters(at_plant)
-        for key, values in numbers.items():
-            with at(key):
-                for name, value in values.items():
-                    # A user's own plant may not let these be set, and has been made with them.
-                    is_set = key != "plant.parameters" and np.array_equal(
-                        before[plant.dae.parameter_slice(name)], np.ravel(value)
-                    )
-                    if not is_set:
-                        plant.set_parameter(at_plant, name, value)
+        numbers["plant.parameters"] = dict(of_plant.parameters)
+        pushes = enumerate(of_plant.disturbances)
+        numbers["plant.payloads"] = {f"{p.name}.mass": p.mass for p in of_plant.payloads}
+        numbers["plant.disturbances"] = {f"plant_disturbance_{i}.force": d.force for i, d in pushes}
+    before = plant.parameters(at_plant)
+    for key, values in numbers.items():
+        with at(key):
+            for name, value in values.items():
+                # A user's own plant may not let these be set, and has been made with them.
+                is_set = key != "plant.parameters" and np.array_equal(
+                    before[plant.dae.parameter_slice(name)], np.ravel(value)
+                )
+                if not is_set:
+                    plant.set_parameter(at_plant, name, value)
     with at("plant"):
         of_plant.begin(plant, at_plant)
-    force, encoders = scenario.sensors.force, scenario.sensors.encoders
+    force, encoders, gains = scenario.sensors.force, scenario.sensors.encoders, scenario.law.gains
     if loop.sensor is not None and force is not None:
         with at("sensors.force"):
             at_sensor = loop.sensor.GetMyMutableContextFromRoot(context)
             loop.sensor.set_errors(at_sensor, force.bias, force.noise_deviation, force.drift)
-    # The loop has the gains with which it was built.
-    gains, designs = scenario.law.gains, loop.memory.setdefault("gains", {})
-    if gains is not None and not controller.takes_over and designs.get(repr(gains), "") is not None:
+    if gains is not None and not controller.takes_over:
         with at("law.gains"):
-            if repr(gains) not in designs:
-                designs[repr(gains)] = controller.law.design(gains.design())
-            at_controller = controller.GetMyMutableContextFromRoot(context)
-            controller.set_gains(at_controller, designs[repr(gains)])
+            controller.set_gains(controller.GetMyMutableContextFromRoot(context), gains.design())
     seed = 0 if force is None else force.seed
     loop.set_seed(context, seed, None if encoders is None else encoders.seed)
 
@@ -177,10 +169,7 @@ def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, 
 
 
 def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
-    """The parameters of the plant's system as the law assumes them, shape (k,).
-
-    Exogenous ones are measured: law and plant have the same.
-    """
+    """The parameters of the plant's system as the law assumes them; exogenous ones are measured."""
     dae, system = loop.plant.dae, loop.controller.law.system
     sizes, of_law = {p.name: p.value.size for p in system.parameters}, parameters.copy()
     for p in dae.parameters:
@@ -240,21 +229,18 @@ def _unwound(
 ) -> FloatArray:
     """A solution near a guess without the whole turns of joints that Newton's method may add."""
     q, turn, (low, high) = solve(guess), 2 * np.pi, model.links.position_limits
-
-    def is_inside(index: int, value: float) -> bool:
-        return bool(low[index] - _SLACK <= value <= high[index] + _SLACK)
-
-    for index, signal in enumerate(model.links.position_signals):
-        is_near = is_inside(index, q[index]) and abs(q[index] - guess[index]) < np.pi
-        if signal.unit != "rad" or is_near:
+    for i, signal in enumerate(model.links.position_signals):
+        nearest = q[i] - turn * np.round((q[i] - guess[i]) / turn)
+        turned = [
+            value
+            for value in (nearest, nearest - turn, nearest + turn)
+            if low[i] - _SLACK <= value <= high[i] + _SLACK
+        ]
+        best = min(turned, key=lambda value: abs(value - guess[i]), default=q[i])
+        if signal.unit != "rad" or abs(best - q[i]) < 1.0:
             continue
-        nearest = q[index] - turn * np.round((q[index] - guess[index]) / turn)
-        turned = (nearest, nearest - turn, nearest + turn)
-        inside = [value for value in turned if is_inside(index, value)]
         trial = q.copy()
-        trial[index] = min(inside, key=lambda v: abs(v - guess[index]), default=q[index])
-        if abs(trial[index] - q[index]) < 1.0:
-            continue
+        trial[i] = best
         with suppress(InconsistentStateError):
             settled = solve(trial)
             q = settled if np.max(np.abs(settled - trial)) < 1e-6 else q

@@ -1,7 +1,7 @@
 """YAML as plain data and back, where a tag `!Sphere` is an entry "_tag" as Drake has it."""
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, ClassVar
 
 import yaml  # type: ignore[import-untyped]
@@ -15,6 +15,10 @@ TAG = "_tag"
 MOST_VALUES, MOST_TEXT = 100_000, 1_000_000
 """The limits of a file; an alias counts as often as it is used. Shipped scenarios have 200 values
 in 4,000 characters."""
+
+
+def _error(problem: str, node: yaml.Node) -> yaml.MarkedYAMLError:
+    return yaml.constructor.ConstructorError(problem=problem, problem_mark=node.start_mark)
 
 
 class _Loader(yaml.SafeLoader):
@@ -40,37 +44,31 @@ class _Loader(yaml.SafeLoader):
         if id(node) in counts:
             return counts[id(node)]
         counts[id(node)] = MOST_VALUES  # For an alias inside itself.
-        parts = node.value
+        parts, names = node.value, set[str]()
         if isinstance(node, yaml.ScalarNode):
             parts = []
             if not can_be_written(node.value):
                 text = "the text has half of a letter (\\ud800 to \\udfff), which no file can hold"
-                raise self._error(text, node)
+                raise _error(text, node)
         elif isinstance(node, yaml.MappingNode):
-            names = set()
             for key, _ in node.value:
                 if key.tag not in ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge"):
                     name = brief(key.value) if isinstance(key, yaml.ScalarNode) else "of a mapping"
-                    raise self._error(f"the key {name} is not text; quote it", key)
+                    raise _error(f"the key {name} is not text; quote it", key)
                 if key.value in names:
-                    raise self._error(f"the key '{key.value}' is given twice", key)
+                    raise _error(f"the key '{key.value}' is given twice", key)
                 names.add(key.value)
             parts = [part for pair in node.value for part in pair]
-        count = 1 + sum(self._count(part, counts) for part in parts)
+        count = counts[id(node)] = 1 + sum(self._count(part, counts) for part in parts)
         if count > MOST_VALUES:
             text = f"more than {MOST_VALUES} values, counting aliases as often as they are used"
-            raise self._error(text, node)
-        counts[id(node)] = count
+            raise _error(text, node)
         return count
 
     def construct_tagged(self, tag: str, node: yaml.Node) -> dict[str, Any]:
         if not isinstance(node, yaml.MappingNode):
-            raise self._error(f"the tag !{tag} must be followed by keys, or by {{}}", node)
+            raise _error(f"the tag !{tag} must be followed by keys, or by {{}}", node)
         return {TAG: f"!{tag}", **self.construct_mapping(node, deep=True)}
-
-    @staticmethod
-    def _error(problem: str, node: yaml.Node) -> yaml.MarkedYAMLError:
-        return yaml.constructor.ConstructorError(problem=problem, problem_mark=node.start_mark)
 
 
 _Loader.add_multi_constructor("!", _Loader.construct_tagged)
@@ -105,23 +103,19 @@ def load_yaml(text: str, name: str) -> Any:
 
 
 def load_lines(text: str, name: str) -> tuple[Any, Callable[[str], int | None]]:
-    """What `load_yaml` returns, and the function from a dotted key to its line.
-
-    The line is that of the deepest key in the text, and None for a key that the text has not.
-    """
+    """What `load_yaml` returns, and the line of a dotted key; None if the text does not have it."""
     if len(text) > MOST_TEXT:
         raise ScenarioError((name, f"more than {MOST_TEXT} characters, got {len(text)}"))
-    loader = None
     try:
         loader = _Loader(text)
         node = loader.get_single_node()
         data = None if node is None else loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        what = ", ".join(part for part in (error.context, error.problem) if part)
-        if "<document start>" in what:
-            what = "more than one value; several stand in brackets, as in [[-4], [-8]]"
-        raise ScenarioError((name, line + what)) from None
+        problem = ", ".join(part for part in (error.context, error.problem) if part)
+        if "<document start>" in problem:
+            problem = "more than one value; several stand in brackets, as in [[-4], [-8]]"
+        raise ScenarioError((name, line + problem)) from None
     except yaml.YAMLError as error:  # Control characters.
         raise ScenarioError((name, str(error))) from None
     except RecursionError:
@@ -129,27 +123,21 @@ def load_lines(text: str, name: str) -> tuple[Any, Callable[[str], int | None]]:
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
         # Of PyYAML, where a tag such as !!int or !!timestamp has a value that is none.
         raise ScenarioError((name, "a tag of YAML (!!...) does not fit its value")) from None
-    finally:
-        if loader is not None:
-            loader.dispose()
-    return data, lambda key: None if node is None else _line_of(node, key)
+    return data, lambda key: dict(_lines(node, node, "")).get(key)
 
 
-def _line_of(node: yaml.Node, key: str) -> int | None:
-    """The line of a dotted key below a node; names may have dots themselves."""
-    line = node.start_mark.line + 1
-    while key:
-        if isinstance(node, yaml.SequenceNode):
-            entries = {str(index): (part, part) for index, part in enumerate(node.value)}
-        elif isinstance(node, yaml.MappingNode):
-            entries = {name.value: (name, part) for name, part in node.value}
-        else:
-            return None
-        if (name := first_name(entries, key)) is None:
-            return None
-        start, node = entries[name]
-        line, key = start.start_mark.line + 1, key[len(name) + 1 :]
-    return int(line)
+def _lines(place: yaml.Node, node: yaml.Node | None, key: str) -> Iterator[tuple[str, int]]:
+    """The dotted keys of a node at its place in the text, and the line of each."""
+    if node is None:
+        return
+    yield key, place.start_mark.line + 1
+    parts = []
+    if isinstance(node, yaml.SequenceNode):
+        parts = [(str(index), part, part) for index, part in enumerate(node.value)]
+    elif isinstance(node, yaml.MappingNode):
+        parts = [(name.value, name, part) for name, part in node.value]
+    for name, start, part in parts:
+        yield from _lines(start, part, f"{key}.{name}" if key else name)
 
 
 def first_name(names: Iterable[str], key: str) -> str | None:
@@ -160,6 +148,5 @@ def first_name(names: Iterable[str], key: str) -> str | None:
 
 def dump_yaml(data: Any) -> str:
     """The text of plain data, which `load_yaml` reads back equal."""
-    return str(
-        yaml.dump(data, Dumper=_Dumper, allow_unicode=True, default_flow_style=None, width=100)
-    )
+    options = {"allow_unicode": True, "default_flow_style": None, "width": 100}
+    return str(yaml.dump(data, Dumper=_Dumper, **options))

@@ -37,9 +37,7 @@ LEAST_SCALE = 1e-3
 class ForceArrows:
     """Draws each constraint force on a robot as an arrow whose tip is at the point of application.
 
-    The arrow has the direction of the force on the robot. A moment is an arrow with two heads,
-    along its axis. The longest arrow, of this length in m, is that of the largest force until now.
-    `has_moment` says whether some moment has not been negligible compared with the forces.
+    A moment is an arrow with two heads. The longest, of this length in m, is the largest until now.
     """
 
     def __init__(self, meshcat: Meshcat, model: RobotModel, length: float = 0.25) -> None:
@@ -77,9 +75,9 @@ class ForceArrows:
                 pose = constraint.placement(own_values(constraint, dae, parameters))
                 self._meshcat.SetTransform(path_of(constraint, "surface"), pose, time)
 
-    def measure(self, course: Sequence[Wrenches]) -> None:
+    def measure(self, motion: Sequence[Wrenches]) -> None:
         """Enlarges the scale so that these wrenches fit."""
-        for wrenches in course:
+        for wrenches in motion:
             force, moment = (
                 float(np.max(np.linalg.norm(rows, axis=1), initial=0.0))
                 for rows in (wrenches.forces, wrenches.moments)
@@ -91,10 +89,7 @@ class ForceArrows:
 
 
 class ConstraintForceVisualizer(LeafSystem):
-    """Draws the constraint forces and the paths of their points while a robot runs.
-
-    Its input ports are those of the plant; `places` are the exogenous signals among the parameters.
-    """
+    """Draws the constraint forces and the paths of their points while a robot runs."""
 
     __slots__ = SHARED_DICTIONARY
 

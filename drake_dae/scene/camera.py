@@ -18,20 +18,18 @@ _MARGIN = 0.06
 
 
 def view_angles(angle: float, aspect: float, top: float = 0.0) -> tuple[float, float, float]:
-    """The tangents of a camera's angles to each side, up and down, without the picture's margins.
+    """The tangents of a camera's angles to each side, up and down, with margins left free.
 
-    `angle` is its vertical angle of view in rad, `aspect` width by height; `top` is the fraction of
-    its height that is also free at the top.
+    `top` is the fraction of a picture's height that is also free at the top.
     """
     half = float(np.tan(angle / 2.0))
     return half * (aspect - 2 * _MARGIN), half * (1 - 2 * (top + _MARGIN)), half * (1 - 2 * _MARGIN)
 
 
 def direction_of(points: FloatArray, contacts: FloatArray, normals: FloatArray) -> FloatArray:
-    """The unit vector from a scene to its camera: from behind, the side and slightly above.
+    """The unit vector from a scene to its camera, turned until little hides the contacts.
 
-    It is turned about the vertical if surfaces or links would hide the contacts. The points enclose
-    the scene; normals point toward the free side at each contact, or are zero.
+    Normals point toward the free side at each contact, or are zero.
     """
     extents = np.ptp(points, axis=0)
     size = float(np.linalg.norm(extents))
@@ -55,14 +53,10 @@ def direction_of(points: FloatArray, contacts: FloatArray, normals: FloatArray) 
 def framed(
     points: FloatArray, direction: FloatArray, view: tuple[float, float, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """The nearest camera that shows all points: its position, and a point on its axis, m.
-
-    Let x point to the right, y up and z to the camera, and let the camera have the distance D from
-    the origin and the offset s from the z axis. It shows a point if |x - s_x| <= side (D - z) and
-    -down (D - z) <= y - s_y <= up (D - z). Each of the two conditions has a least D for which an s
-    exists; the larger one is used. In the other direction the points are centered. `direction` is
-    the unit vector to the camera, not vertical, and `view` is (side, up, down).
-    """
+    """The nearest camera that shows all points: its position, and a point on its axis, m."""
+    # x points to the right, y up and z to the camera, at the distance D and the offset s from the z
+    # axis. It shows a point if |x - s_x| <= side (D - z) and -down (D - z) <= y - s_y <= up (D -
+    # z). Each condition has a least D for which an s exists; the larger one is used.
     side, up, down = view
     right = np.cross([0.0, 0.0, 1.0], direction)
     right /= np.linalg.norm(right)

@@ -17,10 +17,7 @@ _CELLS = (128, 96, 64, 48, 32, 24, 16, 12, 8, 6, 4)
 
 
 def shrink_meshes(scene: SceneGraph, source: SourceId) -> None:
-    """Replaces meshes of a source that are drawn, so that all have at most `MOST_BYTES` together.
-
-    One that cannot be read is left out. A warning says so.
-    """
+    """Draws meshes of a source coarser, to `MOST_BYTES` together; leaves out what is unreadable."""
     inspector, sizes = scene.model_inspector(), {}
     for geometry in inspector.GetAllGeometryIds(Role.kIllustration):
         shape = inspector.GetShape(geometry)

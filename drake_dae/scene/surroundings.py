@@ -47,8 +47,7 @@ def surroundings(
 ) -> list[DrawnSurface]:
     """The surfaces that a robot touches, each only once: two at one pose would flicker.
 
-    An unbounded surface is drawn as a piece of at least this size around its contact points, which
-    are (times, constraints, 3).
+    Of an unbounded one a piece of this size or more around its contact points, (times, m, 3).
     """
     constraints = acting.constraints
 
@@ -93,10 +92,7 @@ def _coincide(first: DrawnSurface | None, second: DrawnSurface | None) -> bool:
 
 
 def floor_below(points: FloatArray, surfaces: Sequence[DrawnSurface] = ()) -> Floor:
-    """A grid slightly below points, m, shape (k, 3), or on a horizontal plane near the lowest.
-
-    The side of a cell is 1, 2 or 5 times a power of ten.
-    """
+    """A grid slightly below points, m, shape (k, 3), or on a horizontal plane near the lowest."""
     size, low, high = diagonal(points), points.min(axis=0), points.max(axis=0)
     power = 10.0 ** np.floor(np.log10(size / _CELLS) + 1e-9)
     cell = power * max(step for step in (1, 2, 5) if step * power <= size / _CELLS * (1 + 1e-9))

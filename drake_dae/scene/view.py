@@ -93,11 +93,7 @@ def add_live_view(
     meshcat: Meshcat,
     exogenous: OutputPort | None = None,
 ) -> None:
-    """Adds the view of a robot, drawn `FRAME_RATE` times a second, to a diagram with its plant.
-
-    Nothing is drawn if the plant is not a robot. `exogenous` is what the plant's input of this name
-    is connected to.
-    """
+    """Adds the view of a robot, drawn `FRAME_RATE` times a second, to a diagram with its plant."""
     if plant.model is None:
         return
     period = 1.0 / FRAME_RATE
@@ -154,9 +150,8 @@ def view_of_links(
 ) -> Diagram | None:
     """A diagram that draws a robot's links in Meshcat for its input, the link state (q, v).
 
-    The links' MultibodyPlant computes the poses of the links, and is not simulated. What is drawn
-    on request, by a forced publish, goes into a page, with coarser meshes if these are large. None
-    if the links have no geometry.
+    What is drawn on request, by a forced publish, goes into a page, with coarser meshes if these
+    are large. None if the links have no geometry.
     """
     links = plant.robot("a view").links.plant
     if scene_graph is None or links is None or links.get_source_id() is None:

@@ -50,7 +50,7 @@ AHEAD = 1000
 Submit = Callable[[str, Variation], "Future[RunResult]"]
 
 
-@checked(lambda text: ScenarioError(("", text)))
+@checked(lambda text: ScenarioError(("", text)), lasts=True)
 def sweep(
     scenario: Scenario,
     variations: Sequence[Mapping[str, Any]],

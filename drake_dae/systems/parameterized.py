@@ -19,13 +19,9 @@ from drake_dae.robots import RobotModel
 class ParameterizedSystem(TracedSystem):
     """A block whose numeric parameter 0 begins with all parameters of a DaeSystem.
 
-    So a study changes numbers in a context without tracing again, and a controller can have other
-    numbers than its plant. Varying parameters, the exogenous signals w, come through an input port
-    `exogenous` with the derivatives that the block needs, stacked like references: w_1, w_1', ...,
-    w_2, .... Without a wire they keep the values of the parameters.
-    `exogenous_layout` and `exogenous_places` are the layout of that port's entries, and their
-    indices among the parameters. `degrees` are the numbers of derivatives of the entries of w that
-    the block needs; by default those on which its expressions depend.
+    Varying ones, the exogenous signals w, come through an input port `exogenous` with as many
+    derivatives, `degrees`, as the block needs, stacked like references; without a wire they keep
+    the values of the parameters, at `exogenous_places`.
     """
 
     __slots__ = TracedSystem.__slots__
@@ -82,33 +78,11 @@ def with_exogenous(block: Block, places: Sequence[int]) -> Block:
     """The block, whose parameters at some places come through an input port `exogenous`."""
     exogenous, parameters = ca.SX.sym("exogenous", len(places)), ca.SX(block.parameters)
     parameters[list(places)] = exogenous
-
-    def moved(value: ca.SX) -> ca.SX:
-        (value,) = ca.substitute([value], [block.parameters], [parameters])
-        return value
-
-    projection = block.projection
-    if projection is not None:
-        projection = replace(projection, parameters=moved(projection.parameters))
+    moved = block.mapped(lambda v: ca.substitute(v, [block.parameters], [parameters]))
     return replace(
-        block,
-        projection=projection,
+        moved,
         inputs={**block.inputs, "exogenous": exogenous},
-        outputs={name: moved(value) for name, value in block.outputs.items()},
-        derivative=moved(block.derivative),
-        held={
-            name: replace(
-                held,
-                next=moved(held.next),
-                begin=None if held.begin is None else moved(held.begin),
-            )
-            for name, held in block.held.items()
-        },
-        defaults={
-            **{name: moved(value) for name, value in block.defaults.items()},
-            "exogenous": block.parameters[list(places)],
-        },
-        requirements=tuple(replace(r, margin=moved(r.margin)) for r in block.requirements),
+        defaults={**moved.defaults, "exogenous": block.parameters[list(places)]},
     )
 
 

@@ -27,27 +27,17 @@ from drake_dae.arrays import brief
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
 from drake_dae.trace.compiler import FLAGS, find_compiler
 
-Compiled = bool | Literal["auto"]
-"""Whether functions become machine code."""
-
+Compiled = bool | Literal["auto"]  # Whether functions become machine code.
+# After this many calls "auto" looks into the cache, which takes about as long as these calls.
 LOOK = 500
-"""After this many calls "auto" looks into the cache, which takes about as long as these calls."""
-
-INTERPRETED = 5.5e-9
-"""The time of an interpreted operation, in s."""
-
+INTERPRETED = 5.5e-9  # The time of an interpreted operation, in s.
+# The time to compile an operation, in s; -O0 makes code that is three times slower.
 COMPILING = {"-O1": 2.7e-4, "-O0": 4e-5}
-"""The time to compile an operation, in s; -O0 makes code that is three times slower."""
-
-STARTING = 0.05
-"""The start-up time of a compiler, in s."""
-
-LIMIT = 10.0
-"""The longest expected compilation under "auto", in s."""
-
+STARTING = 0.05  # The start-up time of a compiler, in s.
+LIMIT = 10.0  # The longest expected compilation under "auto", in s.
+# A compiler hangs if it takes this long, in s, and this many times longer than expected on an idle
+# machine.
 HANGS = (120.0, 40.0)
-"""A compiler hangs if it takes this long, in s, and this many times longer than expected on an idle
-machine."""
 
 
 def attempts(compiled: Compiled, operations: int) -> list[tuple[int, bool]]:
@@ -73,9 +63,6 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
     """Returns a function as machine code; None if there is none.
 
     It writes all results unconditionally: call it by its `buffer()`, with an array bound to each.
-
-    Warns:
-        MachineCodeWarning: Machine code is requested and cannot be made.
     """
     # With many results, a branch for each takes the compiler ten times as long.
     source = without_branches(generate(function))
@@ -86,11 +73,7 @@ def machine_code(function: ca.Function, compiled: Compiled, make: bool) -> ca.Fu
 def library(
     source: str, operations: int, compiled: Compiled, make: bool, options: Sequence[str] = ()
 ) -> Path | None:
-    """Returns a shared library in the cache, compiled from C source; None if there is none.
-
-    Warns:
-        MachineCodeWarning: Machine code is requested and cannot be made.
-    """
+    """Returns a shared library in the cache, compiled from C; None, with a warning, if not."""
     try:
         return _library(source, operations, compiled, make, tuple(options))
     except MachineCodeError as error:

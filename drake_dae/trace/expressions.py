@@ -9,6 +9,7 @@ import numpy as np
 from drake_dae.arrays import brief
 from drake_dae.errors import DrakeDaeError, ModelError
 
+# Operations of CasADi that are not smooth.
 KINKS = {
     ca.OP_FABS: "fabs",
     ca.OP_SIGN: "sign",
@@ -22,8 +23,6 @@ KINKS = {
     ca.OP_IF_ELSE_ZERO: "if_else",
     **dict.fromkeys((ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE), "a comparison"),
 }
-"""Operations of CasADi that are not smooth."""
-
 LARGE = 2.0**200
 
 

@@ -25,12 +25,11 @@ _OF_ONE = (
     *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh"),
     *("atanh", "exp", "log", "sqrt", "erf"),
 )
+# Name -> number of arguments, and the function.
 _FUNCTIONS: dict[str, tuple[int, Callable[..., ca.SX]]] = {
     **{name: (1, getattr(ca, name)) for name in _OF_ONE},
     "atan2": (2, ca.atan2),
 }
-"""Name -> number of arguments, and the function."""
-
 _ROUGH = ("abs", "fabs", "min", "max", "fmin", "fmax", "floor", "ceil", "round", "sign", "mod")
 _SMOOTH_INSTEAD = (
     "is not smooth, and derivatives are needed: write the one side that is needed, or a smooth "

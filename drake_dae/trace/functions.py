@@ -13,16 +13,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_dae.arguments import uncollected
 from drake_dae.arrays import FloatArray, numbers
 from drake_dae.errors import ModelError
 from drake_dae.trace.compiled import Compiled, attempts, machine_code
 
+# A number above this, in any unit, means that something grew without bound. Its powers cancel and
+# overflow, so that pivots have no meaning.
 HUGE = 1e30
-"""A number above this, in any unit, means that something grew without bound. Its powers cancel and
-overflow, so that pivots have no meaning."""
-
+# A matrix whose `pivot` is below this counts as singular; see `trace.factorization`.
 SINGULAR_PIVOT = 1e-12
-"""A matrix whose `pivot` is below this counts as singular; see `trace.factorization`."""
 
 
 class FailureKind(Enum):
@@ -95,6 +95,7 @@ class TracedFunction:
         self.is_machine_code = False
 
     @cached_property
+    @uncollected
     def function(self) -> ca.Function:
         """The CasADi function: outputs, pivot, and numbers that are finite if they are valid."""
         expressions = self._expressions

@@ -13,23 +13,14 @@ from drake_dae.trace.round_off import DEPENDENT
 
 T = TypeVar("T")
 
+# A Newton step below this, relative to the state, is within the round-off of the residual.
 ROUND_OFF = 1e-12
-"""A Newton step below this, relative to the state, is within the round-off of the residual."""
-
+# A Newton step below this, relative to the state, that stops decreasing is round-off.
 CONVERGED = 1e-8
-"""A Newton step below this, relative to the state, that stops decreasing is round-off."""
-
-PRECISION = 1e-16
-"""The accuracy of a search, relative to the state."""
-
-ROUNDING = 1e-15
-"""After a Newton step below this, relative to the state, the error is round-off."""
-
-ITERATIONS = 200
-"""The largest number of steps; quadratic convergence takes a handful."""
-
-LENGTHS = tuple(0.5**k for k in range(30))
-"""The fractions of a Newton step that are tried."""
+PRECISION = 1e-16  # The accuracy of a search, relative to the state.
+ROUNDING = 1e-15  # After a Newton step below this, relative to the state, the error is round-off.
+ITERATIONS = 200  # The largest number of steps; quadratic convergence takes a handful.
+LENGTHS = tuple(0.5**k for k in range(30))  # The fractions of a Newton step that are tried.
 
 
 class NewtonModel(NamedTuple):

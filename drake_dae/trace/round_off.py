@@ -1,29 +1,26 @@
-"""What counts as zero, as dependent and as singular, where numbers have round-off."""
+"""What counts as zero, as dependent and as singular, where numbers have round-off: one rule.
+
+Rows and columns are scaled, since their units are arbitrary; before that, what is round-off
+relative to the whole matrix is zero, since scaled to length one it would count as any other row.
+Products are compared with the sizes of their terms, before these cancel.
+"""
 
 import numpy as np
 
 from drake_dae.arrays import FloatArray
 
-ZERO = 1e-9
-"""A sum of products below this, relative to the sizes of its terms, is zero."""
-
-
+ZERO = 1e-9  # A sum of products below this, relative to the sizes of its terms, is zero.
+VISIBLE = 1e-6  # One above this is not round-off, whatever the parameters are.
+MANY = 10  # A function that is only round-off at this many random states is zero.
+# A factor below this, relative to the other factors in its row or column, is zero.
 NEGLIGIBLE = 1e-11
-"""A factor below this, relative to the other factors in its row or column, is zero."""
-
+# An entry or row below this, relative to the largest of its whole matrix, is round-off.
 FLOOR = 1e-14
-"""An entry below this, relative to the largest of its whole matrix, is round-off: scaled to length
-one, such a row would count as any other."""
-
-DEPENDENT = 1e-9
-"""Rows of length one with a smallest singular value below this are dependent."""
-
+DEPENDENT = 1e-9  # Rows of length one with a smallest singular value below this are dependent.
+# A matrix with a singular value below this, its rows and columns scaled, is singular.
 SINGULAR = 1e-6
-"""A matrix with a singular value below this, its rows and columns scaled, is singular."""
-
-
+# A matrix without its round-off, and the sizes of its entries before cancellation.
 Sized = tuple[FloatArray, FloatArray]
-"""A matrix without its round-off, and the sizes of its entries before cancellation."""
 
 
 def multiply(left: FloatArray, right: Sized, scale: FloatArray) -> Sized:
@@ -53,20 +50,21 @@ def unit_rows(matrix: FloatArray) -> FloatArray:
     return matrix / positive(np.linalg.norm(matrix, axis=-1, keepdims=True))
 
 
-def smallest_singular_value(matrix: FloatArray) -> float:
-    """Returns the smallest singular value of a matrix with no more rows than columns."""
-    return float(np.linalg.svd(matrix, compute_uv=False)[-1])
-
-
 def significant(matrix: FloatArray) -> FloatArray:
     """Returns a matrix in which entries below FLOOR, relative to its largest, are zero."""
     sizes = np.abs(matrix)
     return np.where(sizes > FLOOR * np.max(sizes, initial=0.0), matrix, 0.0)
 
 
+def row_lengths(matrix: FloatArray) -> FloatArray:
+    """Returns the lengths of rows; one that is round-off of the whole counts as the longest."""
+    length = np.linalg.norm(matrix, axis=1)
+    largest = float(np.max(length, initial=0.0))
+    return positive(np.where(length > FLOOR * largest, length, largest))
+
+
 def rank_of(matrix: FloatArray) -> int:
     """Returns the rank of a matrix, its rows and columns scaled, above its round-off."""
-    matrix = significant(matrix)
     return int(np.linalg.matrix_rank(equilibrated(matrix), DEPENDENT)) if matrix.size else 0
 
 
@@ -75,6 +73,7 @@ def are_dependent(gradients: FloatArray) -> bool:
     if not np.all(np.isfinite(gradients)):
         return True
     # By their largest entries first: their squares may be too large for a number.
+    gradients = significant(gradients)
     largest = np.abs(gradients).max(axis=1, keepdims=True, initial=0.0)
     rows = unit_rows(gradients / positive(largest))
     if rows.shape[0] > rows.shape[1] or not rows.any(axis=1).all():
@@ -82,8 +81,14 @@ def are_dependent(gradients: FloatArray) -> bool:
     return smallest_singular_value(rows) < DEPENDENT
 
 
+def smallest_singular_value(matrix: FloatArray) -> float:
+    """Returns the smallest singular value of a matrix with no more rows than columns."""
+    return float(np.linalg.svd(matrix, compute_uv=False)[-1])
+
+
 def equilibrated(matrix: FloatArray) -> FloatArray:
-    """Divides the rows and columns of a matrix by `equilibration`."""
+    """Divides the rows and columns of a matrix, without its round-off, by `equilibration`."""
+    matrix = significant(matrix)
     rows, columns = equilibration(matrix)
     return matrix / rows[:, None] / columns
 

@@ -279,9 +279,8 @@ class MeasuredPlant(ContactPlant):
         builder = DiagramBuilder()
         builder.AddSystem(plant)
         self._noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 14, PERIOD))
-        scaled = builder.AddSystem(
-            MatrixGain(np.diag(noise * np.repeat([ANGLE_NOISE, RATE_NOISE], 7)))
-        )
+        deviations = noise * np.repeat([ANGLE_NOISE, RATE_NOISE], 7)
+        scaled = builder.AddSystem(MatrixGain(np.diag(deviations)))
         measured = builder.AddSystem(Adder(2, 14))
         builder.Connect(self._noise.get_output_port(), scaled.get_input_port())
         builder.Connect(plant.GetOutputPort("state"), measured.get_input_port(0))
@@ -322,8 +321,7 @@ def ours(condition: Condition, friction: float):
     ]
     given = load_scenario(condition.scenario, settings)
     model = scenario_model(given)
-    structure = scenario_structure(model)
-    scenario = advised(given, model, structure).scenario
+    scenario = advised(given, model, scenario_structure(model)).scenario
     if condition.noise:  # Its gains are those for sensors without noise.
         noisy = Encoders(position_noise=ANGLE_NOISE, velocity_noise=RATE_NOISE, seed=1)
         scenario = replace(scenario, sensors=replace(scenario.sensors, encoders=noisy))
@@ -340,9 +338,8 @@ def run(law: str, condition: Condition, friction: float) -> tuple[float, ...]:
         start = ours(CONDITIONS[0], 0.0)
         state = start[0].plant.state(start[0].plant.GetMyContextFromRoot(start[1]))
         known = Known(loop.plant.model.links.plant, state, friction)
-        plant = MeasuredPlant(
-            make_plant(scenario, loop.plant.model, loop.plant.structure), condition.noise
-        )
+        bare = make_plant(scenario, loop.plant.model, loop.plant.structure)
+        plant = MeasuredPlant(bare, condition.noise)
         kind, text = RIVALS[law]
         diagram, logs = wired(kind(known, gains(text)), plant, loop, scenario)
         own, config = diagram.CreateDefaultContext(), STEPS
@@ -359,9 +356,8 @@ def run(law: str, condition: Condition, friction: float) -> tuple[float, ...]:
         found = [log.FindLog(own) for log in logs]
         time, z, u = found[0].sample_times(), found[0].data().T, found[1].data().T
     late = time > SETTLED
-    goal = np.array([loop.reference.reference(t) for t in time])[
-        :, loop.controller.law.layout.lowest
-    ]
+    lowest = loop.controller.law.layout.lowest
+    goal = np.array([loop.reference.reference(t)[lowest] for t in time])
     error = (z - goal)[late]
     rms = [np.linalg.norm(error[:, :2], axis=1), error[:, -1], np.diff(u[late], axis=0)]
     position, force, rough = (float(np.sqrt(np.mean(part**2))) for part in rms)
@@ -370,7 +366,8 @@ def run(law: str, condition: Condition, friction: float) -> tuple[float, ...]:
 
 def wired(law: Rival, plant: MeasuredPlant, loop, scenario):
     builder = DiagramBuilder()
-    reference = ReferenceGenerator(loop.reference.references, loop.reference.degrees)
+    degrees = (*loop.reference.degrees[:-1], 0)  # A rival knows no rate of the force.
+    reference = ReferenceGenerator(loop.reference.references, degrees)
     hold = ControlHold(7, scenario.sampling)
     sensor = scenario.sensors.force.sensor(1)
     for system in (plant, law, reference, hold, sensor):

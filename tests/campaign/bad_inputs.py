@@ -1,23 +1,31 @@
-"""Scenarios and robots with one mistake each: mutations of what the package ships."""
+"""Scenarios, robots, records and command lines with mistakes, read by what users read them with."""
 
+import contextlib
+import io
+import os
 import random
 import re
-from collections.abc import Iterator
+import struct
+import zipfile
+from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
-from campaign.outcomes import Outcome, checked
+from campaign.outcomes import RAW, REFUSED, Outcome, checked
 
-from drake_dae import build_scenario, load_scenario, simulate
-from drake_dae.scenario.scenario import Scenario
+from drake_dae import Record, build_scenario, load_scenario, simulate
+from drake_dae.cli import main
+from drake_dae.scenario.robot_file.reading import finalize, read_robot
+from drake_dae.scenario.robot_file.robot import Robot
 from drake_dae.scenario.shipped import FOLDER, shipped_scenarios
 from drake_dae.scenario.typed_yaml import dump_yaml, load_yaml
 from drake_dae.systems.plants.dae_plant import DaePlant
 
+ROBOTS = Path(__file__).parents[1] / "scenario" / "robots"
 URDFS = {"two_link_arm": "two_link_wall", "five_bar": "five_bar"}
 """Model -> the scenario that reads it as a file."""
 
@@ -58,38 +66,28 @@ _NUMBERS_EACH = re.compile(r"actuation.*(stiffness|inertia|resistance|constant|r
 
 LOST = "so large that what stands beside it is lost"
 
-NUMBERS = ("nan", "inf", "-1", "0", "1e300", "1e-300", "abc", "", "1 2", "0 0 0", "1,5", "1e3000")
+NUMBERS = (
+    *("nan", "inf", "-inf", "-1", "0", "1e300", "1e-300", "1e-320", "1e3000", "1" * 400, "abc", ""),
+    *("1 2", "0 0 0", "1,5", "1_0", "0x1", "\u0661", "\0", "--1", "1e"),
+)
 
 YAML_PIECES = (":", "- ", "[", "]", "{", "}", "&a ", "*a", "!X ", '"', "'", "#", "\t", "\n", "\0")
 URDF_PIECES = ("<", ">", "/", '"', "&", "<robot>", "</link>", "<!--", "\0", "<joint/>", "<axis/>")
 
 
-@dataclass(frozen=True)
-class BadInput:
-    """A scenario file with a mistake.
-
-    Attributes:
-        what: The mistake in words.
-        path: The file.
-        excuse: Why it may run all the same; empty if it must be refused.
-    """
+class BadInput(NamedTuple):
+    """A scenario file with a mistake, in words, and why it may run all the same, if it may."""
 
     what: str
     path: Path
     excuse: str
 
 
-def bad_input(seed: int, folder: Path) -> BadInput:
-    """Writes a scenario, and its robot if the mistake is there, into a folder."""
+def scenario_attempt(seed: int, folder: Path) -> Outcome:
+    """Loads, builds and runs a bad scenario, or a good one of a bad robot, for some steps."""
     choice = random.Random(seed)
     kinds = _bad_value, _bad_structure, _bad_text, _bad_robot, _bad_values
-    kind = choice.choices(kinds, (5, 3, 2, 4, 3))[0]
-    return kind(choice, folder)
-
-
-def attempt(seed: int, folder: Path) -> Outcome:
-    """Loads, builds and runs a bad input for some steps."""
-    bad = bad_input(seed, folder)
+    bad = choice.choices(kinds, (5, 3, 2, 4, 3))[0](choice, folder)
     with checked(bad.what) as outcome:
         scenario = load_scenario(bad.path)
         loop, context = build_scenario(scenario)
@@ -98,18 +96,14 @@ def attempt(seed: int, folder: Path) -> Outcome:
         duration = min(scenario.duration, 0.01, 100 * scenario.integrator.max_step_size)
         simulate(loop.diagram, context, duration, scenario.integrator)
         record = loop.record(context)
-        exact = _is_exact(scenario) and bad.excuse != LOST
+        measured = scenario.sensors.force is not None or scenario.sampling is not None
+        # (30) and (31) hold where the plant is what the law's model says, at all times.
+        exact = not (scenario.plant.parameters or measured) and bad.excuse != LOST
         is_ideal = isinstance(loop.plant, DaePlant)
         predicted = loop.predicted_error(record) if exact and is_ideal else None
         outcome.figures(record, predicted, is_ideal)
         outcome.accepted(bad.excuse)
     return outcome
-
-
-def _is_exact(scenario: Scenario) -> bool:
-    """Whether the plant is what the law's model says, at all times, so that (30) and (31) hold."""
-    measured = scenario.sensors.force is not None or scenario.sampling is not None
-    return not (scenario.plant.parameters or measured)
 
 
 # One mistake each, and why what it makes may run.
@@ -142,10 +136,9 @@ def _bad_values(choice: random.Random, folder: Path) -> BadInput:
 def _excuse_of_value(path: str, before: Any, after: Any) -> str:
     if before == after and type(before) is type(after):
         return "it is what it was"
-    if path.startswith(("references.", "exogenous.")) and _is_constant(after):
+    is_number = isinstance(after, (int, float)) and not isinstance(after, bool) and isfinite(after)
+    if path.startswith(("references.", "exogenous.")) and is_number:
         return "a number is a constant reference" if abs(after) <= 1e15 else LOST
-    if path.startswith("law.gains.") and before == after:
-        return "it is what it was"
     if path.startswith("law.gains.") and isinstance(before, float) and after == -1.0:
         return "another pole, or a gain that is refused where it makes errors grow"
     if after is None and path.split(".")[-1] in _OR_NOTHING:
@@ -157,7 +150,7 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
         return "a list or mapping that fits there" if fits else ""
     if isinstance(before, bool) and isinstance(after, bool):
         return "a switch has two positions"
-    if isinstance(after, bool) or not isinstance(after, (int, float)) or not isfinite(after):
+    if not is_number:
         return ""
     if path.startswith(("references", "actuation")) and abs(after) > 1e15:
         return LOST
@@ -168,10 +161,6 @@ def _excuse_of_value(path: str, before: Any, after: Any) -> str:
 
 _OR_NOTHING = ("gains", "integral", "estimator", "task", "forces", "effort_limit", "friction")
 """Keys that may hold nothing."""
-
-
-def _is_constant(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
 
 
 def _bad_structure(choice: random.Random, folder: Path) -> BadInput:
@@ -261,16 +250,28 @@ def _excuse_of_attribute(element: str, name: str, new: str) -> str:
 
 
 def _spoiled(text: str, pieces: tuple[str, ...], choice: random.Random) -> tuple[str, str]:
-    """A text that ends too early, or lacks or has something in the middle."""
-    place = choice.randrange(len(text))
-    how = choice.choice(("cut", "gap", "insert"))
+    """A text with a piece more, or damaged."""
+    if choice.random() < 0.33:
+        place, piece = choice.randrange(len(text)), choice.choice(pieces)
+        return text[:place] + piece + text[place:], f"{piece!r} at {place}"
+    data, how = _damaged(text.encode(), choice)
+    return data.decode("utf-8", errors="replace"), how
+
+
+def _damaged(data: bytes, choice: random.Random) -> tuple[bytes, str]:
+    """Bytes that end too early, or lack, have or change something in the middle."""
+    place = choice.randrange(max(1, len(data)))
+    how = choice.choice(("cut", "gap", "insert", "change", "twice"))
     if how == "cut":
-        return text[:place], f"cut at {place}"
+        return data[:place], f"cut at {place}"
+    if how == "twice":
+        return data + data, "twice"
     if how == "gap":
         end = place + choice.randrange(1, 40)
-        return text[:place] + text[end:], f"without {text[place:end]!r} at {place}"
-    piece = choice.choice(pieces)
-    return text[:place] + piece + text[place:], f"{piece!r} at {place}"
+        return data[:place] + data[end:], f"without {data[place:end]!r} at {place}"
+    some = bytes(choice.randrange(256) for _ in range(choice.randint(1, 4)))
+    rest = data[place:] if how == "insert" else data[place + len(some) :]
+    return data[:place] + some + rest, f"{how} {some!r} at {place}"
 
 
 def _shipped(choice: random.Random) -> Any:
@@ -310,3 +311,176 @@ def _written(data: Any, folder: Path) -> Path:
         text = yaml.safe_dump(data)
     path.write_text(text)
     return path
+
+
+# Files and commands.
+
+SIZES = ("(1000000, 1000000)", "(-3, 3)", "(3,)", "()", "(3, 3, 3)", "(2, 10)", "'a'", "(1e3, 3)")
+KINDS = ("<f8", "<f4", "<i2", "<c16", "|b1", "<U4", "|O", "<M8[s]", "nonsense", "<f16")
+
+
+def file_attempt(seed: int, folder: Path) -> Outcome:
+    """Reads a bad robot or record, or runs a bad command."""
+    choice = random.Random(seed)
+    return choice.choices((_any_robot, _record, _command), (4, 2, 5))[0](choice, folder)
+
+
+def _read(what: str, read: Callable[[], object], excuse: str) -> Outcome:
+    with checked(what) as outcome:
+        read()
+        outcome.accepted(excuse)
+    return outcome
+
+
+def _any_robot(choice: random.Random, folder: Path) -> Outcome:
+    """An SDFormat, MJCF, URDF or directives file with something damaged, or with a loop."""
+    file = choice.choice(
+        (
+            ROBOTS / "five_bar.sdf",
+            ROBOTS / "leaning_arm.xml",
+            FOLDER / "models" / "three_fingers.dmd.yaml",
+            FOLDER / "models" / "boom.urdf",
+            FOLDER / "models" / "held_box.urdf",
+        )
+    )
+    text = file.read_text("utf-8")
+    numbers = [i for i, word in enumerate(text.split(" ")) if any(c.isdigit() for c in word)]
+    how = choice.choice(("damage", "damage", "number", "number", "line", "include"))
+    if how == "number" and numbers:
+        words = text.split(" ")
+        place, new = choice.choice(numbers), choice.choice(NUMBERS)
+        words[place], how = new, f"{words[place][:20]!r} becomes {new[:8]!r}"
+        text = " ".join(words)
+    elif how == "include":
+        loops = {
+            ".sdf": "<include><uri>package://mine/robot.sdf</uri></include>",
+            ".xml": '<include file="robot.xml"/>',
+        }
+        place = text.rfind("</")
+        text = text[:place] + loops.get(file.suffix, "<include/>") + text[place:]
+    else:
+        text, how = _spoiled(text, URDF_PIECES, choice)
+    name = "robot" + "".join(file.suffixes)
+    (folder / name).write_text(text, "utf-8")
+    (folder / "package.xml").write_text("<package format='2'><name>mine</name></package>")
+
+    def read() -> None:
+        plant, _ = read_robot(Robot(file=str(folder / name)))
+        finalize(plant)
+
+    return _read(f"{file.name}: {how}", read, "what is left is a robot")
+
+
+def _record(choice: random.Random, folder: Path) -> Outcome:
+    """A record that is damaged, or whose arrays claim what they do not hold."""
+    file = folder / "record.npz"
+    Record(np.arange(3.0), {}).save(file)
+    how = choice.choice(("damage", "damage", "member", "rows"))
+    if how == "rows":
+        head = choice.choice(("[" * 9999, '{"signals": 1}', '{"signals": {"a": [[1]]}}', "{}", "{"))
+        file.write_bytes(head.encode() + b"\n" + bytes(100))
+    elif how == "member":
+        size, kind = choice.choice(SIZES), choice.choice(KINDS)
+        order = choice.random() < 0.2
+        text = f"{{'descr': '{kind}', 'fortran_order': {order}, 'shape': {size}, }}".encode()
+        text = text.ljust(117) + b"\n"
+        data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(160)
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr("time.npy", data)
+    else:
+        data, how = _damaged(file.read_bytes(), choice)
+        file.write_bytes(data)
+    return _read(f"record: {how}", lambda: Record.load(file), "what is left is a record")
+
+
+WORDS = (
+    "two_link_wall",
+    "no_such",
+    "",
+    ".",
+    "/dev/zero",
+    "a\u00e9",
+    "--set",
+    "--set=duration=0.01",
+    "--set=duration=-1",
+    "--set=duration=1e400",
+    "--set=duration=1_0",
+    "--set=a.b=1",
+    "--set==",
+    "--set=sampling={period: 0.001, delay: 1.0e+6}",
+    "--set=write={}",
+    "--set=start={}",
+    "--set=references={tool.z: !Csv {file: /dev/zero, columns: [z]}}",
+    '--set=constraints.0.name="\\ud800"',
+    "--out=",
+    "--out",
+    "--out=results",
+    "--out=/dev/null/a",
+    "--json",
+    "--check",
+    "--rollout",
+    "--force",
+    "--nonsense",
+    "-h",
+    "--surface=plane",
+    "--surface=cube",
+    "--tip=a:1,2,nan",
+    "--tip=a:1_0,2,3",
+    "--tip=:1,2,3",
+    "--path",
+)
+
+VARY = (
+    "start.errors.tool.z=-1e308..1e308:3",
+    "start.errors.tool.z=0..1e300:2",
+    "law.gains.all=[]",
+    "a=",
+    "=",
+    "sensors.force.seed=0..1e300",
+    "duration=1..0:3",
+    "duration=1..2",
+    "law.gains.all=0..1:999999999",
+    "x=[1, [2]]",
+    "plant.parameters.no=[1]",
+    "duration=[nothing, 1]",
+    "duration=[[[[1]]]]",
+    "duration=nan..1:2",
+)
+
+
+def _command(choice: random.Random, folder: Path) -> Outcome:
+    """A command line with random words, as far as it goes in a moment."""
+    command = choice.choice(
+        ("simulate", "analyze", "sweep", "plot", "play", "new", "print", "list", "export")
+    )
+    words = [command, *choice.sample(WORDS, choice.randint(0, 3))]
+    if command == "sweep":
+        words += [
+            f"--vary={choice.choice(VARY)}",
+            *choice.choice(([], ["--random=2"], ["--together"])),
+        ]
+    if command in ("simulate", "export") and not any(w.startswith("--out") for w in words):
+        words.append("--out=results")
+    if command in ("simulate", "sweep", "analyze", "export"):
+        quick = ["--set=duration=0.01", "--set=write={plots: false, animation: false}"]
+        words[1:1] = ["two_link_wall", *quick] if choice.random() < 0.7 else quick
+    told, here = io.StringIO(), os.getcwd()
+    with checked(f"drake-dae {' '.join(words)}"[:200]) as caught:
+        os.chdir(folder)
+        try:
+            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+                code = main(words)
+        except SystemExit as error:
+            code = error.code
+        finally:
+            os.chdir(here)
+        text = told.getvalue()
+        if code == 0:
+            caught.text = "a command that makes sense"
+        elif code in (1, 2) and ("error: " in text or "PROBLEM" in text):
+            caught.kind, caught.text = REFUSED, text[-200:]
+        elif code == 2 and "--check" in words:
+            caught.text = "it missed its task"
+        else:
+            caught.kind, caught.text = RAW, f"exit code {code}: {text[-200:]}"
+    return caught

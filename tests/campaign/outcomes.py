@@ -33,39 +33,28 @@ OFF = 1e-4
 
 @dataclass
 class Outcome:
-    """How an attempt ended.
-
-    Attributes:
-        what: What was attempted.
-        kind: One of CLASSES.
-        text: The message, or why it was accepted.
-        residual, off: The largest constraint residual, and the largest deviation of the error from
-            its prediction beside the largest output; NaN if it did not run.
-    """
+    """How an attempt ended: what it was, one of CLASSES, and the message or why it was accepted."""
 
     what: str
     kind: str = RESULT
     text: str = ""
-    residual: float = np.nan
-    off: float = np.nan
 
     def figures(self, record: Record, predicted: np.ndarray | None, is_ideal: bool = True) -> None:
         """Judges the numbers of a run; no prediction is compared with if it is None.
 
         Contact that gives way, which is not ideal, leaves a residual.
         """
-        residual = record["constraint_residual"]
-        self.residual = float(np.max(np.abs(residual), initial=0.0))
+        residual = float(np.max(np.abs(record["constraint_residual"]), initial=0.0))
         finite = all(np.all(np.isfinite(signal.values)) for signal in record.signals.values())
-        self.off = 0.0
+        off = 0.0
         if predicted is not None:
             # Outputs of one kind share a scale: the largest of any, as springs mix them.
             size = max(1.0, float(np.max(np.abs(record["controlled_output"]), initial=0.0)))
-            self.off = float(np.max(np.abs(record["tracking_error"] - predicted)) / size)
-        kept = self.residual <= RESIDUAL or not is_ideal
-        if not (finite and kept and self.off <= OFF):
+            off = float(np.max(np.abs(record["tracking_error"] - predicted)) / size)
+        kept = residual <= RESIDUAL or not is_ideal
+        if not (finite and kept and off <= OFF):
             self.kind = WRONG
-            self.text = f"finite {finite}, residual {self.residual:.2g}, off {self.off:.2g}"
+            self.text = f"finite {finite}, residual {residual:.2g}, off {off:.2g}"
 
     def accepted(self, excuse: str) -> None:
         """Says why a bad input may run."""

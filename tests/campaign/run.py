@@ -15,12 +15,12 @@ from pebble import ProcessExpired, ProcessPool
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 
-from campaign import bad_files, bad_inputs, random_robots, random_tasks
+from campaign import bad_inputs, random_robots, random_tasks
 from campaign.outcomes import BAD, CLASSES, HANG, RESULT, Outcome
 
 ATTEMPTS = {
-    "inputs": (bad_inputs.attempt, 1500, 30.0),
-    "files": (bad_files.attempt, 1000, 30.0),
+    "inputs": (bad_inputs.scenario_attempt, 1500, 30.0),
+    "files": (bad_inputs.file_attempt, 1000, 30.0),
     "robots": (random_robots.attempt, 500, 30.0),
     "tasks": (random_tasks.attempt, 1000, 300.0),
 }

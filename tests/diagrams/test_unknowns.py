@@ -7,9 +7,8 @@ from pydrake.math import RollPitchYaw
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
-from drake_dae import build_scenario, rollout
+from drake_dae import build_scenario
 from drake_dae.errors import ScenarioError
-from drake_dae.running import start_values
 from drake_dae.scenario.model import scenario_model
 
 W = 25.0
@@ -132,20 +131,3 @@ def test_surface_may_be_tilted():
 def test_what_is_not_there_is_refused(settings, message):
     with pytest.raises(ScenarioError, match=message):
         build_scenario(two_link(*CONTACT, settings))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "unknown",
-    [
-        "plant.payloads=[{frame: tool, mass: 0.5}]",
-        "plant.disturbances=[{frame: tool, force: [0, 0, 10], start_time: 0.05, end_time: 0.15}]",
-    ],
-)
-def test_rollouts_have_what_the_law_does_not_know(unknown):
-    """An accuracy of 1e-6 a step, of which some hundred go to round-off or to the poles."""
-    settings = unknown, "duration=0.2"
-    loop, context = build_scenario(two_link(*settings))
-    found = rollout(loop, *start_values(loop, context), [0.0, 0.1, 0.2])[0].record
-    _, _, record = run_scenario(two_link(*settings))
-    assert_allclose(found["state"][-1], record["state"][-1], atol=1e-6)

@@ -145,22 +145,21 @@ def test_pages_are_in_the_contents():
     assert {named(page) for page in pages()[1:]} <= listed
 
 
-@pytest.mark.parametrize("page", [pytest.param(p, id=named(p)) for p in pages() if has_code(p)])
-def test_notebook_has_what_the_page_runs_in_its_order(page):
-    cells = json.loads(notebook(page))["cells"]
-    code = iter("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
-    for block in blocks(page):
-        if block.language == "python":
-            assert block.text.rstrip("\n") in code  # Which goes on from there.
-        elif block.language == "console":
-            first = block.text.splitlines()[0].removeprefix("$ ")
-            assert any(cell.startswith(f"!{first}") for cell in code)
-    prose = "".join(cell["source"] for cell in cells if cell["cell_type"] == "markdown")
-    titles = re.findall(
-        r"^#+ .*", re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=MARKED), re.MULTILINE
-    )
-    assert [title for title in titles if title not in prose] == []
-    assert ".md)" not in prose
+def test_a_notebook_has_what_its_page_runs_in_its_order():
+    for page in filter(has_code, pages()):
+        cells = json.loads(notebook(page))["cells"]
+        code = iter("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+        for block in blocks(page):
+            if block.language == "python":
+                assert block.text.rstrip("\n") in code, page  # Which goes on from there.
+            elif block.language == "console":
+                first = block.text.splitlines()[0].removeprefix("$ ")
+                assert any(cell.startswith(f"!{first}") for cell in code), page
+        prose = "".join(cell["source"] for cell in cells if cell["cell_type"] == "markdown")
+        text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=MARKED)
+        titles = re.findall(r"^#+ .*", text, re.MULTILINE)
+        assert [title for title in titles if title not in prose] == [], page
+        assert ".md)" not in prose, page
 
 
 def test_every_public_name_is_used_in_a_page_or_an_example_that_runs():

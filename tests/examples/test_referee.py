@@ -63,15 +63,14 @@ def test_drake_dae_has_twelve_digits_of_all_forces(name, stated):
     assert cell.digits >= 12
 
 
+QUICK = ("pendulum", "four_bar", "sliding_rod", "rolling_ball", "gears")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pendulum", "four_bar", "sliding_rod", "rolling_ball", "gears"])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.thorough] * (n not in QUICK)) for n in MOVING]
+)
 def test_drake_dae_has_ten_digits_after_a_motion(name, stated, moved):
-    assert compare_motion(ours, MECHANISMS[name], stated, moved).digits >= 10
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("name", MOVING)
-def test_drake_dae_has_ten_digits_after_each_motion(name, stated, moved):
     assert compare_motion(ours, MECHANISMS[name], stated, moved).digits >= 10
 
 

@@ -1,4 +1,4 @@
-"""Lines, circles and spirals: where they go, how fast, and that they rest at both ends."""
+"""Lines and circles: where they go, how fast, and that they rest at both ends."""
 
 from math import factorial
 
@@ -7,7 +7,7 @@ import pytest
 
 from drake_dae import CircleReference, LineReference
 from drake_dae.errors import ReferenceSignalError
-from drake_dae.references import PathLimits, SpiralReference
+from drake_dae.references import PathLimits
 
 LIMITS = PathLimits(0.2, 1.0, 8.0)
 
@@ -18,8 +18,6 @@ MEMBERS = {
     "smooth line": LineReference([0.0], [0.1], LIMITS, 0.3, order=7),
     "turns": CircleReference([0.5, 0.1], 0.1, limits=LIMITS, turns=-1.5, phase=0.4, start_time=0.3),
     "tight turn": CircleReference([0.5, 0.1], 0.01, limits=LIMITS, start_time=0.3, order=6),
-    "outward": SpiralReference([0.5, 0.1], 0.0, 0.1, 0.03, LIMITS, 0.4, 0.3),
-    "inward": SpiralReference([0.5, 0.1], 0.1, 0.02, 0.03, LIMITS, 0.4, 0.3, order=3),
 }
 
 
@@ -77,21 +75,6 @@ def test_a_line_takes_as_long_as_by_hand():
     np.testing.assert_allclose(quarter[1::2], [0.06, 0.08], atol=1e-15)
 
 
-@pytest.mark.parametrize("name", ["outward", "inward"])
-def test_turns_of_a_spiral_are_a_pitch_apart(name):
-    path = MEMBERS[name]
-    points = course(path)[:, :, 0] - [0.5, 0.1]
-    radius = np.linalg.norm(points, axis=1)
-    assert radius[0] == pytest.approx(path.start_radius, abs=1e-14)
-    assert radius[-1] == pytest.approx(path.end_radius, abs=1e-14)
-    shown = radius > 1e-6  # At the center there is no angle.
-    angle = np.unwrap(np.arctan2(points[shown, 1], points[shown, 0]))
-    np.testing.assert_allclose(np.ptp(radius[shown] - 0.03 * angle / (2 * np.pi)), 0, atol=1e-12)
-    speed = np.linalg.norm(course(path)[:, :, 1], axis=1)
-    even = speed[speed.size // 4 : -speed.size // 4]
-    assert even.min() > 0.7 * even.max()
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -104,8 +87,6 @@ def test_turns_of_a_spiral_are_a_pitch_apart(name):
         (lambda: CircleReference([0, 0, 0], 1.0, 2.0), r"center.*\(2,\)"),
         (lambda: CircleReference([0, 0], -1.0, 2.0), r"radius.*-1"),
         (lambda: CircleReference([0, 0], 1.0, 0.0), "period"),
-        (lambda: SpiralReference([0, 0], 1.0, 1.0, 0.1, LIMITS), "start_radius"),
-        (lambda: SpiralReference([0, 0], 0.0, 1.0, 0.0, LIMITS), r"pitch.*0"),
         (lambda: CircleReference([0, 0], 1.0, 2.0).travel, "limits"),
         (
             lambda: LineReference([1.0], [2.0], LIMITS, order=3).derivatives([4]),

@@ -62,7 +62,7 @@ def test_constraints_that_nothing_meets_name_the_argument(tmp_path):
         RobotModel.from_multibody(plant, [pin])
 
 
-@pytest.mark.parametrize("off", [0.0, 1e-12, 1e-9])
+@pytest.mark.parametrize("off", [0.0, 1e-9])
 @pytest.mark.parametrize("cls", [WeldedFrames, RevoluteLoopJoint, PrismaticLoopJoint])
 def test_frames_that_are_half_a_turn_off_are_turned_to_each_other(cls: type, off: float):
     """The rotations of these constraints have poles there, which no step shows."""

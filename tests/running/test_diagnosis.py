@@ -1,16 +1,12 @@
 """Ends of runs say their cause: singular states, paths out of reach, wires, limits, stiffness."""
 
-import os
 import re
-import signal
-import threading
-import time
 import warnings
 
 import numpy as np
 import pytest
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder
 from runs import scenario
 
 from drake_dae import DaePlant, DaeSystem, simulate
@@ -132,34 +128,3 @@ def test_a_stiff_loop_says_so_and_an_implicit_scheme_is_silent():
     (text,) = told("runge_kutta3", 6.0)
     assert "radau3" in text
     assert told("radau3", 0.1) == []
-
-
-class Endless(LeafSystem):
-    """Its derivative takes as long as it is asked for."""
-
-    def __init__(self):
-        super().__init__()
-        self.DeclareContinuousState(1)
-        self.calls = 0
-
-    def DoCalcTimeDerivatives(self, context, derivatives):
-        self.calls += 1
-        if self.calls > 5:
-            time.sleep(0.2)
-        derivatives.SetFromVector([-1.0])
-
-
-@pytest.mark.slow
-def test_a_signal_ends_a_step_that_lasts():
-    """Radau's step takes some 2 s here: it is left, and the last accepted state is kept."""
-    block = Endless()
-    context = block.CreateDefaultContext()
-    config = SimulatorConfig(integration_scheme="radau3", max_step_size=1.0)
-    sender = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGTERM))
-    sender.start()
-    run = simulate(block, context, 1000.0, config)
-    assert run.interrupted == signal.SIGTERM
-    assert run.wall_time < 3.0
-    assert context.get_time() == run.simulated_time
-    state = context.get_continuous_state_vector().CopyToVector()
-    assert state == pytest.approx(-run.simulated_time)

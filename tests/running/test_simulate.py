@@ -111,10 +111,9 @@ def test_settings_are_checked(settings, message):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["two_link_wall", "two_link_measured_force"])
-def test_a_second_run_of_a_context_is_a_record_of_its_own(name):
+def test_a_second_run_of_a_context_is_a_record_of_its_own():
     """It begins at its start_time again, from the state that the first one ended in."""
-    chosen = scenario(name, "duration=0.2")
+    chosen = scenario("two_link_measured_force", "duration=0.2")
     loop, context = build_scenario(chosen)
     simulate(loop.diagram, context, 0.2, chosen.integrator)
     first = loop.record(context)

@@ -1,11 +1,12 @@
 """What is told about a run, as text, as data and as figures, of a record made by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from arms import arm
 
 from drake_dae import Record, Signal
-from drake_dae.analysis import LimitKind, SignalRange, robot_limits
+from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
 from drake_dae.running.judgement import judge
 from drake_dae.running.simulate import RunStatistics
@@ -104,14 +105,18 @@ def test_cut_off_controls_say_for_how_long():
     assert row[-2:] == ["0.4", "s"]
 
 
-def test_identified_parameters_with_what_the_motion_does_not_excite():
-    signals = [("wall.friction", ""), ("load.mass", "kg")]
+def test_identified_parameters_that_differ_from_the_law_or_that_are_named():
+    signals = [("wall.friction", ""), ("wall.rpy[1]", "rad"), ("load.mass", "kg")]
     found = record(
-        identified=([[0.5, 1.0], [0.3, 1.0], [0.25, 1.0]], signals),
-        identified_deviation=([[0.2, 1.0], [0.1, 1.0], [0.01, 0.9]], signals),
+        identified=([[0.5, 0.0, 1.0], [0.3, 0.0, 1.0], [0.25, 0.015, 1.0]], signals),
+        identified_deviation=([[0.2, 0.1, 1.0], [0.1, 0.1, 1.0], [0.01, 0.01, 0.9]], signals),
     )
     text = summary(found).text
     assert "wall.friction = 0.25 +- 0.01" in text
+    assert "wall.rpy[1]" not in text  # It is within two deviations of the 0 before.
+    assert "load.mass" not in text
+    text = replace(summary(found), named=["wall.rpy", "load.mass"]).text
+    assert "wall.rpy[1] = 0.015 +- 0.01 rad" in text
     assert "load.mass: this motion" in text
 
 
@@ -133,19 +138,4 @@ def test_figures_by_hand():
         "margin of q2 [rad]": pytest.approx(-0.2),
         "largest residual": 4.44e-11,
         "end [s]": 1.0,
-    }
-
-
-def test_limits_of_a_robot():
-    limits = robot_limits(arm("two_link").model)
-    pairs = zip(limits.signals, limits.bounds.T, strict=True)
-    found = {signal.name: tuple(pair) for signal, pair in pairs}
-    assert found == {
-        "joint1_motor": (-300.0, 300.0),
-        "joint2_motor": (-120.0, 120.0),
-        "joint1": (-3.1416, 3.1416),
-        "joint2": (-2.7925, 2.7925),
-        "joint1_w": (-3.0, 3.0),
-        "joint2_w": (-3.0, 3.0),
-        "wall.force": (0.0, np.inf),
     }

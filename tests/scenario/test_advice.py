@@ -178,8 +178,8 @@ def test_scenario_as_run_says_all_and_needs_no_advice(tmp_path):
 def test_run_reports_its_advice_and_what_it_identified(tmp_path, capsys):
     out = tmp_path / "run"
     write = "write={record: false, plots: false, animation: false}"
-    command = ["simulate", "wall_point_contact", "--out", str(out)]
-    assert main([*command, "--set", "duration=0.1", "--set", write]) == 0
+    command = ["simulate", "wall_point_contact", "--out", str(out), "--set", "duration=0.1"]
+    assert main([*command, "--set", "plant.friction=0.35", "--set", write]) == 0
     assert "recommended for a contact of 1e+05 N/m" in capsys.readouterr().out
     told = (out / "summary.txt").read_text()
     assert "recommended for a contact of 1e+05 N/m" in told
@@ -207,6 +207,37 @@ def test_nothing_is_advised_behind_springs():
     with pytest.raises(ScenarioError, match="gains: ") as told:
         build_completed(found)
     assert "wall_flexible_contact" in str(told.value)
+
+
+def test_friction_that_jams_the_contact_is_told():
+    """mu A_nt = A_nn at the start, which the path hardly leaves, in one direction of sliding."""
+    wave = "!Sinusoids {offset: 0.3, amplitudes: [0.005], frequencies: [3]}"
+    moves = f"references={{tool.z: {wave}, wall.force: 20}}"
+    given = "constraints.0.friction=0", "duration=2.1", moves
+    completed, loop = build_completed(two_link(*given, "plant.friction=1.3"))
+    known = numbers("two_link", loop.plant.structure.states[0][:2], np.zeros(2))
+    moved = np.linalg.solve(known.mass, known.constraint_jacobian[0])
+    critical = abs(known.constraint_jacobian[0] @ moved / (known.output_jacobian[0] @ moved))
+    told = re.search(r"wall\.friction of (\S+) or more", completed.notes[1])
+    assert float(told[1]) == pytest.approx(critical, rel=0.1)
+    free, _ = build_completed(two_link(*given, f"plant.friction={0.8 * critical}"))
+    assert len(free.notes) == 1
+
+
+@pytest.mark.slow
+def test_gains_without_a_margin_are_told():
+    """Of half the stiffness, for which twice of it are stable; stiffer ones are refused."""
+    sensed = "sensors.encoders={resolution: 1.0e-5}", "sampling={period: 4.0e-3, delay: 4.0e-3}"
+
+    def built(stiffness: float):
+        return build_completed(two_link(*sensed, f"plant.stiffness={stiffness}"))[0]
+
+    assert "stiffer than stated" not in built(2e5).notes[0]
+    bare = built(4e5)
+    assert "stiffer than stated" in bare.notes[0]
+    assert bare.scenario.law.gains == built(2e5).scenario.law.gains
+    with pytest.raises(ScenarioError, match=r"law\.gains: .*8e\+05"):
+        built(8e5)
 
 
 def test_ideal_plants_are_not_advised():

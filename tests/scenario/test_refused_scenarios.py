@@ -64,27 +64,12 @@ def test_texts(text, words, tmp_path):
     assert [word for word in words if word not in message] == [], message
 
 
-SPHERE = "constraints.0.surface=!Sphere"
-
-
 SINES = "references.wall.force=!Sinusoids"
-
-
 MOVE = "references.tool.z=!PointToPoint"
-
-
 WELD = "constraints.0=!WeldedFrames {frame_a: world,"
-
-
 PIN = "constraints.0=!CoincidentPoints {frame_a: world, point_a: [1.2, 0, 0], frame_b: link2,"
-
-
 ALONG = "outputs.0=!SurfaceCoordinates"
-
-
 SPRINGS = "actuation=[!FlexibleJoints {inertia: 1, stiffness:"
-
-
 WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"
 
 
@@ -165,34 +150,6 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
 def test_refused_with_key_value_and_remedy(settings, words):
     message = refusal(*([settings] if isinstance(settings, str) else settings))
     assert [word for word in words if word not in message] == [], message
-
-
-def test_all_problems_are_reported_at_once():
-    """Also below a wrong key, in several entries of a list, and beside a missing key."""
-    message = refusal(
-        "outputs.0.axs=z",
-        "outputs.0.frame=3",
-        "start.errors={tool.z: a, b: c}",
-        "duration=.nan",
-        "write.plots=maybe",
-    )
-    assert [line.split(": ")[0] for line in message.splitlines()] == [
-        *["outputs.0.frame", "outputs.0"],
-        *["start.errors.tool.z", "start.errors.b"],
-        *["duration", "write.plots"],
-    ]
-    message = refusal(f"{SPHERE} {{center: [0, 0], radius: big, side: 1, inside: 0}}")
-    assert [line.split(": ")[0].rpartition(".")[2] for line in message.splitlines()] == [
-        *["center", "radius", "inside", "surface"],
-    ]
-    # What a class refuses itself, in several places.
-    message = refusal(
-        f"{SPHERE} {{center: [0, 0, 0], radius: -1}}",
-        "outputs.0.axes=zz",
-        f"{MOVE} {{start: [1], end: [2], end_time: 0}}",
-    )
-    keys = [line.split(": ")[0] for line in message.splitlines()]
-    assert keys == ["constraints.0.surface", "outputs.0", "references.tool.z"]
 
 
 def test_a_file_that_is_not_there(tmp_path):

@@ -13,7 +13,7 @@ from drake_dae import (
     load_scenario,
 )
 from drake_dae.errors import ScenarioError
-from drake_dae.references import PathLimits, SpiralReference
+from drake_dae.references import PathLimits
 from drake_dae.scenario.scenario import save_scenario
 from drake_dae.scenario.shipped import find_scenario
 
@@ -24,9 +24,6 @@ FORMS = {
     "!Circle {center: [0, 1], radius: 0.1, period: 3}": CircleReference([0, 1], 0.1, 3.0),
     f"!Circle {{center: [0, 1], radius: 0.1, turns: -2, phase: 0.5, {GENTLE}}}": CircleReference(
         [0, 1], 0.1, limits=LIMITS, turns=-2.0, phase=0.5
-    ),
-    f"!Spiral {{center: [0, 1], start_radius: 0, end_radius: 0.1, pitch: 0.02, {GENTLE}}}": (
-        SpiralReference([0, 1], 0.0, 0.1, 0.02, LIMITS)
     ),
     f"!Polyline {{points: [[0, 0], [1, 0], [1, 1]], corner: 0.1, order: 3, {GENTLE}}}": (
         PolylineReference([[0, 0], [1, 0], [1, 1]], LIMITS, 0.1, order=3)
@@ -68,10 +65,6 @@ def refusal(form):
         (f"!Line {{start: [0.2], end: [[1]], {GENTLE}}}", ": end"),
         (f"!Line {{start: [0.2], end: [0.2], {GENTLE}}}", ": start and end"),
         ("!Circle {center: [0, 0], radius: 1, period: 2}", ": 2"),
-        (
-            f"!Spiral {{center: [0, 0], start_radius: 1, end_radius: 1, pitch: 1, {GENTLE}}}",
-            ": start_radius and end_radius",
-        ),
         (f"!Polyline {{points: [0, 1], corner: 1, {GENTLE}}}", ".points.0: "),
         (
             f"!Polyline {{points: [[0], [0]], corner: 0.1, {GENTLE}}}",

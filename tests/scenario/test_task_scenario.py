@@ -1,8 +1,10 @@
-"""Tasks in scenario files: the shipped one, its pictures, and what is refused."""
+"""Tasks in scenario files: told, touching, on a wall that moves, and what is refused."""
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from arms import parse
 from runs import some
 from scenario_texts import task_text
 
@@ -98,19 +100,6 @@ def test_what_does_not_fit_is_named_by_its_key(file, change, message):
         build_scenario(load_scenario(file, [change]))
 
 
-@pytest.mark.slow
-def test_a_rollout_of_a_task_reports_its_phases(file, tmp_path, capsys):
-    told = []
-    for number, more in enumerate(([], ["--rollout"])):
-        words = ["--set", "write.animation=false", "--out", str(tmp_path / f"run {number}")]
-        assert main(["simulate", str(file), *words, *more]) == 0
-        lines = capsys.readouterr().out.splitlines()
-        (first,) = [i for i, line in enumerate(lines) if line.startswith("0 s: Approach")]
-        told.append([line.split(";")[0] for line in lines[first : first + 4]])
-    assert told[0] == told[1]
-    assert ": done, after" in told[1][-1]
-
-
 def test_a_task_does_not_start_outside_of_limits(tmp_path):
     """A joint stands at 0 where nothing is said of it."""
     urdf = Path(shipped_model("two_link_arm.urdf")).read_text()
@@ -124,3 +113,73 @@ def test_a_task_does_not_start_outside_of_limits(tmp_path):
     file.write_text(words.replace("joint1: 1.1653, ", ""))
     with pytest.raises(ScenarioError, match=r"start: .*joint1 = 0 rad"):
         build_scenario(load_scenario(file))
+
+
+MOVING = """
+robot: {file: package://drake_dae_models/two_link_arm.urdf}
+constraints:
+- {name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}
+outputs: [{frame: tool, axes: z}]
+law:
+  gains: !Poles {all: [-20]}
+  constraint_damping: !Poles {all: [-250]}
+exogenous:
+  wall.position: [!Sinusoids {offset: 1.2, amplitudes: [0.02], frequencies: [3.0]}, 0, 0]
+plant: !CompliantContact {radius: 1.0e-5}
+task:
+  phases:
+  - !Approach {speed: 0.03}
+  - !Press {force: 15.0}
+  - !Move {references: {tool.z: 0.4, wall.force: 20}, duration: 1.0, over: 0.5}
+  - !Release {}
+  - !Retreat {distance: 0.03}
+start: {positions: {joint1: 1.1653, joint2: -1.8326}}
+duration: 4.5
+"""
+
+
+@pytest.fixture
+def moving(tmp_path):
+    path = tmp_path / "moving.yaml"
+    path.write_text(MOVING)
+    return path
+
+
+@pytest.mark.slow
+def test_a_task_follows_a_wall_that_moves(moving):
+    """The places of tool and wall by MultibodyPlant and by the sine.
+
+    20 N press it 0.2 mm into the wall, of 1e5 N/m; its steps of 1 ms leave some 10 um.
+    """
+    chosen = load_scenario(moving)
+    loop, context = build_scenario(chosen)
+    done = roll_scenario(chosen, loop, context)
+    record, changes = done.record, loop.changes(done.record)
+    names = ["Approach", "Press", "Move", "Release", "Retreat", "done"]
+    assert [change.phase for change in changes] == names
+    plant = parse("two_link_arm")
+    own, frame = plant.CreateDefaultContext(), plant.GetFrameByName("tool")
+    places = []
+    for state in record["state"]:
+        plant.SetPositions(own, state[: plant.num_positions()])
+        places.append(frame.CalcPoseInWorld(own).translation()[0])
+    gap = 1.2 + 0.02 * np.sin(3.0 * record.time) - np.array(places)
+    touch, leave, end = changes[1].time, changes[4].time, changes[5].time
+    touches = (record.time > touch) & (record.time < leave)
+    pressed = record["constraint_force"][touches, 0] / 1e5
+    np.testing.assert_allclose(gap[touches], -pressed, atol=1e-5)
+    moves = (record.time > changes[2].time + 0.7) & (record.time < changes[3].time)
+    np.testing.assert_allclose(record["tracking_error"][moves, 1], 0.0, atol=0.5)
+    np.testing.assert_allclose(gap[record.time > end], 0.03, atol=5e-5)
+    np.testing.assert_allclose(record["distance"][:, 0], gap, atol=1e-9)
+    # The speed of the touch is that towards the wall as it moves.
+    approach = (record.time > 0.8) & (record.time < touch)
+    np.testing.assert_allclose(
+        np.diff(gap[approach]) / np.diff(record.time[approach]), -0.03, atol=5e-3
+    )
+
+
+def test_a_task_does_not_begin_at_rest_on_a_wall_that_moves(moving):
+    chosen = load_scenario(moving, ["task.phases=[!Press {force: 15}]"])
+    with pytest.raises(ScenarioError, match="task"):
+        build_scenario(chosen)

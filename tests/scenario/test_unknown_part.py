@@ -11,7 +11,8 @@ from drake_dae import build_scenario, rollout
 from drake_dae.running import start_values
 
 DURATION = 12.1  # Until the part is polished.
-BALL = "plant=!CompliantContact {friction: 0.3, radius: 0.01}"
+PLACE = "part.position: [0.703, 0.003, 0.6026], part.rpy: [0.03, 0.06, -0.056]"  # As in the file.
+BALL = f"plant=!CompliantContact {{friction: 0.3, radius: 0.01, parameters: {{{PLACE}}}}}"
 
 
 def polished(*settings):

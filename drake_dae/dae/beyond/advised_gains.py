@@ -269,9 +269,8 @@ def advised_gains(
         if not most > 0.0:
             raise ModelError(f"{name} must be positive, got {most:g}")
     bounds = _Bounds(roughness, position_error, force_error)
-    phase = _PHASE / 2.0 if situation.estimates else _PHASE
-    highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
-    rates = np.geomspace(highest, highest / 60.0, 17).tolist()
+    highest = _highest(situation)
+    rates = _rates(highest)
     candidates = []
     for fast in _state_rates(situation, highest):
         found = _pair(situation, rates, fast, bounds)
@@ -297,6 +296,16 @@ def advised_gains(
         noise_force=contact.by_noise,
         roughness=float(np.hypot(free.roughness, contact.roughness)),
     )
+
+
+def _highest(situation: SensedContact) -> float:
+    """The largest w by the loss of phase."""
+    phase = _PHASE / 2.0 if situation.estimates else _PHASE
+    return phase / (3.0 * (situation.delay + 0.5) * situation.period)
+
+
+def _rates(highest: float) -> list[float]:
+    return np.geomspace(highest, highest / 60.0, 17).tolist()
 
 
 def _state_rates(situation: SensedContact, highest: float) -> Iterator[float | None]:
@@ -345,6 +354,17 @@ def _best(situation: SensedContact, parts: list[Part], allowed: float, most: flo
         if is_stable(situation, part):
             return part
     return None
+
+
+def settles_along(situation: SensedContact) -> bool:
+    """Whether any gains are stable along the contact with a margin."""
+    highest = _highest(situation)
+    return any(
+        is_stable(situation, contact_part(situation, w, fast, share))
+        for fast in _state_rates(situation, highest)
+        for w in _rates(highest)
+        for share in SLOWER
+    )
 
 
 def _reason(situation: SensedContact, rates: list[float], bounds: _Bounds, highest: float) -> str:

@@ -15,11 +15,8 @@ from drake_dae.errors import ModelError
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction
 
-DISTURBANCE = "disturbance"
-"""The name of the parameter."""
-
-_TINY = 1e-200
-"""The denominator where nothing slides or presses; the quotient is then not used."""
+DISTURBANCE = "disturbance"  # The name of the parameter.
+_TINY = 1e-200  # The denominator where nothing slides or presses; the quotient is then not used.
 
 
 @checked(ModelError)
@@ -35,16 +32,8 @@ def with_disturbance(
     through the port `exogenous` of its controller; see `StateEstimator`. With d = 0 it is the
     law of the original system.
 
-    Args:
-        system: The system, as a robot's `RobotModel.dae`.
-        states: The names of the states whose rates contain d, for a robot those of v.
-        frictions: The names of parameters that are observed as well: coefficients of friction, such
-            as "wall.friction", and others with bounds or `ranges` of `Observing`. They become
-            exogenous signals.
-
-    Raises:
-        ModelError: A name is not that of a state or parameter, or occurs twice; or the system
-            already has a parameter "disturbance".
+    `frictions` are the names of parameters that are observed as well: coefficients of friction,
+    such as "wall.friction", and others with bounds or `ranges` of `Observing`.
     """
     names = [signal.name for signal in system.state_signals]
     for name in states:
@@ -61,18 +50,11 @@ def with_disturbance(
     parameter = Parameter(DISTURBANCE, np.zeros(len(rows)), exogenous=True)
     force = ca.SX(system.num_states, 1)
     force[rows] = parameter.symbol
-    inner = system.implicit
-
-    def implicit(rate: ca.SX, constraint_input: ca.SX) -> tuple[ca.SX, ca.SX]:
-        assert inner is not None
-        balance, constraint_rate = inner(rate, constraint_input)
-        return balance - force, constraint_rate
-
     return replace(
         system,
         f=system.f + force,
         parameters=(*system.parameters, parameter),
-        implicit=None if inner is None else implicit,
+        implicit=system.implicit_with(lambda rate: -force),
         state_scale=system.scale,
     ).with_exogenous(frictions)
 
@@ -80,11 +62,7 @@ def with_disturbance(
 def estimated_within(
     parameters: Sequence[Parameter], ranges: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """The lowest and highest values between which estimation starts: bounds, or a deviation.
-
-    Raises:
-        ModelError: A parameter has neither.
-    """
+    """The lowest and highest values between which estimation starts: bounds, or a deviation."""
     low, high = [np.zeros(0)], [np.zeros(0)]
     for p in parameters:
         if p.bounds is not None and np.all(p.low < p.high):
@@ -110,16 +88,15 @@ class IdentifiedTerms:
     An error delta = theta* - theta leaves the disturbance d = -G delta in the balance of the
     momentum p, where G is the derivative of p' - S^T (E' x + f + g v + h u) with respect to theta.
     An error of a surface leaves a distance phi(x) that is not zero in contact.
-    `slopes` is (x, u, v, parameters) -> the derivatives by theta of p, of its rate without inputs
-    and of the part from the inputs, (k, c) each; the distances phi that depend on theta, (j,), with
-    derivatives, (j, c), and second derivatives, one below the other, (j c, c). `pressed` are
-    the constraint inputs of these distances, `places` the indices in theta that they depend on.
     """
 
     parameters: tuple[Parameter, ...]
+    # (x, u, v, parameters) -> the derivatives by theta of p, of its rate without inputs and of the
+    # part from the inputs, (k, c) each; the distances phi that depend on theta, (j,), their
+    # derivatives, (j, c), and second derivatives, one below the other, (j c, c).
     slopes: TracedFunction
-    pressed: tuple[int, ...]
-    places: tuple[int, ...]
+    pressed: tuple[int, ...]  # The constraint inputs of these distances.
+    places: tuple[int, ...]  # The indices in theta that these distances depend on.
 
     @classmethod
     def of(

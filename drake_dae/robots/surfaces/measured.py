@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -16,19 +16,15 @@ from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, brief, numbers, positive, show, vector
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError
-from drake_dae.files import MESHES, check_file, read_mesh
+from drake_dae.files import MESHES, check_file, read_mesh, read_text
 from drake_dae.robots.surfaces.meshes import PosedShape, mesh_of_grid
 from drake_dae.robots.surfaces.surface import Pair, Surface, Vector, tangents
 
-CELLS, BEYOND = 16, 3
-"""The default number of bells along the longer side; bells beyond each edge, for a fit there."""
-
+CELLS, BEYOND = 16, 3  # Bells along the longer side, and beyond each edge, for a fit there.
+MOST_LENGTH = 1e9  # The largest height and length in m.
 LEAST, CALM = np.logspace(-8, -2, 7), 1.5
 """Relative singular values below which the data do not determine a component. The smallest is taken
 with which the surface stays near the plane beyond its edges: by CALM times the range of heights."""
-
-MOST_HEIGHTS, MOST_LENGTH = 10_000_000, 1e9
-"""The largest number of heights, and their largest size in m."""
 
 
 @checked(ModelError)
@@ -47,7 +43,7 @@ class MeasuredSurface(Surface):
         size: The lengths of the rectangle, m, shape (2,); None for all of a mesh.
         heights: Heights above the plane through `point`, shape (r, c): a row is along the first
             coordinate, and the rows follow each other along the second.
-        file: A file instead: a table (.csv, .npy), or a mesh for trimesh.
+        file: A file instead: a table (.csv), or a mesh for trimesh.
         point: The middle of a table, or the origin of a mesh, whose axes are the world's, m.
         normal: The direction of the heights and of the free side, of any length, shape (3,).
         scale: The length of a unit of the heights, or of the mesh, m.
@@ -78,8 +74,8 @@ class MeasuredSurface(Surface):
         if (self.heights is None) == (self.file is None):
             raise ModelError("give either heights, row by row, or a file with them")
         if self.heights is not None:
-            rows = tuple(map(tuple, _table("heights", self.heights).tolist()))
-            object.__setattr__(self, "heights", rows)
+            rows = _table("heights", self.heights).tolist()
+            object.__setattr__(self, "heights", tuple(map(tuple, rows)))
         _ = self.fit  # Data that cannot be read are told here.
 
     @property
@@ -102,10 +98,9 @@ class MeasuredSurface(Surface):
     @property
     def remark(self) -> str:
         source = f" '{Path(self.file).name}'" if self.file else ""
-        return (
-            f"MeasuredSurface{source} is off its data by at most {1e3 * self.fit.largest:.2g} mm; "
-            f"details finer than {1e3 * max(self.fit.widths):.2g} mm are smoothed away"
-        )
+        off, width = 1e3 * self.fit.largest, 1e3 * max(self.fit.widths)
+        smoothed = f"details finer than {width:.2g} mm are smoothed away"
+        return f"MeasuredSurface{source} is off its data by at most {off:.2g} mm; {smoothed}"
 
     def picture(self, center: ArrayLike, size: float) -> PosedShape:
         even = np.linspace(-0.5, 0.5, 3 * CELLS + 1)
@@ -165,7 +160,7 @@ def _bells(values: FloatArray, places: FloatArray, width: float) -> FloatArray:
 def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
     """The least-squares fit; kept as long as the file, of which the stamp tells, is the same."""
     if surface.file is not None and Path(surface.file).suffix.lower() in MESHES:
-        x, y, heights, distance = _mesh_heights(surface, Path(surface.file))
+        x, y, heights = _mesh_heights(surface, Path(surface.file))
     else:
         if surface.size is None:
             raise ModelError("a table of heights needs its size, two lengths in m")
@@ -173,9 +168,9 @@ def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
         heights = surface.scale * np.array(rows)
         counts = zip(surface.size, heights.shape[::-1], strict=True)
         x, y = (length * np.linspace(-0.5, 0.5, count) for length, count in counts)
-        distance = max(x[1] - x[0], y[1] - y[0], max(surface.size) / CELLS)
     if not (largest := float(np.max(np.abs(heights)))) <= MOST_LENGTH:
         raise ModelError(f"heights of up to {largest:.3g} m are no surface; is the scale right?")
+    distance = max(x[1] - x[0], y[1] - y[0], max(np.ptp(x), np.ptp(y)) / CELLS)
     flat = np.stack([np.ones_like(heights), 0 * heights + x, 0 * heights + y[:, None]], axis=-1)
     plane = np.linalg.lstsq(flat.reshape(-1, 3), heights.ravel())[0].astype(float)
     rest = heights - flat @ plane
@@ -212,24 +207,22 @@ def _fit(surface: MeasuredSurface, stamp: tuple[str, int, int] | None) -> _Fit:
 
 
 def _read_table(file: Path) -> FloatArray:
-    """The heights in a file, first row lowest."""
+    """The heights in a .csv file, first row lowest."""
     try:
-        if file.suffix.lower() == ".csv":
-            text = file.read_text(encoding="utf-8-sig")
-            mark = next((mark for mark in ";\t," if mark in text), None)
-            data: Any = np.loadtxt(text.splitlines(), delimiter=mark, ndmin=2)
-        else:
-            with file.open("rb") as stream:  # NumPy leaves a damaged archive open.
-                data = np.load(stream, allow_pickle=False)
-    except Exception as error:  # NumPy, whose headers are Python, raises many kinds.
-        text = f"'{file.name}' is no table of heights (.csv, .npy) and no mesh"
-        raise ModelError(f"{text} ({', '.join(MESHES)}): {brief(str(error))}") from None
-    return _table(f"'{file.name}'", data)
+        if file.suffix.lower() != ".csv":
+            raise ValueError("its name ends with neither")
+        text = read_text(file)
+        mark = next((mark for mark in ";\t," if mark in text), None)
+        rows = np.loadtxt(text.splitlines(), delimiter=mark, ndmin=2)
+    except (OSError, ValueError) as error:
+        what = f"'{file.name}' is no table of heights (.csv) and no mesh ({', '.join(MESHES)})"
+        raise ModelError(f"{what}: {brief(str(error))}") from None
+    return _table(f"'{file.name}'", rows)
 
 
-def _table(what: str, rows: Any) -> FloatArray:
+def _table(what: str, rows: ArrayLike) -> FloatArray:
     heights = numbers(f"{what}: heights", rows)
-    if heights.ndim != 2 or min(heights.shape) < 2 or heights.size > MOST_HEIGHTS:
+    if heights.ndim != 2 or min(heights.shape) < 2:
         raise ModelError(f"{what}: heights are two rows of two at least, got {heights.shape}")
     if not np.all(np.isfinite(heights)):
         row, column = np.argwhere(~np.isfinite(heights))[0] + 1
@@ -237,10 +230,8 @@ def _table(what: str, rows: Any) -> FloatArray:
     return heights
 
 
-def _mesh_heights(
-    surface: MeasuredSurface, file: Path
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Places x and y, the heights of a mesh there, and the default resolution."""
+def _mesh_heights(surface: MeasuredSurface, file: Path) -> tuple[FloatArray, ...]:
+    """Places x and y, and the heights of a mesh there, shape (len(y), len(x))."""
     vertices, triangles = read_mesh(file)
     axes = np.column_stack([*tangents(surface.normal), np.array(surface.normal)])
     vertices = surface.scale * vertices @ axes
@@ -248,8 +239,8 @@ def _mesh_heights(
     lengths = high - low if surface.size is None else np.array(surface.size)
     if not np.all((lengths > 0.0) & (lengths < MOST_LENGTH)):
         raise ModelError(f"the mesh is {show(lengths)} m wide, which is no surface of a robot")
-    distance = float(np.max(lengths)) / CELLS
-    counts = [2 * max(ceil(n / (surface.resolution or distance)), 4) + 1 for n in lengths]
+    distance = surface.resolution or float(np.max(lengths)) / CELLS
+    counts = [2 * max(ceil(n / distance), 4) + 1 for n in lengths]
     sides = zip((low + high) / 2, lengths, counts, strict=True)
     x, y = (middle + length * np.linspace(-0.5, 0.5, count) for middle, length, count in sides)
     corners, extent = vertices[triangles], float(np.max(np.ptp(vertices, axis=0)))
@@ -258,7 +249,7 @@ def _mesh_heights(
     facing = areas * np.linalg.det(axes) / extent**2  # A reflection turns all triangles.
     seen = facing > 1e-12 if np.any(facing > 1e-12) else facing < -1e-12
     lowest, highest = (end(corners[..., 1], axis=1) for end in (np.min, np.max))
-    heights = np.empty((len(y), len(x)))
+    heights, depth = np.empty((2, len(y), len(x)))
     for row, level in enumerate(y):
         crossed = seen & (lowest < level + 1e-9 * extent) & (highest > level - 1e-9 * extent)
         first, (one, other) = corners[crossed, 0], edges[crossed].swapaxes(0, 1)
@@ -268,12 +259,11 @@ def _mesh_heights(
         inside = (s > -1e-9) & (t > -1e-9) & (s + t < 1 + 1e-9)
         found = first[:, 2] + s * one[:, 2] + t * other[:, 2]
         heights[row] = np.max(found, axis=1, initial=-np.inf, where=inside)
-        depth = heights[row] - np.min(found, axis=1, initial=np.inf, where=inside)
-        for bad, what in (
-            (~np.isfinite(heights[row]), "has a hole; give a size that it covers"),
-            (depth > 1e-6 * extent, "overlaps itself; choose another normal or size"),
-        ):
-            if bad.any():
-                place = show([x[np.argmax(bad)], level])
-                raise ModelError(f"at {place} m across the normal the mesh {what}")
-    return x, y, heights, distance
+        depth[row] = heights[row] - np.min(found, axis=1, initial=np.inf, where=inside)
+    hole = "has a hole; give a size that it covers"
+    fold = "overlaps itself; choose another normal or size"
+    for bad, what in ((np.isinf(heights), hole), (depth > 1e-6 * extent, fold)):
+        for row, column in np.argwhere(bad)[:1]:
+            place = show([x[column], y[row]])
+            raise ModelError(f"at {place} m across the normal the mesh {what}")
+    return x, y, heights

@@ -135,10 +135,7 @@ class Controller(System):
         return {}
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared | None:
-        """The current outputs and their desired values, with their names; None if unknown.
-
-        `shown` has the value of a signal of the plant, such as "controlled_output".
-        """
+        """The outputs now and their desired values; `shown` has the value of a plant's signal."""
         port = self.GetInputPort("reference") if self.HasInputPort("reference") else None
         if port is None or not port.HasValue(context):
             return None
@@ -148,10 +145,7 @@ class Controller(System):
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
     ) -> FloatArray:
-        """The predicted tracking error, one row for each time of a record with these values.
-
-        `parameters` are those of the law's model at its start.
-        """
+        """The predicted tracking error, one row for each time of a record with these values."""
         raise NotImplementedError
 
     def changes(self, values: Mapping[str, FloatArray]) -> tuple[PhaseChange, ...]:

@@ -75,12 +75,8 @@ class ControlHold(TracedSystem):
         u(t) = control(t_k)    for    t_k + delay <= t < t_(k+1) + delay,    t_k = k period.
 
     The controller is evaluated only at samples. Before the first control acts, that of the start is
-    held, as if the robot had been at rest there.
-
-    The updates are unrestricted: so the controller sees time, state and reference at t_k, even if
-    a discrete MultibodyPlant steps at t_k. That plant uses the previously held control, and so sees
-    a delay longer by one of its steps. The output has no direct feedthrough. A first control that
-    depends on itself is a WiringError at the start.
+    held. A discrete MultibodyPlant that steps at t_k uses the previously held control, and so sees
+    a delay longer by one of its steps.
     """
 
     __slots__ = SHARED_DICTIONARY

@@ -117,15 +117,10 @@ class Plant(System):
     ) -> FloatArray:
         """Sets the state on N* next to a guess, and returns it.
 
-        Args:
-            context: The context of this plant.
-            guess: x, shape (n,): velocities that are not zero are kept where the constraints allow
-                it. Or name of a state -> its value, which is fixed; the others are near the nominal
-                state.
-            fixed: Names of further states that keep their values.
-
-        Raises:
-            InconsistentStateError: None is found near the guess, or none with these states fixed.
+        A guess is x, shape (n,), whose velocities that are not zero are kept where the constraints
+        allow it; or name of a state -> its value, which is fixed, others near the nominal state.
+        `fixed` are names of further states that keep their values. An InconsistentStateError says
+        that there is none.
         """
         parameters = self.current_parameters(context)
         if isinstance(guess, Mapping):

@@ -87,7 +87,7 @@ class DaePlant(ParameterizedSystem, Plant):
     def explained(
         self, error: SimulationError, values: Mapping[str, FloatArray]
     ) -> SimulationError:
-        """Returns the error with dependent constraints, or in a Painleve paradox its outcome."""
+        """Returns the error with dependent constraints, or as that of a Painleve paradox."""
         if not isinstance(error, SingularityError):
             return error
         parameters = values.get("parameters", np.zeros(0))
@@ -97,12 +97,7 @@ class DaePlant(ParameterizedSystem, Plant):
         if not self.dae.frictional_contacts:
             names = self.structure.dependent_constraints(error.state, parameters)
             return singular_configuration(self.dae.name, error.time, error.state, names)
-        control = values.get("input control", np.zeros(self.dae.num_controls))
-        derivatives = self.structure.derivatives
-        v = derivatives.expand(derivatives.constraint_input)  # (25)
-        force = self.structure.trace("force", self.dae.forces(v), True)
-        (lambdas,) = force(error.state, control, parameters)
-        return jammed_contact(self.structure, error, control, parameters, lambdas) or error
+        return jammed_contact(self.structure, error, parameters) or error
 
     def _check_start(self, context: Context) -> EventStatus:
         self.check_start(self.state(context), self._values(context))

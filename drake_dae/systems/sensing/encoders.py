@@ -109,12 +109,9 @@ class Encoders:
 class StateSensor(TracedSystem):
     """The state x = (q, v, ...) of a robot, measured by `Encoders`, for a law.
 
-    The measurement of t_k = k period is held until the next sample; entries of x after q and v are
-    not changed. At t_k itself the output is a function of the state at that instant, so that a law
-    sampled at t_k uses the measurement of t_k. Its updates are unrestricted, so that it sees that
-    instant even if a discrete MultibodyPlant steps then. Drake's DiscreteDerivative is not
-    suitable: its difference is one sample old, and it is updated after such a plant. The input
-    `noise` has deviation 1 for each of q and v, if the encoders have noise.
+    The measurement of t_k = k period is held until the next sample; at t_k itself the output is a
+    function of the state at that instant, which a law sampled then uses. Entries of x after q and v
+    are not changed.
     """
 
     __slots__ = SHARED_DICTIONARY

@@ -49,10 +49,7 @@ EARLY = 2e-12
 
 @cache
 def fading(order: int) -> FloatArray:
-    """Row k has the factors of 1, x, ..., x^(2 n + 1) of a polynomial, for the order n.
-
-    Its k-th derivative is 1 at 0, and all others up to n are 0 at 0 and at 1.
-    """
+    """Rows k: factors of 1, x, ..., x^(2 n + 1) whose derivative k alone, of n, is 1 at 0."""
     powers = np.arange(2 * order + 2)
     # Row j: the j-th derivatives of the powers at 1.
     at_end = np.array(
@@ -106,9 +103,8 @@ class Automaton:
 
         R(t) = goal(t) + base + rate t + faded(offset, t),
 
-    where base and rate are 0 for outputs with goals. Before the first sample the task has not
-    begun: the references are the present outputs. All values change at samples alone. `laws` are
-    that of the free robot, and that in contact.
+    where base and rate are 0 for outputs with goals; before the first sample, R is that of the
+    present outputs. `laws` are that of the free robot, and that in contact.
     """
 
     def __init__(
@@ -161,10 +157,7 @@ class Automaton:
         self.is_closed = ca.if_else(self.has_begun, law, float(self.task.contacts[0])) > 0.5
 
     def _filter(self) -> None:
-        """The low-pass of the forces of the contact, after their bias.
-
-        The bias is the mean of the samples before the first touch.
-        """
+        """The low-pass of the contact's forces minus their bias, the mean of the first samples."""
         size, own = self.contact.size, self.force[list(self.contact.forces)]
         low, bias, count = (
             self.held["filter"][i : i + n] for i, n in ((0, size), (size, size), (2 * size, 1))
@@ -183,11 +176,7 @@ class Automaton:
     # The references.
 
     def _goals_of(self, place: int) -> tuple[list[int], ca.SX, ca.SX, FloatArray]:
-        """The outputs with goals in a phase, R at its start and now, and the rates of the others.
-
-        With a goal for the force of several points, their differences of forces without goals go to
-        zero; with one for the first of their distances, the others go to the same.
-        """
+        """The outputs with goals in a phase, R at its start and now, and rates of the others."""
         phase, contact, is_closed = self.phases[place], self.contact, self.task.contacts[place]
         law = self.laws[int(is_closed)]
         names, where = [s.name for s in law.system.output_signals], self.task.where(place)
@@ -254,8 +243,7 @@ class Automaton:
     def _present(self, which: int, force: ca.SX | float) -> ca.SX:
         """R of a law from the present outputs, z_i, z_i', ...; zero for the highest derivatives.
 
-        A force of degree 0 is the measured one, and differences of forces of degree 0 are zero:
-        from an even pressure on, all points are pressed to the surface.
+        A force of degree 0 is the measured one; differences of such forces begin at zero.
         """
         law, main = self.laws[which], self.contact.main
         reference = ca.SX.zeros(law.layout.reference_size)
@@ -392,14 +380,12 @@ class Automaton:
     # The laws.
 
     def holds(self, which: int) -> ca.SX:
-        """Whether the integrals of a law do not move.
-
-        Those in contact also not while no force is measured, and not during the transition after a
-        touch: the force of an impact is no error.
-        """
+        """Whether the integrals of a law do not move."""
         waits = ca.logic_or(self.hold != 0, self.is_closed != (which == CONTACT))
         if which == FREE:
             return waits
+        # In contact also while no force is measured, and during the transition after a touch: the
+        # force of an impact is no error.
         least = self.contact.size * ca.mmin(self.each)
         settles = ca.logic_and(self.held["touched"], self.passed < self.held["over"])
         return ca.logic_or(waits, ca.logic_or(least < self.task.contact_force, settles))

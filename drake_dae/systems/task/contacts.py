@@ -17,15 +17,11 @@ FREE, CONTACT = 0, 1
 
 @dataclass(frozen=True)
 class OpeningContact:
-    """The contact of a task: one point, or several that open and close together.
+    """The contact of a task: one point, or several that open and close together."""
 
-    `places` are the outputs that are its forces, and its distances where it is open; `main` is the
-    one of them that is the sum of its forces; `forces` are its constraint forces.
-    """
-
-    places: tuple[int, ...]
-    forces: tuple[int, ...]
-    main: int
+    places: tuple[int, ...]  # the outputs that are its forces, or its distances where it is open
+    forces: tuple[int, ...]  # its constraint forces
+    main: int  # the output that is the sum of its forces
 
     @property
     def size(self) -> int:
@@ -43,10 +39,8 @@ def open_contact(system: DaeSystem, force: str | Sequence[str]) -> DaeSystem:
 
         x' = f + g_o v_o + h u,    0 = k_o(x),    z = (l_o(x) + m_o(x) v_o, k_i(x)),
 
-    where o are all constraints except those, i, with the named forces v_i: one, or those of several
-    points. These constraints do not hold, and the outputs that were their forces are
-    their distances k_i(x). State, controls, parameters and the order of the outputs do not change,
-    so that the laws of both systems can replace each other at any moment.
+    where o are all constraints except those, i, with the named forces: they do not hold, and the
+    outputs that were their forces are their distances k_i(x).
     """
     forces = [force] if isinstance(force, str) else list(force)
     names = [signal.name for signal in system.constraint_input_signals]

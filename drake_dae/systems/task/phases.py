@@ -82,23 +82,17 @@ class Condition:
 
 @dataclass(frozen=True)
 class Moment:
-    """The measurements that decide when a phase ends, as expressions of CasADi.
-
-    Those of `Condition`, of several points the sum of forces and the mean of distances; `rate` of
-    the distance in m/s, `wanted`, the reference of the force (in contact) or of the distance, and
-    `away`, the increase of the distance since the phase began, in m. `controls` and `signals` have
-    those that phases watch, "" the largest |u|.
-    """
+    """The measurements that decide when a phase ends, as expressions: those of `Condition`."""
 
     time: Any
-    force: Any
-    distance: Any
-    rate: Any
-    wanted: Any
-    away: Any = 0.0
+    force: Any  # of several points the sum
+    distance: Any  # of several points the mean
+    rate: Any  # of the distance, m/s
+    wanted: Any  # the reference of the force, in contact, or of the distance
+    away: Any = 0.0  # the increase of the distance since the phase began, m
     travel: Any = 0.0
     signals: Mapping[str, Any] = field(default_factory=dict)
-    controls: Mapping[str, Any] = field(default_factory=dict)
+    controls: Mapping[str, Any] = field(default_factory=dict)  # "" is the largest |u|
 
     def margin(self, condition: Condition) -> Any:
         """A number that is positive until a condition holds."""

@@ -8,7 +8,6 @@ from drake_dae import (
     AxisNormalToSurface,
     LinkExpressions,
     Plane,
-    Sphere,
 )
 from drake_dae.errors import ModelError
 from drake_dae.trace.functions import TracedFunction
@@ -46,19 +45,6 @@ def test_it_measures_the_tilt_and_has_no_second_zero(angle):
     np.testing.assert_allclose(phi, [0.0, -2.0 * np.tan(angle / 2.0)], atol=1e-13)
 
 
-def test_on_a_sphere_the_normal_turns_with_the_point():
-    """At distance d from the center the normal turns by x' / d: phi' = -(angle' + x' / d)."""
-    links = pole()
-    constraint = AxisNormalToSurface("body", Sphere((0.0, 0.0, -1.0), 0.5))
-    phi, jacobian = rows(constraint, links, [0.0, 0.4, 0.0])
-    np.testing.assert_allclose(phi, 0.0, atol=1e-15)
-    np.testing.assert_allclose(jacobian[1], [-1.0 / 1.4, 0.0, -1.0], atol=1e-14)
-    np.testing.assert_allclose(jacobian[0], 0.0, atol=1e-14)
-
-
-DOME = Sphere((0.5, 0.0, 0.0), 0.45)
-
-
 def test_an_axis_of_no_length_is_refused():
     with pytest.raises(ModelError, match="axis"):
-        AxisNormalToSurface("tool", DOME, (0.0, 0.0, 0.0))
+        AxisNormalToSurface("tool", Plane((0, 0, 0), (0, 0, 1)), (0.0, 0.0, 0.0))

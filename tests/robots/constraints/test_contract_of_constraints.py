@@ -267,13 +267,10 @@ def case(name):
     return constraint, evaluate, context, v, load, frames
 
 
-@pytest.fixture(params=MEMBERS)
-def given(request):
-    return request.param, *case(request.param)
+# The rules, each for what `case` knows of a member.
 
 
-@pytest.mark.slow
-def test_rows_are_as_many_as_names(given):
+def rows_are_as_many_as_names(given):
     _, constraint, evaluate, *_ = given
     found, count = evaluate(), len(constraint.force_signals)
     assert len(constraint.residual_signals) == len(constraint.is_unilateral) == count
@@ -285,8 +282,7 @@ def test_rows_are_as_many_as_names(given):
     assert all(name.startswith(f"{constraint.name}.") for name in names)
 
 
-@pytest.mark.equation(38)
-def test_it_holds_and_its_rate_is_the_derivative(given):
+def it_holds_and_its_rate_is_the_derivative(given):
     _, _, evaluate, *_ = given
     found = evaluate()
     np.testing.assert_allclose(found["residual"], 0.0, atol=1e-12)
@@ -294,13 +290,12 @@ def test_it_holds_and_its_rate_is_the_derivative(given):
     np.testing.assert_allclose(rate, found["plain rate"], **CLOSE)
 
 
-def test_rate_is_linear_in_velocities(given):
+def rate_is_linear_in_velocities(given):
     _, _, evaluate, _, v, *_ = given
     np.testing.assert_allclose(evaluate(v=-3.0 * v)["rate"], -3.0 * evaluate()["rate"], **CLOSE)
 
 
-@pytest.mark.equation(41)
-def test_reaction_is_linear_and_does_the_work_of_the_rate(given):
+def reaction_is_linear_and_does_the_work_of_the_rate(given):
     """Friction takes some: tau . v = lambda . rate without it, and less with it."""
     _, constraint, evaluate, _, v, load, _ = given
     found = evaluate()
@@ -314,12 +309,12 @@ def test_reaction_is_linear_and_does_the_work_of_the_rate(given):
     assert np.any(found["drag"]) == (constraint.name == "rough")
 
 
-def test_wrenches_act_on_the_frames_that_it_connects(given):
+def wrenches_act_on_the_frames_that_it_connects(given):
     name, *_, frames = given
     assert set(frames) == MEMBERS[name][1]
 
 
-def test_reaction_is_what_its_wrenches_do(given):
+def reaction_is_what_its_wrenches_do(given):
     """On all its frames at once, at their origins, by Drake; together they balance."""
     _, _, evaluate, context, _, _, frames = given
     if not frames:
@@ -338,7 +333,7 @@ def test_reaction_is_what_its_wrenches_do(given):
     np.testing.assert_allclose(total, 0.0, atol=1e-10)
 
 
-def test_wrenches_take_no_power_where_the_constraint_holds(given):
+def wrenches_take_no_power_where_the_constraint_holds(given):
     """Rule 9, by Drake's velocities of the frames, at a velocity that keeps the rate at zero.
 
     Without friction the power is 0; the numbers that cancel are of order 1e2, so 1e-9 is round-off
@@ -365,7 +360,7 @@ def test_wrenches_take_no_power_where_the_constraint_holds(given):
         assert power < -0.1
 
 
-def test_coordinates_are_as_many_as_names_or_refused(given):
+def coordinates_are_as_many_as_names_or_refused(given):
     _, constraint, *_ = given
     if constraint.coordinate_signals:
         assert constraint.coordinates(robot()).numel() == len(constraint.coordinate_signals)
@@ -378,7 +373,7 @@ JOINTS = {"revolute": 2.5, "planar revolute": -0.7, "prismatic": 0.3}
 """The members that are joints, and their coordinates."""
 
 
-def test_a_joint_has_a_coordinate_with_a_rate_that_is_power_of_a_unit_force(given):
+def a_joint_has_a_coordinate_with_a_rate_that_is_power_of_a_unit_force(given):
     """Rule 11, at any velocity where the positions keep the constraint."""
     name, constraint, _, context, v, *_ = given
     assert (constraint.joint is not None) == (name in JOINTS)
@@ -408,6 +403,27 @@ def test_a_joint_has_a_coordinate_with_a_rate_that_is_power_of_a_unit_force(give
             name, {"c": symbol, "p": symbols}, {"f": constraint.joint.force(symbol[0], symbol[1])}
         )(np.array([c, speed]), values)[0]
         np.testing.assert_allclose(force, expected, rtol=1e-12)
+
+
+RULES = (
+    rows_are_as_many_as_names,
+    it_holds_and_its_rate_is_the_derivative,
+    rate_is_linear_in_velocities,
+    reaction_is_linear_and_does_the_work_of_the_rate,
+    wrenches_act_on_the_frames_that_it_connects,
+    reaction_is_what_its_wrenches_do,
+    wrenches_take_no_power_where_the_constraint_holds,
+    coordinates_are_as_many_as_names_or_refused,
+    a_joint_has_a_coordinate_with_a_rate_that_is_power_of_a_unit_force,
+)
+
+
+@pytest.mark.equation(38)
+@pytest.mark.equation(41)
+@pytest.mark.parametrize("name", MEMBERS)
+def test_each_rule(name):
+    for rule in RULES:
+        rule((name, *case(name)))
 
 
 def test_a_push_drives_the_residual_up():

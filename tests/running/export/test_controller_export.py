@@ -57,13 +57,10 @@ def played(folder, name: str, *flags: str) -> "subprocess.CompletedProcess[str]"
     ("name", "settings"),
     [
         ("two_link_wall", (SAMPLED,)),
-        pytest.param("two_link_wall", (SAMPLED, MANY_PIECES), marks=pytest.mark.slow),
-        pytest.param("two_link_wall", EVERYTHING, marks=pytest.mark.slow),
+        ("two_link_wall", (SAMPLED, MANY_PIECES)),
+        ("two_link_wall", EVERYTHING),
         # Another mass than the model has: what the observer holds is more than rounding.
-        pytest.param(
-            "wall_polish", ("plant.parameters={link6.mass: 3.0}",), marks=pytest.mark.slow
-        ),
-        pytest.param("wall_flexible_contact", (), marks=[pytest.mark.slow, pytest.mark.thorough]),
+        ("wall_polish", ("plant.parameters={link6.mass: 3.0}",)),
     ],
 )
 def test_the_controller_does_what_it_does_in_drakes_simulator(name, settings, tmp_path):
@@ -133,6 +130,7 @@ def test_the_program_finds_what_is_wrong(two_link, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @needs_compiler
 def test_a_long_controller_plays_with_the_instructions_of_this_processor(tmp_path):
     """Where what is held begins with several equal numbers, of which gcc 12 made more."""

@@ -35,11 +35,9 @@ from problems.mechanisms import (
 from problems.networks import (
     circuit,
     dc_motor,
-    quadruple_tank,
-    quadruple_tank_crossed,
     swing_network,
 )
-from problems.nonholonomic import chaplygin_sleigh, knife_edge, knife_edge_force, rolling_disk
+from problems.nonholonomic import knife_edge, knife_edge_force, rolling_disk
 from problems.problem import Array, Known, Problem, known, unconstrained
 from problems.variants import changed, in_other_units
 
@@ -85,11 +83,8 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
         flexible_pendulum,
         knife_edge,
         knife_edge_force,
-        chaplygin_sleigh,
         rolling_disk,
         swing_network,
-        quadruple_tank,
-        quadruple_tank_crossed,
         aircraft,
         dc_motor,
         gantry,

@@ -1,4 +1,4 @@
-"""Circuits, power lines, tanks and a motor."""
+"""Circuits, power lines and a motor."""
 
 import casadi as ca
 import numpy as np
@@ -121,74 +121,6 @@ def swing_network() -> Problem:
         "where the power flow Jacobian is regular, so 2 with t' = v; network: Bergen and Hill, "
         "IEEE Transactions on Power Apparatus and Systems 100(1), 1981",
         minimum_phase=True,
-    )
-
-
-def _tanks(levels, gains, splits, name: str, minimum_phase: bool) -> Problem:
-    """Four tanks, two pumps: levels in cm, pump voltages in V, the numbers of Johansson 2000.
-
-    A_1 h_1' = -a_1 s_1 + a_3 s_3 + g_1 k_1 u_1,  A_3 h_3' = -a_3 s_3 + (1 - g_2) k_2 u_2, and with
-    1, 2 and 3, 4 exchanged, where s_i = sqrt(2 g h_i). z = (h_1, h_2), mu = (1, 1). The zeros solve
-    (1 + s T_3)(1 + s T_4) = (1 - g_1)(1 - g_2)/(g_1 g_2): both negative where g_1 + g_2 > 1.
-    """
-    area, hole = np.array([28.0, 32.0, 28.0, 32.0]), np.array([0.071, 0.057, 0.071, 0.057])
-    (k1, k2), (g1, g2), gravity = gains, splits, 981.0
-
-    def f(x: ca.SX) -> list[ca.SX]:
-        out = [hole[i] * ca.sqrt(2 * gravity * x[i]) for i in range(4)]
-        return [
-            (out[2] - out[0]) / area[0],
-            (out[3] - out[1]) / area[1],
-            -out[2] / area[2],
-            -out[3] / area[3],
-        ]
-
-    system = DaeSystem.from_functions(
-        [Signal(f"h{i + 1}", "cm") for i in range(4)],
-        f=f,
-        h=lambda x: [
-            [g1 * k1 / area[0], 0],
-            [0, g2 * k2 / area[1]],
-            [0, (1 - g2) * k2 / area[2]],
-            [(1 - g1) * k1 / area[3], 0],
-        ],
-        l=lambda x: [x[0], x[1]],
-        control_signals=[Signal("pump1", "V"), Signal("pump2", "V")],
-        output_signals=[Signal("h1", "cm"), Signal("h2", "cm")],
-        nominal_state=levels,
-        name=name,
-    )
-
-    def closed_form(x: Array) -> Known:
-        out = hole * np.sqrt(2 * gravity * x)
-        return unconstrained(
-            2, (out[2:] - out[:2]) / area[:2], np.diag([g1 * k1, g2 * k2] / area[:2])
-        )
-
-    return Problem(
-        system=system,
-        constraint_degrees=(),
-        output_degrees=(1, 1),
-        index=0,
-        zero_dynamics=2,
-        output_order=(0, 1),
-        known=closed_form,
-        consistent=lambda random: np.array(levels) + random.uniform(-0.2, 0.2, 4),
-        reference=[(levels[0], 0.0, 0.1), (levels[1], 0.0, 0.1)],
-        source="Johansson, IEEE Transactions on Control Systems Technology 8(3), 2000",
-        minimum_phase=minimum_phase,
-    )
-
-
-def quadruple_tank() -> Problem:
-    """The minimum phase setting, P-: most of each pump goes to its lower tank. See `_tanks`."""
-    return _tanks([12.4, 12.7, 1.8, 1.4], (3.33, 3.35), (0.70, 0.60), "quadruple tank", True)
-
-
-def quadruple_tank_crossed() -> Problem:
-    """The nonminimum phase setting, P+: most of each pump goes to the upper tank across."""
-    return _tanks(
-        [12.6, 13.0, 4.8, 4.9], (3.14, 3.29), (0.43, 0.34), "crossed quadruple tank", False
     )
 
 

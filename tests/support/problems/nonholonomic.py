@@ -109,65 +109,6 @@ def knife_edge_force() -> Problem:
     )
 
 
-def chaplygin_sleigh() -> Problem:
-    """A sleigh with its centre of mass a distance a ahead of the blade; v is the blade's force.
-
-    k = -s vx + c vy - a w with (vx, vy) of the centre of mass. On N*, V' = a w^2 + u1/m and
-    (I + m a^2) w' = -m a w V + u2, as Bloch has them. k' = -w V + (1/m + a^2/I) v - a u2/I.
-    """
-    m, inertia, a = 3.0, 0.4, 0.3
-    system = DaeSystem.from_functions(
-        ["x", "y", "heading", "vx", "vy", "w"],
-        f=lambda x: [x[3], x[4], x[5], 0, 0, 0],
-        g=lambda x: [0, 0, 0, -ca.sin(x[2]) / m, ca.cos(x[2]) / m, -a / inertia],
-        h=lambda x: [
-            *[[0, 0]] * 3,
-            [ca.cos(x[2]) / m, 0],
-            [ca.sin(x[2]) / m, 0],
-            [0, 1 / inertia],
-        ],
-        k=lambda x: -ca.sin(x[2]) * x[3] + ca.cos(x[2]) * x[4] - a * x[5],
-        l=lambda x: [x[2], ca.cos(x[2]) * x[3] + ca.sin(x[2]) * x[4]],
-        m=lambda x: [0, 0],
-        output_signals=["heading", "V"],
-        nominal_state=[0.0, 0.0, 0.3, 0.5, 0.4, 1.0],
-        name="Chaplygin sleigh",
-    )
-
-    def derivatives(x: Array) -> Array:
-        return np.array([-np.sin(x[2]) * x[3] + np.cos(x[2]) * x[4] - a * x[5]])
-
-    def closed_form(x: Array) -> Known:
-        speed, whole = np.cos(x[2]) * x[3] + np.sin(x[2]) * x[4], inertia + m * a**2
-        return known(
-            1 / m + a**2 / inertia,
-            x[5] * speed * m * inertia / whole,
-            [[0, a * m / whole]],
-            [-m * a * x[5] * speed / whole, x[5] * (a * x[5] + derivatives(x)[0])],
-            [[0, 1 / whole], [1 / m, 0]],
-        )
-
-    def consistent(random: np.random.Generator) -> Array:
-        x, y, heading, speed, rate = random.uniform(0.5, 1.5, 5)
-        s, c = np.sin(heading), np.cos(heading)
-        across = a * rate
-        return np.array([x, y, heading, c * speed - s * across, s * speed + c * across, rate])
-
-    return Problem(
-        system=system,
-        constraint_degrees=(1,),
-        output_degrees=(2, 1),
-        index=2,
-        zero_dynamics=2,
-        output_order=(0, 1),
-        known=closed_form,
-        consistent=consistent,
-        reference=[(0.5, 0.0, 0.5), (1.0, 0.0, 0.3)],
-        derivatives=derivatives,
-        source="Bloch, Nonholonomic Mechanics and Control, 2003, 1.7: the Chaplygin sleigh",
-    )
-
-
 def rolling_disk() -> Problem:
     """An upright disk that rolls without slipping: two nonholonomic constraints, r = (1, 1).
 

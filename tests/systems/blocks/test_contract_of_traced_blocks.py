@@ -59,6 +59,8 @@ from drake_dae import (
     TrackingLaw,
     poles,
 )
+from drake_dae.blocks.block import BlockFunction
+from drake_dae.blocks.compose import compose
 from drake_dae.dae import with_disturbance
 from drake_dae.errors import ModelError
 from drake_dae.running.rollout_program import RolloutProgram
@@ -238,42 +240,62 @@ def in_context(name):
         system.set_consistent_state(own, system.structure.states[1])
     elif isinstance(system, TrackingController):
         diagram.GetInputPort("in 0").FixValue(context, system.law.structure.states[1])
-    return system, diagram, context, RolloutProgram(diagram, context.Clone())
+    return system, diagram, context, compose(diagram, context=context)
 
 
-def check_functions(diagram, context, program, tolerance):
+def sources(composed, context):
+    """Source -> its values in a context, as of `Block.columns`."""
+    values = {"time": context.get_time()}
+    for kind, places in (("state", composed.states), ("parameters", composed.parameters)):
+        own = [system.GetMyContextFromRoot(context) for system in places]
+        if kind == "state":
+            parts = [each.get_continuous_state_vector().CopyToVector() for each in own]
+        else:
+            groups = [(c, i) for c in own for i in range(c.num_numeric_parameter_groups())]
+            parts = [c.get_numeric_parameter(i).CopyToVector() for c, i in groups]
+        values[kind] = np.concatenate([np.zeros(0), *parts])
+    for (system, i), (group, _) in composed.held.items():
+        own = system.GetMyContextFromRoot(context)
+        values[f"held {group}"] = own.get_discrete_state(i).CopyToVector()
+    for name, (system, i) in composed.fixed.items():
+        own = system.GetMyContextFromRoot(context)
+        values[f"input {name}"] = system.get_input_port(i).Eval(own)
+    return values
+
+
+def check_value(composed, value, given, wanted):
+    """To 1e-12 of the largest value: other common subexpressions are removed."""
+    function = BlockFunction(composed.block, "", {"value": value})
+    found = function(*(given[source] for source in function.sources))[0]
+    scale = max(1.0, np.abs(wanted).max(initial=0.0))
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * scale)
+
+
+def check_functions(diagram, context, composed):
     """Outputs and derivative are those of the diagram, to a share of the largest value."""
-    functions, given = program.functions, (context.get_time(), *program.values_in(context))
-    wanted = [diagram.GetOutputPort(output).Eval(context) for output in program.signals]
-    pairs = [(functions.row(*given), np.concatenate([np.zeros(0), *wanted]))]
-    if program.num_states:
+    given = sources(composed, context)
+    for name, value in composed.block.outputs.items():
+        check_value(composed, value, given, diagram.GetOutputPort(name).Eval(context))
+    if composed.block.state.numel():
         derivative = diagram.EvalTimeDerivatives(context).CopyToVector()
-        pairs.append((functions.rate(*given), derivative))
-    for found, wanted in pairs:
-        scale = max(1.0, np.abs(wanted).max(initial=0.0))
-        np.testing.assert_allclose(found.full()[:, 0], wanted, rtol=0.0, atol=tolerance * scale)
+        check_value(composed, composed.block.derivative, given, derivative)
 
 
 @pytest.mark.parametrize("name", [*some(BLOCKS, of=3, first=1), *SYSTEMS])
 def test_outputs_derivatives_and_updates_are_those_of_the_system(name):
-    """To 1e-12 of the largest value: other common subexpressions are removed."""
-    _, diagram, context, program = in_context(name)
-    check_functions(diagram, context, program, 1e-12)
-    given = context.get_time(), *program.values_in(context)
-    noise = np.zeros(program.functions.sizes[4])
-    for rate in program.functions.rates:
-        if rate.offset:
-            context.SetTime(rate.offset + rate.period)
-            given = context.get_time(), *given[1:]
-        held = program.values_in(context)[1]
-        held[rate.places] = rate.function(*given, noise).full()[:, 0]
+    _, diagram, context, composed = in_context(name)
+    check_functions(diagram, context, composed)
+    for (period, offset, _), groups in composed.block.rates().items():
+        if offset:
+            context.SetTime(offset + period)
         # The events of this instant, a multiple of the period.
         simulator = Simulator(diagram, context.Clone())
         simulator.Initialize()
         simulator.AdvancePendingEvents()
-        found = program.values_in(simulator.get_context())[1]
-        scale = max(1.0, np.abs(found).max(initial=0.0))
-        np.testing.assert_allclose(held, found, rtol=0.0, atol=1e-12 * scale)
+        after = sources(composed, simulator.get_context())
+        for group in groups:
+            following = composed.block.held[group].next
+            check_value(composed, following, sources(composed, context), after[f"held {group}"])
 
 
 @pytest.mark.parametrize(
@@ -281,10 +303,9 @@ def test_outputs_derivatives_and_updates_are_those_of_the_system(name):
 )
 def test_feedthrough_is_that_of_the_system(name):
     """So an algebraic loop is one for both."""
-    system, _, _, program = in_context(name)
-    block = program.composed.block
-    for j, output in enumerate(program.signals):
-        value = block.outputs[output]
+    system, _, _, composed = in_context(name)
+    block = composed.block
+    for j, value in enumerate(block.outputs.values()):
         for i in range(system.num_input_ports()):
             symbol = block.inputs.get(f"in {i}")
             if symbol is not None and symbol.numel():
@@ -295,12 +316,12 @@ def test_feedthrough_is_that_of_the_system(name):
 
 @pytest.mark.parametrize("name", sorted(PROBLEMS))
 def test_any_plant_of_equations_is_traced(name):
-    """To 1e-12 of the largest value, at a state on N*."""
+    """At a state on N*."""
     plant = DaePlant(PROBLEMS[name]().system)
     diagram, context = alone(plant)
     own = plant.GetMyMutableContextFromRoot(context)
     plant.set_consistent_state(own, plant.structure.states[0])
-    check_functions(diagram, context, RolloutProgram(diagram, context.Clone()), 1e-12)
+    check_functions(diagram, context, compose(diagram, context=context))
 
 
 def test_a_system_that_cannot_be_traced_is_named():

@@ -9,9 +9,9 @@ import pytest
 from arms import arm, numbers
 from numpy.testing import assert_allclose
 
-from drake_dae import RobotModel, StateEstimator, TrackingLaw, poles
+from drake_dae import JointFriction, RobotModel, StateEstimator, TrackingLaw, poles
 from drake_dae.dae import with_disturbance
-from drake_dae.dae.beyond.chain_filter import ChainFilter
+from drake_dae.dae.beyond.filters import ChainFilter
 from drake_dae.systems import Observing
 
 T = 1e-3
@@ -210,3 +210,41 @@ def test_the_first_sample_takes_what_is_measured():
     state, after = (v.full().ravel() for v in function(*(given[n] for n in block.columns())))
     assert_allclose(state, [*Q, *V], rtol=0, atol=0)
     assert np.all(np.isfinite(after))
+
+
+def test_friction_of_joints_is_compensated_at_wanted_velocities_where_it_is_estimated():
+    """What the law adds for friction is then no feedback of velocities, which could be unstable.
+
+    Coulomb friction is fully developed in both motions, so that viscous friction alone differs.
+    """
+    found = arm("two_link")
+    viscous = np.array([0.7, 0.4])
+    friction = JointFriction(["joint1", "joint2"], [0.3, 0.2], viscous, stiction_tolerance=1e-6)
+    wall = replace(found.model.constraints[0], friction=0.0)
+    model = RobotModel(
+        found.model.links, [wall], found.model.outputs, [1.2, -1.6], known_forces=[friction]
+    )
+    names = [signal.name for signal in model.links.velocity_signals]
+    named = ["joint1.coulomb", "joint2.coulomb", "joint1.viscous"]
+    law = TrackingLaw(with_disturbance(model.dae, names, named), poles(-4.0), measured_force=True)
+    ranges = dict.fromkeys(named, 1.0)
+    block = StateEstimator(law, Observing(20.0, ranges=ranges), T).block
+    known = numbers("two_link", Q, V)
+    slides = np.vstack([known.output_jacobian, known.constraint_jacobian])
+    wanted = np.linalg.solve(slides, [0.4, 0.0])
+    now = 0.5 * wanted
+    reference = np.zeros(law.layout.reference_size)
+    reference[:2] = known.outputs[0], 0.4
+    given = {
+        "time": [T],
+        "input measured_state": [*Q, *now],
+        "input measured_force": [5.0],
+        "input reference": reference,
+        "parameters": law.system.parameter_values,
+    } | {f"held {name}": held.start for name, held in block.held.items()}
+    columns = block.columns()
+    function = ca.Function("law", [*columns.values()], [block.outputs["exogenous"]])
+    values = [given.get(name, np.zeros(symbol.shape)) for name, symbol in columns.items()]
+    disturbance = function(*values).full().ravel()[len(named) :]
+    # The law cancels d v of its model itself; this changes it to d times the wanted velocity.
+    assert_allclose(disturbance, [-viscous[0] * (wanted - now)[0], 0.0], rtol=1e-6, atol=1e-9)

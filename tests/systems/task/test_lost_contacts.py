@@ -69,11 +69,7 @@ def ended(path, cause, phase, reaction):
     return loop.changes(found.record)
 
 
-CASES = [
-    ("a push", Press, "approach"),
-    ("a push", Dwell, "away"),
-    ("a reference that jumps", Move, "hold"),
-]
+CASES = [("a push", Press, "approach"), ("a reference that jumps", Move, "hold")]
 
 
 @pytest.mark.slow

@@ -186,11 +186,7 @@ class CompliantPlant(ParameterizedSystem, Plant):
 
 
 class CompliantEquations:
-    """The equations of a `CompliantPlant`, whose state is x, or (x, F) if it is discrete.
-
-    Parameters are those of the system, followed by `PointMaterial.values` and `ball_normals` of the
-    nominal configuration: see `own_parameters`.
-    """
+    """The equations of a `CompliantPlant`, whose state is x, or (x, F) if it is discrete."""
 
     def __init__(
         self, model: RobotModel, structure: ConstraintStructure, material: PointMaterial
@@ -209,10 +205,7 @@ class CompliantEquations:
         self._depths = TracedFunction("depths", inputs, {"depths": depths}, often=False)
 
     def own_parameters(self, values: FloatArray, material: PointMaterial) -> FloatArray:
-        """All parameters, with the balls placed where they touch in the nominal configuration.
-
-        `values` are those of the system. Refuses a ball that does not fit there.
-        """
+        """Those of the system, `PointMaterial.values`, and `ball_normals`, if the balls fit."""
         dae, manifold = self._model.dae, self._structure.manifold
         state = manifold.project(dae.nominal_state, values)
         normals = self._normals(state, values)[0]

@@ -20,10 +20,9 @@ from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
 
 class ContactForces(LeafSystem):
-    """Sums the points and patches of Drake's contact results to a force F of each constraint.
+    """Sums Drake's contact results to a force F on the robot of each constraint, shape (3 m,).
 
-    `contact_force` is that on the robot, in the world, N, shape (3 m,), with friction. `pairs` are
-    the geometries of the robot, and those of the surface, of each constraint.
+    `pairs` are the geometries of the robot, and those of the surface, of each constraint.
     """
 
     __slots__ = SHARED_DICTIONARY

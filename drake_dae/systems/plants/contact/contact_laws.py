@@ -32,19 +32,14 @@ surface: they reduce the error of its direction by (radius / radius of curvature
 
 @dataclass(frozen=True, eq=False)
 class PointContact:
-    """The contact of a ball of a robot with a surface, at the point halfway into their overlap.
+    """The contact of a ball with a surface halfway into their overlap, in the world."""
 
-    In the world: the depth in m, negative without contact; the unit normal of the surface, toward
-    the robot; J of the velocity J(q) v of the robot at the point; the velocity of the surface
-    there; and the coefficients of Coulomb friction and of viscous friction, N s/m.
-    """
-
-    depth: ca.SX
-    normal: ca.SX
-    jacobian: ca.SX
-    velocity: ca.SX
+    depth: ca.SX  # m, negative without contact
+    normal: ca.SX  # of the surface, toward the robot
+    jacobian: ca.SX  # of the velocity J(q) v of the robot at the point
+    velocity: ca.SX  # of the surface there
     friction: ca.SX
-    viscous_friction: ca.SX
+    viscous_friction: ca.SX  # N s/m
 
 
 def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
@@ -66,8 +61,7 @@ def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
 def ball_normals(model: RobotModel) -> ca.SX:
     """The normals of the surfaces in the frames of their constraints, stacked, shape (3 k, 1).
 
-    Those of the nominal configuration determine the balls: there a ball touches at the point of its
-    constraint, so that its center is that point plus the radius times the normal.
+    A ball's center is the point of its constraint plus the radius times the nominal normal.
     """
     touches = [touch for _, touch in touching(model)]
     return ca.vertcat(*(ca.mtimes(model.links.rotation(t.frame).T, t.normal) for t in touches))
@@ -78,8 +72,7 @@ def point_contacts(
 ) -> list[PointContact]:
     """The contact of a robot's ball with the surface of each constraint.
 
-    `normals` are symbols for `ball_normals` of the nominal configuration; `friction` is the
-    coefficient of all contacts, None for those of the constraints.
+    `normals` are the `ball_normals` of the nominal configuration; `friction` that of all contacts.
     """
     kinematics, links = model.links.kinematics(), model.links
     contacts = []
@@ -107,11 +100,7 @@ def point_contacts(
 
 
 def _overlap(touch: Touch, ball: ca.SX, radius: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """The unit normal of the surface and the depth of the overlap of a ball there.
-
-    If the distance is exact only on the surface, the depth is that of the deepest point of the
-    ball, p = ball - radius n(p), by fixed-point iteration.
-    """
+    """The unit normal of the surface and the depth of a ball there, if need be by iteration."""
     point = ca.SX.sym("point", 3)
     clearance = touch.clearance(point)
     slope = ca.gradient(clearance, point)
