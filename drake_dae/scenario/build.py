@@ -111,8 +111,8 @@ def build_completed(
         forces = [ScaledForce(d.frame, d.point, name, d.force) for name, d in pushes.items()]
         known = [*scenario.robot.known_forces, *forces]
         moving: dict[str, Any] = {f"{name}.course": [d.course] for name, d in pushes.items()}
-        robot = replace(scenario.robot, known_forces=known)
-        own = replace(scenario, robot=robot, exogenous={**scenario.exogenous, **moving})
+        pushed = replace(scenario.robot, known_forces=known)
+        own = replace(scenario, robot=pushed, exogenous={**scenario.exogenous, **moving})
         drawn["scene_graph"] = SceneGraph()
         _, of_plant, _ = completed_model(own, drawn["scene_graph"], scenario.plant.payloads)
         plant = make_plant(own, of_plant, scenario_structure(of_plant))
