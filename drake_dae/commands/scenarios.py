@@ -33,7 +33,8 @@ from drake_dae.robots import Vector
 from drake_dae.running.simulate import simulate
 from drake_dae.scenario.build import build_completed, build_scenario
 from drake_dae.scenario.judging import find_feasibility, judge_run
-from drake_dae.scenario.new import new_scenario
+from drake_dae.scenario.new import placed_scenario
+from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario, load_scenario
 from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
 from drake_dae.scenario.start import start_scenario
@@ -80,16 +81,16 @@ def _new(options: argparse.Namespace) -> int:
         warnings.simplefilter("ignore", GeometryWarning)
         tip, point = _tip(options.tip)
         where = options.robot, options.surface, tip, point, out.parent
-        _, text = new_scenario(*where, progress=tell)
+        _, text, robot = placed_scenario(*where, tell)
         out.write_text(text, encoding="utf-8")
         print(f"written: {out}", flush=True)
         tell("checking it by a run")
-        verdict = _check(load_scenario(out), used + _LONGEST)
+        verdict = _check(load_scenario(out), robot, used + _LONGEST)
     print(f"checked: {verdict}\nnow run: {program()} simulate {shlex.quote(str(out))}")
     return 0 if verdict.startswith("GOOD") else 2
 
 
-def _check(scenario: Scenario, end: float) -> str:
+def _check(scenario: Scenario, robot: RobotLinks, end: float) -> str:
     """The verdict of a run of a new scenario, or why there is none up to an end."""
 
     def look(context: Context) -> None:
@@ -99,7 +100,7 @@ def _check(scenario: Scenario, end: float) -> str:
             raise SimulationError(text, now, [])
 
     try:
-        completed, loop = build_completed(scenario)
+        completed, loop = build_completed(scenario, robot=robot)
         context = start_scenario(completed.scenario, loop)
         # The first round: the second repeats it.
         half = replace(completed.scenario, duration=scenario.duration / 2)

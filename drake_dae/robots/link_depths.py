@@ -47,6 +47,7 @@ class LinkDepths:
         poses = [(links.rotation(o.frame), links.position(o.frame)) for o in links.outlines]
         every = [(o, *pose, moved_by(*pose)) for o, pose in zip(links.outlines, poses, strict=True)]
         base = [p for o, _, p, by in every if not by and o.name != "world"]
+        bases = ca.horzcat(ca.SX(3, 0), *base)
         every = [each for each in every if each[3]]
         self.names = [o.name for o, *_ in every]
         self._points = [o.points.T for o, *_ in every]
@@ -59,10 +60,10 @@ class LinkDepths:
             held = moved_by(links.rotation(touch.frame), contact)
             counts = np.repeat([not held <= by for *_, by in every], self._sizes)
             inner = np.repeat([len(by) > 1 for *_, by in every], self._sizes)
-            to_base = ca.mmin(ca.vertcat(ca.inf, *[ca.norm_2(point - p) for p in base]))
             deepest = ca.mmax(ca.vertcat(-ca.inf, *[-touch.clearance(p) for p in base]))
-            out = [-touch.clearance(point), ca.norm_2(point - contact), to_base, deepest]
-            self._surfaces[name] = ca.Function("depth", [point, *at], out), counts, inner
+            depth = ca.Function("depth", [point, *at], [-touch.clearance(point)])
+            places = ca.Function("places", at, [contact, bases, deepest])
+            self._surfaces[name] = depth, places, counts, inner
 
     def at(self, q: FloatArray, parameters: FloatArray) -> dict[str, FloatArray]:
         """Name of each constraint -> the depth of each link in m; 0 where it is in front."""
@@ -72,11 +73,13 @@ class LinkDepths:
         pairs = zip(poses, self._points, strict=True)
         world = np.hstack([pose[:, :3] @ points + pose[:, 3:] for pose, points in pairs])
         depths, starts = {}, np.cumsum([0, *self._sizes[:-1]])
-        for name, (function, counts, inner) in self._surfaces.items():
-            out = (v.full().ravel() for v in function(world, q, parameters))
-            depth, to_contact, to_base, base = out
-            depth = depth + self._radii
-            near = (to_contact < NEARER * to_base) | (inner & (base < TOUCHING))
+        for name, (function, places, counts, inner) in self._surfaces.items():
+            contact, bases, of_base = (v.full() for v in places(q, parameters))
+            to_contact = np.linalg.norm(world - contact, axis=0)
+            distances = [np.linalg.norm(world - base[:, None], axis=0) for base in bases.T]
+            to_base = np.min([np.full(world.shape[1], np.inf), *distances], axis=0)
+            depth = function(world, q, parameters).full().ravel() + self._radii
+            near = (to_contact < NEARER * to_base) | (inner & (of_base.item() < TOUCHING))
             behind = counts & near & (depth > np.maximum(TOUCHING, BESIDE * to_contact))
             depths[name] = np.maximum.reduceat(np.where(behind, depth, 0.0), starts)
         return depths

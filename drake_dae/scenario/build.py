@@ -47,7 +47,7 @@ from drake_dae.scenario.model import (
     scenario_structure,
 )
 from drake_dae.scenario.parts import Poles, ScenarioTask
-from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.reading import RobotLinks, read_robot
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
 from drake_dae.systems.control.contract import Controller, Derived
@@ -75,13 +75,19 @@ def build_scenario(
 
 @uncollected
 def build_completed(
-    scenario: Scenario, meshcat: Meshcat | None = None, commanded: bool = False
+    scenario: Scenario,
+    meshcat: Meshcat | None = None,
+    commanded: bool = False,
+    robot: RobotLinks | None = None,
 ) -> tuple[Completed, ClosedLoop]:
-    """The completed scenario and its loop; a person may change the references if `commanded`."""
+    """The completed scenario and its loop; a person may change the references if `commanded`.
+
+    A `robot` that is read already is not drawn.
+    """
     # The robot, with the outputs and the start that the scenario leaves out.
     check_task(scenario)
     drawn = {"scene_graph": (scene_graph := SceneGraph()), "meshcat": meshcat}
-    completed, model, structure = completed_model(scenario, scene_graph)
+    completed, model, structure = completed_model(scenario, scene_graph, robot=robot)
     if not model.dae.num_controls:
         return completed, _mechanism(completed.scenario, model, **drawn)
     if structure is None:
@@ -105,8 +111,8 @@ def build_completed(
         forces = [ScaledForce(d.frame, d.point, name, d.force) for name, d in pushes.items()]
         known = [*scenario.robot.known_forces, *forces]
         moving: dict[str, Any] = {f"{name}.course": [d.course] for name, d in pushes.items()}
-        robot = replace(scenario.robot, known_forces=known)
-        own = replace(scenario, robot=robot, exogenous={**scenario.exogenous, **moving})
+        pushed = replace(scenario.robot, known_forces=known)
+        own = replace(scenario, robot=pushed, exogenous={**scenario.exogenous, **moving})
         drawn["scene_graph"] = SceneGraph()
         _, of_plant, _ = completed_model(own, drawn["scene_graph"], scenario.plant.payloads)
         plant = make_plant(own, of_plant, scenario_structure(of_plant))

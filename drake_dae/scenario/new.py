@@ -50,7 +50,13 @@ from drake_dae.scenario.model import NOTHING_FOUND, completed_model
 from drake_dae.scenario.parts import Start
 from drake_dae.scenario.postures import Posture, Postures, tool_axis
 from drake_dae.scenario.robot_file.changes import joints_of
-from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot, robot_links
+from drake_dae.scenario.robot_file.reading import (
+    RobotLinks,
+    finalize,
+    needs_of,
+    read_robot,
+    robot_links,
+)
 from drake_dae.scenario.robot_file.robot import Robot, RobotPlacement
 from drake_dae.scenario.scenario import Scenario, scenario_data
 from drake_dae.scenario.typed_yaml import dump_yaml
@@ -127,6 +133,18 @@ def new_scenario(
         ScenarioError: The file cannot be read or has no such tip, or no place is reached; the
             message lists the places that were tried.
     """
+    return placed_scenario(file, surface, tip, point, folder, progress)[:2]
+
+
+def placed_scenario(
+    file: str,
+    surface: SurfaceKind,
+    tip: str,
+    point: Vector,
+    folder: str | Path | None,
+    progress: Callable[[str], object],
+) -> tuple[Scenario, str, RobotLinks]:
+    """What `new_scenario` returns, and its robot as read."""
     progress("reading the robot")
     end = process_time() + _SECONDS
     is_url = file.startswith("package://")
@@ -152,7 +170,7 @@ def new_scenario(
         except DrakeDaeError as error:
             problem = str(error)
         if not problem:
-            return scenario, _text(scenario, {**why, "surface": place.why}, folder)
+            return scenario, _text(scenario, {**why, "surface": place.why}, folder), read
         tried.append(f"{name} at {center} m, {fraction:g} of the usual circle: {problem[:160]}")
     where = "; ".join(tried[:_PLACES]) or "surfaces along all axes of the world"
     text = (
