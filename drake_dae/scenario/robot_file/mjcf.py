@@ -40,13 +40,14 @@ def read_included(file: Path, within: tuple[Path, ...]) -> Node:
     return read_xml(file)
 
 
-def expand(root: Element, file: Path) -> None:
+def expand(root: Element, file: Path) -> list[str]:
     """Writes an MJCF file so that each element says all that it means, where it means it.
 
     Included files and defaults of classes go into their places. Inactive equalities go. Limits of
-    motors become those of the efforts at joints, the gear times those of motors; servos become
-    motors, since controls are efforts here. Bodies of mass 0, which MuJoCo takes if they do not
-    move or move with others, lose their inertia, and their geometry its mass.
+    motors become those of the efforts at joints, the gear times those of motors. Position servos
+    become motors, since controls are efforts here; their names are returned. Bodies of mass 0,
+    which MuJoCo takes if they do not move or move with others, lose their inertia, and their
+    geometry its mass.
     """
     _include(root, file, (file.resolve(),), count(1))
     root.attrib.setdefault("model", file.stem)
@@ -62,9 +63,11 @@ def expand(root: Element, file: Path) -> None:
         words = joint.get("range", "").split()
         if "limited" not in joint.attrib and not any(map(number_in, words)):
             joint.attrib.pop("range", None)
+    servos = []
     for motor in [*root.iterfind("actuator/motor"), *root.iterfind("actuator/position")]:
         if motor.tag == "position":  # Its control is a position, and has no limit of efforts.
             motor.tag = "motor"
+            servos.append(motor.get("name", motor.get("joint", "")))
             motor.attrib.pop("ctrlrange", None)
             motor.attrib.pop("ctrllimited", None)
         gear = abs(number_in([*motor.get("gear", "").split(), "1"][0]) or 1.0)
@@ -86,6 +89,7 @@ def expand(root: Element, file: Path) -> None:
             geom.attrib.pop("conaffinity", None)
         if "friction" in geom.attrib:  # Drake has none that resists turning.
             geom.set("friction", "".join(geom.get("friction", "").split()[:1]))
+    return servos
 
 
 def _include(owner: Element, main: Path, within: tuple[Path, ...], number: Iterator[int]) -> None:

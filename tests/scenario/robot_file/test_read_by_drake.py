@@ -13,7 +13,7 @@ from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 from pydrake.multibody.tree import FrameIndex
 from pydrake.solvers import MathematicalProgram
 
-from drake_dae.errors import GeometryWarning, ModelError
+from drake_dae.errors import GeometryWarning, ModelError, RobotFileWarning
 from drake_dae.scenario.robot_file.read_by_drake import READ_BY_DRAKE
 from drake_dae.scenario.robot_file.reading import finalize, needs_of, read_robot
 from drake_dae.scenario.robot_file.robot import Robot
@@ -317,7 +317,8 @@ def test_all_kinds_of_actuators_have_one_default(tag: str, tmp_path: Path):
     text = MJCF.replace("<worldbody>", default).replace(' forcerange="-4 4"', "", 2)
     text = text.replace('<motor name="n"', '<position name="n" kp="9"')
     (tmp_path / "robot.xml").write_text(text)
-    plant = read_robot(Robot(str(tmp_path / "robot.xml")))[0]
+    with pytest.warns(RobotFileWarning, match="'n'"):  # A servo becomes a motor.
+        plant = read_robot(Robot(str(tmp_path / "robot.xml")))[0]
     limits = [plant.GetJointActuatorByName(name).effort_limit() for name in "mn"]
     assert limits == [2.0 * 3.0, 3.0 * 7.0]  # Of m the own gear and control, within 2 times 7.
 
