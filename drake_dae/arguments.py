@@ -43,8 +43,12 @@ class _Uncollected(ContextDecorator):
             if self._depth == 1:
                 self._was = gc.isenabled()
                 gc.disable()
-        while self._collector not in (None, get_ident()):
-            time.sleep(1e-3)
+        try:
+            while self._collector not in (None, get_ident()):
+                time.sleep(1e-3)
+        except BaseException:  # Ctrl-C: nobody calls __exit__.
+            self.__exit__()
+            raise
 
     def __exit__(self, *_: object) -> None:
         with self._lock:

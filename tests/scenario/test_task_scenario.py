@@ -139,10 +139,9 @@ duration: 4.5
 
 
 @pytest.fixture
-def moving(tmp_path):
-    path = tmp_path / "moving.yaml"
-    path.write_text(MOVING)
-    return path
+def moving(file):
+    file.write_text(MOVING)
+    return file
 
 
 @pytest.mark.slow
