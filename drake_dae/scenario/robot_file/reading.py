@@ -1,10 +1,12 @@
 """Reads a robot's files into a MultibodyPlant, and into links of the library."""
 
+import logging
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import get_native_id
 from types import MappingProxyType
 
 import numpy as np
@@ -20,7 +22,7 @@ from pydrake.multibody.parsing import (
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, QuaternionFloatingJoint, RpyFloatingJoint
 
-from drake_dae.errors import DrakeDaeError, ModelError
+from drake_dae.errors import DrakeDaeError, ModelError, RobotFileWarning
 from drake_dae.robots import Constraint, MultibodyExpressions, joint_names, plant_constraints
 from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.changes import (
@@ -197,16 +199,36 @@ def _find_packages(files: RobotFiles, file: Path, within: tuple[Path, ...]) -> N
 
 @contextmanager
 def drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Iterator[None]:
-    """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
+    """Converts Drake's exceptions to ModelError, and what it logs to one RobotFileWarning.
+
+    A failed assertion of Drake is a SystemExit.
+    """
+    remarks: list[str] = []
+    here, logger = get_native_id(), logging.getLogger("drake")
+
+    def original(text: str) -> str:
+        for copy, file in originals.items():
+            text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
+        return text.replace(" warning:", "")
+
+    def takes(record: logging.LogRecord) -> bool:
+        if record.thread != here or record.levelno < logging.WARNING:
+            return True
+        remarks.append(record.getMessage())
+        return False
+
+    logger.addFilter(takes)
     try:
         yield
     except DrakeDaeError:
         raise
     except (RuntimeError, ValueError, SystemExit) as error:
-        text = str(error)
-        for copy, original in originals.items():
-            text = text.replace(str(copy), str(original))
-        raise ModelError(text) from None
+        raise ModelError(original(str(error))) from None
+    finally:
+        logger.removeFilter(takes)
+    if remarks:
+        text = _listed((" ".join(original(one).split()) for one in remarks), most=3)
+        warnings.warn(f"Drake reads the robot with remarks: {text}", RobotFileWarning, stacklevel=3)
 
 
 def _told(lost: Mapping[str, list[str]]) -> str:
