@@ -289,7 +289,7 @@ def one_joint(kind: str, form: str, part: str = "", rest: str = "") -> str:
 <limit {part if "damping" not in part else ""}/><dynamics {part if "damping" in part else ""}/>
 {rest}</{tag}></robot>"""
     if kind == ".sdf":
-        (part, is_limit) = (part, "damping" not in part and "spring" not in part)
+        is_limit = "damping" not in part and "spring" not in part
         limit = "" if "effort" in part else "<effort>0</effort>"
         inner = (
             f"<limit>{limit}{part * is_limit}</limit><dynamics>{part * (not is_limit)}</dynamics>"
@@ -299,9 +299,8 @@ def one_joint(kind: str, form: str, part: str = "", rest: str = "") -> str:
             damping = part * ("damping" in part)
             axes += f"<axis2><xyz>0 1 0</xyz><dynamics>{damping}</dynamics></axis2>"
         return f"""<sdf version="1.9" xmlns:drake="d"><model name="r">
-<link name="a">{SDF_MASS}</link><joint name="j" type="{form}"><parent>world</parent><child>a</child>{axes}
-{rest}</joint></model>
-</sdf>"""
+<link name="a">{SDF_MASS}</link><joint name="j" type="{form}"><parent>world</parent>
+<child>a</child>{axes}{rest}</joint></model></sdf>"""
     return f"""<mujoco model="r"><compiler angle="radian"/><worldbody><body name="a">
 <inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/><joint name="j" type="{form}" {part}/></body>
 </worldbody>{rest}</mujoco>"""
