@@ -22,7 +22,7 @@ from pydrake.multibody.parsing import (
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, QuaternionFloatingJoint, RpyFloatingJoint
 
-from drake_dae.errors import DrakeDaeError, ModelError, RobotFileWarning
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import Constraint, MultibodyExpressions, joint_names, plant_constraints
 from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.changes import (
@@ -134,10 +134,11 @@ def read_robot(
             models = _mended(robot, files, mender)
             if mender.lost:
                 raise ModelError(_told(mender.lost))
-            if isinstance(models, Path):
-                parser.AddModels(str(models))
-            else:
-                ProcessModelDirectives(models, parser)
+            with _remarks(mender):
+                if isinstance(models, Path):
+                    parser.AddModels(str(models))
+                else:
+                    ProcessModelDirectives(models, parser)
             _add_floating_joints(plant, mender)
     for (category, kind), items in mender.told.items():
         warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
@@ -199,36 +200,39 @@ def _find_packages(files: RobotFiles, file: Path, within: tuple[Path, ...]) -> N
 
 @contextmanager
 def drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Iterator[None]:
-    """Converts Drake's exceptions to ModelError, and what it logs to one RobotFileWarning.
-
-    A failed assertion of Drake is a SystemExit.
-    """
-    remarks: list[str] = []
-    here, logger = get_native_id(), logging.getLogger("drake")
-
-    def original(text: str) -> str:
-        for copy, file in originals.items():
-            text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
-        return text.replace(" warning:", "")
-
-    def takes(record: logging.LogRecord) -> bool:
-        if record.thread != here or record.levelno < logging.WARNING:
-            return True
-        remarks.append(record.getMessage())
-        return False
-
-    logger.addFilter(takes)
+    """Converts Drake's exceptions to ModelError, also the SystemExit of a failed assertion."""
     try:
         yield
     except DrakeDaeError:
         raise
     except (RuntimeError, ValueError, SystemExit) as error:
-        raise ModelError(original(str(error))) from None
+        raise ModelError(_of_originals(str(error), originals)) from None
+
+
+@contextmanager
+def _remarks(mender: Mender) -> Iterator[None]:
+    """Tells what Drake logs in this thread."""
+    here, logger = get_native_id(), logging.getLogger("drake")
+
+    def passes(record: logging.LogRecord) -> bool:
+        is_remark = record.thread == here and record.levelno >= logging.WARNING
+        if is_remark:
+            text = _of_originals(record.getMessage(), mender.originals)
+            mender.tell("Drake reads the file with remarks", text.replace(" warning:", ""))
+        return not is_remark
+
+    logger.addFilter(passes)
+    try:
+        yield
     finally:
-        logger.removeFilter(takes)
-    if remarks:
-        text = _listed((" ".join(original(one).split()) for one in remarks), most=3)
-        warnings.warn(f"Drake reads the robot with remarks: {text}", RobotFileWarning, stacklevel=3)
+        logger.removeFilter(passes)
+
+
+def _of_originals(text: str, originals: Mapping[Path, Path]) -> str:
+    """A text of Drake with the names of files in the place of those of their copies."""
+    for copy, file in originals.items():
+        text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
+    return " ".join(text.split())
 
 
 def _told(lost: Mapping[str, list[str]]) -> str:

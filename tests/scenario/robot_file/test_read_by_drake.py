@@ -405,7 +405,7 @@ def test_what_drake_remarks_is_one_warning_with_the_users_file(tmp_path: Path):
     (line,) = {str(one.message) for one in told}
     assert "robot.xml:" in line
     assert "g0" in line
-    assert "17 more" in line
+    assert "12 more" in line
     assert "/" not in line.replace("robot.xml", "")
 
 
