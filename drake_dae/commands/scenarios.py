@@ -109,7 +109,7 @@ def analyze_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
 def page_command(options: argparse.Namespace) -> int:
     """Compiles a scenario into a page."""
     from drake_dae.pictures.page.page import write_page
-    from drake_dae.scenario.commanded import build_commanded
+    from drake_dae.scenario.rolled import build_commanded
 
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
