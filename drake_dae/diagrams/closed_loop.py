@@ -16,7 +16,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
 from drake_dae.dae import Signal
 from drake_dae.diagrams.parts import encoder_seed as seed_of_encoders
-from drake_dae.diagrams.record import Record, computed_record, recorded_values
+from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller, PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
@@ -131,7 +131,7 @@ class ClosedLoop:
         """Adds the derived signals of the controller, such as `tracking_error`, to a record."""
         values = {name: recorded.values for name, recorded in record.signals.items()}
         derived = self.controller.derived(values)
-        added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
+        added = {name: Recorded(v, tuple(signals)) for name, (v, signals) in derived.items()}
         return computed_record(record.time, {**record.signals, **added})
 
     @checked(WiringError)

@@ -40,13 +40,6 @@ class Recorded:
         object.__setattr__(self, "signals", tuple(self.signals))
 
 
-def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:
-    """A signal that the library itself has recorded, made without checks of the arguments."""
-    recorded = object.__new__(Recorded)
-    vars(recorded).update(values=values, signals=signals)
-    return recorded
-
-
 def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Record":
     """A record that the library itself has computed, made without checks of the arguments."""
     record = object.__new__(Record)
@@ -143,7 +136,7 @@ class Record:
 
     def _rows(self, rows: slice) -> Self:
         signals = {
-            name: recorded_values(recorded.values[rows], recorded.signals)
+            name: Recorded(recorded.values[rows], recorded.signals)
             for name, recorded in self.signals.items()
         }
         return type(self)(self.time[rows], signals, self.about)
@@ -186,7 +179,7 @@ class Record:
         return cls(
             time[last],
             {
-                name: recorded_values(np.ascontiguousarray(values), tuple(each))
+                name: Recorded(np.ascontiguousarray(values), tuple(each))
                 for (name, each), values in zip(signals.items(), columns, strict=True)
             },
         )
