@@ -163,7 +163,7 @@ def _page(options: argparse.Namespace) -> int:
     force and error with the prediction. It needs zig: pip install ziglang.
     """
     from drake_dae.pictures.page.page import write_page
-    from drake_dae.scenario.commanded import build_commanded
+    from drake_dae.scenario.rolled import build_commanded
 
     path = find_scenario(options.scenario)
     scenario = load_scenario(path, options.settings)
