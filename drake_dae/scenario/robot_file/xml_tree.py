@@ -18,6 +18,14 @@ class Node(Element):
     line = 0
 
 
+def read_included(file: Path, within: tuple[Path, ...]) -> Node:
+    """The root of a file that others include, none of which it is."""
+    if file.resolve() in within:
+        names = " -> ".join(path.name for path in (*within, file))
+        raise ModelError(f"'{file.name}' includes itself: {names}")
+    return read_xml(file)
+
+
 def read_xml(file: Path) -> Node:
     """The root of an XML file.
 
