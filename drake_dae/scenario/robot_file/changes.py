@@ -368,12 +368,12 @@ def loop_constraint(cut: CutJoint, plant: MultibodyPlant) -> Constraint:
         plant.world_frame(),
     )
     turning = [column[:3] for column in rates.T if np.linalg.norm(column[:3]) > 1e-9]
-    turning += [] if cut.slides else [rotation @ cut.axis]
-    sliding = [*rates[3:].T, *([rotation @ cut.axis] if cut.slides else [])]
+    sliding = [*rates[3:].T]
+    (sliding if cut.slides else turning).append(rotation @ cut.axis)
     normal = turning[-1] if turning else None
-    if normal is not None and any(
-        np.linalg.norm(np.cross(normal, axis)) > 1e-9 for axis in turning
-    ) | any(abs(normal @ axis) > 1e-9 for axis in sliding):
+    leans = [] if normal is None else [np.linalg.norm(np.cross(normal, axis)) for axis in turning]
+    leans += [] if normal is None else [abs(normal @ axis) for axis in sliding]
+    if any(lean > 1e-9 for lean in leans):
         normal = None
     if cut.slides and normal is not None:
         across = rotation.inverse() @ normal

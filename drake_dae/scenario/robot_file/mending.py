@@ -8,7 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -21,7 +21,7 @@ from drake_dae.scenario.robot_file import mjcf
 from drake_dae.scenario.robot_file.files import RobotFiles, drawable
 from drake_dae.scenario.robot_file.read_by_drake import DRIVES, READ_BY_DRAKE, take_lost
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.robot_file.xml_tree import read_included, write_xml
+from drake_dae.scenario.robot_file.xml_tree import check_included, read_xml, write_xml
 
 _ROUND = {"radius": 1, "length": 1}
 _SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "capsule": _ROUND}
@@ -33,15 +33,6 @@ _OF_MANY_AXES = ("planar", "floating", "universal", "ball", "free")
 
 _FLAT = 1e-8
 """A scale of a mesh up to which Drake takes none."""
-
-
-class Floating(NamedTuple):
-    """A floating joint that a copy lacks; its origin on the parent is a frame of the copy."""
-
-    model: str
-    name: str
-    child: str
-    origin: str
 
 
 class Mender:
@@ -64,7 +55,8 @@ class Mender:
         # "effort" limit, "armature", "follows" (leader, ratio, offset), "parent" of SDFormat ->
         # (model, joint) -> value.
         self.joints: dict[str, dict[tuple[str, str], Any]] = defaultdict(dict)
-        self.floating: list[Floating] = []
+        # Joints that the copies lack: model, name, child, and the frame that is their origin.
+        self.floating: list[tuple[str, str, str, str]] = []
         self.crossed: set[tuple[str, str]] = set()  # (model, link) without a visual shape.
 
     def copy(
@@ -82,7 +74,8 @@ class Mender:
         kind = file.suffix
         if kind not in READ_BY_DRAKE:
             return file
-        root = read_included(file, within)
+        check_included(file, within)
+        root = read_xml(file)
         if kind == ".xml":
             for servo in mjcf.expand(root, file):
                 text = "servos become motors without their gains: controls are efforts"
@@ -253,7 +246,7 @@ class Mender:
                 origin = joint.find("origin")
                 own = {"name": f"{name}_origin", "link": parent, "xyz": "0 0 0", "rpy": "0 0 0"}
                 SubElement(root, "frame", own | ({} if origin is None else origin.attrib))
-                self.floating.append(Floating(model, name, child, own["name"]))
+                self.floating.append((model, name, child, own["name"]))
             self._follow(model, joint, "mimic")
             still |= {name} if kind in _OF_MANY_AXES else set()
             for limit in joint.iterfind("limit[@effort]"):
@@ -266,9 +259,9 @@ class Mender:
         for transmission in root.findall("transmission"):
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
-            for name in driven if driven & still else ():
+            for one in driven & still:
                 why = "its effort is 0, or it has more than one axis"
-                self.lose("transmission/joint", f"joint '{name}': {why}")
+                self.lose("transmission/joint", f"joint '{one}': {why}")
             if not has_type or not driven & moving or driven & still:
                 root.remove(transmission)
                 continue
@@ -281,8 +274,8 @@ class Mender:
 
     def _mend_axes(self, joint: Element, place: str) -> None:
         """Refuses two dampings, of which Drake reads one; writes the pitch of a screw in m."""
-        dampings = [axis.findtext("dynamics/damping", "0") for axis in joint.iterfind("axis")]
-        dampings += [axis.findtext("dynamics/damping", "0") for axis in joint.iterfind("axis2")]
+        axes = (part for part in joint if part.tag in ("axis", "axis2"))
+        dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
         if len({*map(number_in, dampings)}) > 1:
             self.lose("axis2/damping", f"{place}: {' and '.join(dampings)}")
         pitch = joint.find("thread_pitch")
@@ -329,10 +322,8 @@ class Mender:
         kinds |= {one.get("name", ""): "free" for one in root.iter("freejoint")}
         for owner in root.iterfind("actuator"):
             for motor in owner.findall("motor"):
-                kind = kinds.get(motor.get("joint", ""), "") if "joint" in motor.attrib else "free"
-                if kind in _OF_MANY_AXES:
+                if (kind := kinds.get(motor.get("joint", ""))) in _OF_MANY_AXES:
                     owner.remove(motor)
-                if kind in _OF_MANY_AXES and "joint" in motor.attrib:
                     name = motor.get("name", motor.get("joint"))
                     self.lose(f"{kind}/motor", f"{file.name}: motor '{name}'")
         for joint in root.iter("joint"):
@@ -342,7 +333,7 @@ class Mender:
             elif armature:
                 self.lose(mjcf.ARMATURE, f"{file.name}: of a joint that no motor can drive")
         for name, free in mjcf.floating_bodies(root, placed):
-            self.floating.append(Floating(model, free, name, "world"))
+            self.floating.append((model, free, name, "world"))
 
     def _mend_geoms(self, root: Element, file: Path, model: str) -> None:
         """Leaves out what of the geometry Drake cannot take, unless a body has its mass from it."""

@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from drake_dae.arrays import number_in
 from drake_dae.errors import ModelError
-from drake_dae.scenario.robot_file.xml_tree import read_included
+from drake_dae.scenario.robot_file.xml_tree import check_included, read_xml
 
 ARMATURE = "joint/armature"
 """Rotor inertia. Drake gives it to motors only."""
@@ -49,9 +49,6 @@ def expand(root: Element, file: Path) -> list[str]:
     _include(root, file, (file.resolve(),), count(1))
     root.attrib.setdefault("model", file.stem)
     _apply_defaults(root)
-    if compiler(root).get("coordinate") == "global":
-        way = "MuJoCo up to 2.3.2 reads it, and saves it with local ones"
-        raise ModelError(f"'{file.name}' has global coordinates; {way}")
     for equality in root.iterfind("equality"):
         for constraint in list(equality):
             if constraint.attrib.pop("active", "true") == "false":
@@ -102,7 +99,8 @@ def _include(owner: Element, main: Path, within: tuple[Path, ...], number: Itera
         if next(number) > _MOST_INCLUDED:
             raise ModelError(f"'{main.name}' includes more than {_MOST_INCLUDED} files")
         file = main.parent / node.get("file", "")
-        included = read_included(file, within)
+        check_included(file, within)
+        included = read_xml(file)
         _include(included, main, (*within, file.resolve()), number)
         for part in included.iter():
             part.line = 0  # type: ignore[attr-defined]

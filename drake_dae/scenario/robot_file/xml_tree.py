@@ -18,12 +18,11 @@ class Node(Element):
     line = 0
 
 
-def read_included(file: Path, within: tuple[Path, ...]) -> Node:
-    """The root of a file that others include, none of which it is."""
+def check_included(file: Path, within: tuple[Path, ...]) -> None:
+    """Refuses a file that others include, if it is one of them."""
     if file.resolve() in within:
         names = " -> ".join(path.name for path in (*within, file))
         raise ModelError(f"'{file.name}' includes itself: {names}")
-    return read_xml(file)
 
 
 def read_xml(file: Path) -> Node:
