@@ -107,7 +107,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
         ),
         # Outputs.
         ("outputs.0.axes=xz", ["outputs: ", "1", "2", "(tool.x, tool.z)"]),
-        ("judgement.tolerances={tool.z: -1}", ["judgement: ", "tool.z", "-1"]),
+        ("judgement.tolerances={tool.z: -1}", ["judgement.tolerances.tool.z: ", "-1"]),
         ("judgement.tolerances={tool.q: 1}", ["judgement.tolerances: ", "'tool.q'"]),
         # Gains.
         ("law.gains.all=[1]", ["gains: ", "Hurwitz"]),
@@ -133,7 +133,7 @@ WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [
             ["actuation.0: ", "stiffness"],
         ),
         (f"{SPRINGS} [[1, 0, 0], [0, 1, 0]]}}]", ["actuation.0: ", "(2,)", "(2, 2)"]),
-        ("sensors.force={time_constant: 1, seed: -1}", ["sensors.force: seed: ", "-1"]),
+        ("sensors.force={time_constant: 1, seed: -1}", ["sensors.force.seed: ", "-1"]),
         ("plant.parameters={link9.mass: [1]}", ["plant.parameters: ", "link9.mass", "link2.mass"]),
         # The start.
         (
