@@ -323,7 +323,7 @@ class _NoController(TracedSystem, Controller):
 class _NoLaw:
     """Has of a law what records ask for, its system; all else of a law is an error."""
 
-    structure = None
+    structure = measured_force = None
 
     def __init__(self, system: DaeSystem) -> None:
         self.system = system
