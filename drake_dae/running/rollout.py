@@ -1,6 +1,5 @@
 """Rollouts: runs of a whole diagram without Drake's Simulator."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,7 +21,7 @@ from drake_dae.blocks.failures import (
 )
 from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
-from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepSettings
+from drake_dae.blocks.stepping import Run, RunEnding, StepSettings
 from drake_dae.blocks.trials import PACE_STEPS
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
@@ -37,9 +36,8 @@ from drake_dae.running.diagnosis import (
     IN_ROLLOUT,
     MANY,
     explained,
-    fastest_rate,
-    stiffness,
     too_long,
+    warn_if_stiff,
 )
 from drake_dae.running.drake_stepped import run_stepped
 from drake_dae.running.events import Seed
@@ -233,7 +231,12 @@ def run_loop(
             made = [run_interpreted(kind.functions, one, settings) for one in each]
         runs |= zip(indices.tolist(), made, strict=True)
     if settings.tableau is None:
-        _warn_of_stiffness(program, max(runs.values(), key=lambda run: run.steps), problems)
+        most = max(runs.values(), key=lambda run: run.steps)
+        if most.steps >= MANY and most.ending is RunEnding.DONE:  # A failure says its own cause.
+            context = program.context.Clone()
+            program.put(context, most.time, most.state, most.held, problems.run(0).parameters)
+            pace = (most.time - moments[0]) / most.steps
+            warn_if_stiff(program.diagram, context, pace, most.steps, IN_ROLLOUT)
     found = []
     for i in range(len(problems.state)):
         failure = None
@@ -242,17 +245,6 @@ def run_loop(
                 failure = _failure(program, problems.run(i).parameters, runs[i])
         found.append(Rollout(runs[i].steps, failure, program, moments, runs[i].rows))
     return found
-
-
-def _warn_of_stiffness(program: RolloutProgram, run: Run, problems: RunProblem) -> None:
-    """Warns where the fastest rate, not the accuracy, has made the steps of a run short."""
-    if run.steps < MANY or run.ending is not RunEnding.DONE:  # A failure says its own cause.
-        return
-    context, pace = program.context.Clone(), (run.time - problems.times[0]) / run.steps
-    program.put(context, run.time, run.state, run.held, problems.run(0).parameters)
-    rate = fastest_rate(program.diagram, context, run.time, run.state[: program.num_states])
-    if rate * pace > 1.0:
-        warnings.warn(stiffness(rate, pace, run.steps, IN_ROLLOUT), stacklevel=4)
 
 
 def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> SimulationError:
