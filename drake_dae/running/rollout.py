@@ -251,6 +251,8 @@ def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> Simul
     """The exception that the same run raises in Drake's Simulator."""
     if isinstance(run.error, SimulationError):
         return run.error
+    if run.error is not None:
+        return cannot_go_on(run.time, run.held[program.drake_state], str(run.error))
     plants = [s for s in program.composed.states if isinstance(s, Plant)]
     state = run.state[program.composed.states[plants[0]] if plants else slice(program.num_states)]
     trial = None
