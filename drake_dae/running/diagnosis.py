@@ -154,6 +154,10 @@ def _blocks_of(system: System) -> Iterator[System]:
         yield system
 
 
+# Name of a signal -> its present values, with their names and units.
+_Rows = dict[str, tuple[FloatArray, Sequence[Signal]]]
+
+
 class RunWatch:
     """Looks at a simulation: does it diverge, stop, or take very many steps, and why did it end.
 
@@ -275,7 +279,7 @@ class RunWatch:
         self, context: Context, *, is_last: bool = False, states_only: bool = False
     ) -> None:
         for plant, watch in self._watches.items():
-            rows = {
+            rows: _Rows = {
                 "state": (plant.state(plant.GetMyContextFromRoot(context)), plant.dae.state_signals)
             }
             if self._controller is not None and self._plant is not None and not states_only:
@@ -283,9 +287,7 @@ class RunWatch:
             row = {name: recorded_values(one[None], tuple(of)) for name, (one, of) in rows.items()}
             watch.look(computed_record(np.array([context.get_time()]), row), is_last=is_last)
 
-    def _compared(
-        self, context: Context, plant: Plant, controller: Controller
-    ) -> dict[str, tuple[FloatArray, Sequence[Signal]]]:
+    def _compared(self, context: Context, plant: Plant, controller: Controller) -> _Rows:
         """Present values of force, control and outputs, and what outputs are compared with."""
         local, dae, given = (
             plant.GetMyContextFromRoot(context),
@@ -296,7 +298,7 @@ class RunWatch:
         def value(name: str) -> FloatArray:
             return np.array(plant.GetOutputPort(name).Eval(local))
 
-        rows = {"constraint_force": (value("constraint_force"), dae.force_signals)}
+        rows: _Rows = {"constraint_force": (value("constraint_force"), dae.force_signals)}
         if given.HasValue(local):
             rows["control"] = np.array(given.Eval(local)), dae.control_signals
         compared = controller.compared(controller.GetMyContextFromRoot(context), value)

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import cast
 
 import numpy as np
 
@@ -167,19 +168,19 @@ def _of_contacts(record: Record, pushing: set[str]) -> Iterator[RunFinding]:
     """Lost contacts, which are problems in the second half of the run."""
     times, forces = record.time, record.signals["constraint_force"]
     for signal, values in zip(forces.signals, forces.values.T, strict=True):
-        touches = np.flatnonzero(values > 0.0)
+        touches, decides = np.flatnonzero(values > 0.0), cast(Outcome | None, Outcome.BAD)
         if signal.name not in pushing or (not touches.size and (values.size < 2 or values.any())):
             continue
         if not touches.size:
-            text, first, decides = f"{signal.name} is 0 all the time", times[0], Outcome.BAD
+            text, first = f"{signal.name} is 0 all the time", times[0]
         else:
             lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
             if not lost.size:
                 continue
             first, lasted = times[lost[0]], np.diff(times)[lost].sum()
             text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
-            is_late = times[lost[-1]] >= 0.5 * (times[0] + times[-1])
-            decides = Outcome.BAD if is_late else None
+            if times[lost[-1]] < 0.5 * (times[0] + times[-1]):
+                decides = None
         yield RunFinding(FindingKind.CONTACT, text, decides, signal, 0.0, time=float(first))
 
 

@@ -46,17 +46,12 @@ from drake_dae.running.simulate import check_config
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.compiled import Compiled, check_choice
 
-SEVERAL = 8
-"""The least number of runs that go side by side; fewer give the bits of single runs."""
-
-STAGES_PER_SECOND = 500
-"""An estimate of the evaluations in a simulated second under error control."""
-
+SEVERAL = 8  # The least number of runs that go side by side; fewer give the bits of single runs.
+STAGES_PER_SECOND = 500  # An estimate of the evaluations in a simulated second under error control.
+# The time that runs side by side save per evaluation, over that of an interpreted one.
 FASTER = 0.05
-"""The time that runs side by side save per evaluation, over that of an interpreted one."""
-
+# The most failed runs of one call whose cause is looked for, which takes up to a second each.
 DIAGNOSED = 8
-"""The most failed runs of one call whose cause is looked for, which takes up to a second each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +206,7 @@ def run_loop(
             continue
         with MAKING:
             kind = program.shared if of else program
-            some = kind.reduced(problems, indices)
+            some = kind.some(problems, indices)
             settings = StepSettings.of(config, kind.functions, stop)
             calls: float = STAGES_PER_SECOND
             if settings.tableau is not None:

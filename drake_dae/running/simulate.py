@@ -28,8 +28,8 @@ from drake_dae.running.compiled_run import NO_EVENTS, CompiledRun
 from drake_dae.running.diagnosis import RunWatch
 from drake_dae.running.interruption import Interruption, ending_signals
 
+# The time between updates of the progress bar, or between lines without a terminal, in s.
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
-"""The time between updates of the progress bar, or between lines without a terminal, in s."""
 
 
 @dataclass(frozen=True)
