@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, Diagram, System
 from drake_dae.arrays import FloatArray, show_state
 from drake_dae.blocks.failures import cannot_go_on, singular_configuration
 from drake_dae.dae import ConstraintStructure, EndCause, Signal, Structure, ZeroDynamics
-from drake_dae.diagrams.record import computed_record, recorded_values
+from drake_dae.diagrams.record import Recorded, computed_record
 from drake_dae.errors import (
     DrakeDaeError,
     PainleveError,
@@ -284,7 +284,7 @@ class RunWatch:
             }
             if self._controller is not None and self._plant is not None and not states_only:
                 rows |= self._compared(context, plant, self._controller)
-            row = {name: recorded_values(one[None], tuple(of)) for name, (one, of) in rows.items()}
+            row = {name: Recorded(one[None], tuple(of)) for name, (one, of) in rows.items()}
             watch.look(computed_record(np.array([context.get_time()]), row), is_last=is_last)
 
     def _compared(self, context: Context, plant: Plant, controller: Controller) -> _Rows:

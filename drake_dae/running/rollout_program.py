@@ -23,7 +23,7 @@ from drake_dae.blocks.stepping import RunProblem, StepFunctions
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.record import Record, computed_record, recorded_values
+from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError
 from drake_dae.running.events import Seed, drawn_noise, events_within, source_period
 from drake_dae.systems.parameterized import ParameterizedSystem
@@ -354,7 +354,7 @@ class RolloutProgram:
         columns, stop, signals = by_columns(rows[first:]), 0, {}
         for name, entries in self.signals.items():
             start, stop = stop, stop + len(entries)
-            signals[name] = recorded_values(columns[start:stop].T, tuple(entries))
+            signals[name] = Recorded(columns[start:stop].T, tuple(entries))
         record = computed_record(times[first:], signals)
         return self.loop.with_errors(record) if isinstance(self.loop, ClosedLoop) else record
 

@@ -17,6 +17,7 @@ from drake_dae.analysis import (
     along,
     analyze,
     digits,
+    examine,
     limits_along,
     robot_limits,
     to_text,
@@ -37,8 +38,8 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import (
     completed_model,
-    examine_scenario,
     exogenous_references,
+    of_steered,
     reference_and_start,
     references_of,
     scenario_structure,
@@ -147,7 +148,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     completed, model, _ = completed_model(scenario)
     scenario, gains = completed.scenario, ""
     try:
-        examined = examine_scenario(model) if scenario.task is None else None
+        examined = of_steered(model, examine) if scenario.task is None else None
         structure = None if examined is None or examined.problems else examined.structure
         structure = structure or scenario_structure(model)
     except AssumptionError:

@@ -100,7 +100,7 @@ class Scenario:
     description: str = field(default="", kw_only=True)
     robot: Robot
     constraints: list[parts.WrittenConstraint] = field(default_factory=list)
-    compliances: dict[str, float] | None = None
+    compliances: dict[str, parts.Positive] | None = None
     outputs: list[parts.WrittenOutput] = field(default_factory=list)
     tool_axis: Literal["normal", "fixed", "free"] = "normal"
     forces: list[str | ForceOutput] | None = None
@@ -208,7 +208,7 @@ _VALUES: dict[Any, Any] = {
 
 
 @cache
-def scenario_reader() -> Reader[Scenario]:
+def scenario_reader() -> Reader:
     """The reader and writer of scenarios as plain data."""
     move = dict(keys_of(rs.PointToPointReference))
     move["start_time"] = replace(move["start_time"], default=0.0)
@@ -235,7 +235,8 @@ def scenario_data(scenario: Scenario) -> dict[str, Any]:
 
 def read_scenario(data: Mapping[str, Any]) -> Scenario:
     """Makes a scenario from plain data."""
-    return scenario_reader().read(data)
+    scenario: Scenario = scenario_reader().read(data)
+    return scenario
 
 
 def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

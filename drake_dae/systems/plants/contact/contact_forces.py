@@ -99,7 +99,7 @@ def contact_block(
     # J of the velocities of all contact points, shape (3 m, nv).
     nominal = structure.manifold.project(dae.nominal_state, values)
     normals = ca.SX.sym("normals", given.numel())
-    contacts = point_contacts(model, normals, ca.SX(material.radius), None)
+    contacts = point_contacts(model, normals, ca.SX(material.values), material)
     at = ca.Function("n", [dae.state, dae.parameter_symbol], [ball_normals(model)])
     (jacobian,) = ca.substitute(
         [ca.vertcat(*(contact.jacobian for contact in contacts))],
