@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,7 @@ class Study:
 
     def extent(self) -> dict[str, dict[str, float]]:
         """Name of a figure -> its least, median and largest value over the runs that have it."""
+        of: dict[str, Callable[[FloatArray], Any]]
         of = {"least": np.nanmin, "median": np.nanmedian, "largest": np.nanmax}
         return {
             figure: {name: float(function(self.values(figure))) for name, function in of.items()}
