@@ -249,7 +249,7 @@ class Reader:
             for one in error.errors():
                 path = [str(part) for part in one["loc"] if str(part)[:1] != "!"]  # A tag.
                 place = place_of(".".join([*path, one["ctx"]["wrong"]]).rstrip("."))
-                problems.append((".".join(path) or "scenario", f"{one['msg']} {place}"))
+                problems.append((".".join(path) or "scenario", f"{one['ctx']['text']} {place}"))
             raise ScenarioError(*problems) from None
 
     def write(self, value: Any) -> Any:
