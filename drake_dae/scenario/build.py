@@ -274,7 +274,7 @@ def _task_controller(
             free_system, gains.design(), structure=structure, latency=law.latency
         )
     # The noise of the sum over the points.
-    noise = float(np.max(scenario.sensors.force_noise)) * len(points) ** 0.5
+    noise = scenario.sensors.force_noise * len(points) ** 0.5
     return TaskController(task.make(noise), law, free_law, sample_period=period or 1e-3)
 
 

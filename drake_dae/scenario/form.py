@@ -160,6 +160,7 @@ _WORDS = {
     "float_type": "a number",
     "finite_number": "a finite number",
     "greater_than": "a positive number",
+    "greater_than_equal": "0 or more",
     "int_type": "a whole number",
     "bool_type": "true or false",
     "string_type": "text",

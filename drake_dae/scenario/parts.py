@@ -3,13 +3,14 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar, cast
+from typing import Annotated, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.arrays import unknown_name
 from drake_dae.dae import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.references import Reference
@@ -29,6 +30,7 @@ from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.task import Task
 
 T = TypeVar("T", Constraint, PositionOutput)
+Positive = Annotated[float, Field(gt=0.0)]
 
 
 @dataclass(frozen=True)
@@ -128,11 +130,7 @@ class MeasuredForce:
     bias: ArrayLike = 0.0
     noise_deviation: ArrayLike = 0.0
     drift: ArrayLike = 0.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**32:
-            raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
     def sensor(self, size: int) -> ForceSensor:
         """The sensor of m = `size` forces."""
@@ -153,9 +151,9 @@ class Sensors:
     force: MeasuredForce | None = None
 
     @property
-    def force_noise(self) -> FloatArray:
-        """The standard deviation of the noise of the measured force, in N or N m."""
-        return np.asarray(0.0 if self.force is None else self.force.noise_deviation)
+    def force_noise(self) -> float:
+        """The largest standard deviation of the noise of the measured force, in N or N m."""
+        return 0.0 if self.force is None else float(np.max(self.force.noise_deviation))
 
 
 @dataclass(frozen=True)
@@ -167,13 +165,8 @@ class LargestErrors:
         force: Of a contact force, in N; no bound if left out.
     """
 
-    position: float | None = None
-    force: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, most in vars(self).items():
-            if most is not None:
-                positive(f"largest {name} error", most)
+    position: Positive | None = None
+    force: Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -253,11 +246,6 @@ class Matrices(Gains):
     """
 
     groups: list[list[list[list[float]]]]
-
-    def __post_init__(self) -> None:
-        for matrix in (matrix for group in self.groups for matrix in group):
-            if len({len(row) for row in matrix}) != 1:
-                raise GainError(f"groups: the rows of {matrix} have different lengths")
 
     def design(self) -> GainDesign:
         return gain_matrices(*self.groups)
@@ -364,14 +352,9 @@ class Judgement:
             with the reason.
     """
 
-    tolerances: dict[str, float | None] = field(default_factory=dict)
+    tolerances: dict[str, Positive | None] = field(default_factory=dict)
     friction_cones: list[FrictionCone] = field(default_factory=list)
     may_diverge: bool = False
-
-    def __post_init__(self) -> None:
-        for name, tolerated in self.tolerances.items():
-            if tolerated is not None:
-                positive(f"tolerances: {name}", tolerated)
 
     @property
     def tolerated(self) -> dict[str, float]:

@@ -100,7 +100,7 @@ class Scenario:
     description: str = field(default="", kw_only=True)
     robot: Robot
     constraints: list[parts.WrittenConstraint] = field(default_factory=list)
-    compliances: dict[str, float] | None = None
+    compliances: dict[str, parts.Positive] | None = None
     outputs: list[parts.WrittenOutput] = field(default_factory=list)
     tool_axis: Literal["normal", "fixed", "free"] = "normal"
     forces: list[str | ForceOutput] | None = None

@@ -10,7 +10,6 @@ from functools import lru_cache
 from threading import Lock
 from typing import Any
 
-import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.analysis import SignalLimits, robot_limits
@@ -92,7 +91,7 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
         patterns.append(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
     if not (isinstance(base.law.gains, Matrices) or base.is_advised or base.task is not None):
         patterns.append(r"law\.gains\..+")
-        if np.any(base.sensors.force_noise):
+        if base.sensors.force_noise:
             patterns.append(r"sensors\.force\.noise_deviation")
     in_context = re.compile("|".join(patterns))
     own = {key: value for key, value in variation.items() if not in_context.fullmatch(key)}
