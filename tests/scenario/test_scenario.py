@@ -126,7 +126,7 @@ def test_every_form_reads_back_equal(tmp_path):
     assert copy.forces == scenario.forces
     assert copy.references == scenario.references
     assert copy.law.gains == scenario.law.gains
-    assert copy.sensors.force.sensor(2).sample_period == 0.001
+    assert copy.sensors.force.sample_period == 0.001
     pairs = list(zip(copy.actuation, scenario.actuation, strict=True))
     for one, other in [*pairs, (copy.sensors.force, scenario.sensors.force)]:
         assert type(one) is type(other)
