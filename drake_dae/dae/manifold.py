@@ -16,14 +16,7 @@ from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction, count_operations
-from drake_dae.trace.newton import (
-    PRECISION,
-    ROUNDING,
-    NewtonModel,
-    newton,
-    norm,
-    shortest_steps,
-)
+from drake_dae.trace.newton import PRECISION, ROUNDING, NewtonModel, newton, norm, shortest_steps
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
 POLE = 1e-3  # A larger residual, over its usual change by the scale of the states, is no round-off.
@@ -249,10 +242,7 @@ class Manifold:
         return text + "Start nearer to the constraint, away from its singular states"
 
     def settle(
-        self,
-        state: ArrayLike,
-        parameters: ArrayLike | None = None,
-        fixed: Sequence[str] = (),
+        self, state: ArrayLike, parameters: ArrayLike | None = None, fixed: Sequence[str] = ()
     ) -> FloatArray:
         """Returns the consistent state next to a user's start, computed level by level."""
         start, p = self._state(state), self.system.parameter_vector(parameters)

@@ -222,10 +222,7 @@ class PinnedSet:
         return self.outputs.motion.evaluate(state, self.reference, self.parameters)[0].copy()
 
     def slopes(
-        self,
-        state: FloatArray,
-        directions: FloatArray | None = None,
-        by: FloatArray | None = None,
+        self, state: FloatArray, directions: FloatArray | None = None, by: FloatArray | None = None
     ) -> FloatArray:
         """Returns the derivatives of x' along columns of dx, all if None, and of dR if given."""
         columns = np.eye(state.size) if directions is None else directions

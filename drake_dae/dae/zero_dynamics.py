@@ -15,13 +15,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive, show, vector
-from drake_dae.dae.pinned_motion import (
-    PinnedMotion,
-    PinnedOutputs,
-    PinnedSet,
-    TimeFunction,
-    follow,
-)
+from drake_dae.dae.pinned_motion import PinnedMotion, PinnedOutputs, PinnedSet, TimeFunction, follow
 from drake_dae.dae.stability import (
     AT_REST,
     ISOLATED,
