@@ -117,7 +117,7 @@ class Structure(ConstraintStructure):
         degrees = f"r={self.constraint_degrees}, mu={self.output_degrees}"
         return f"Structure({self.system.name!r}, {degrees}, index={self.index})"
 
-    @property
+    @cached_property
     def layout(self) -> DerivativeLayout:
         """The layout of reference vectors and output chains."""
         return DerivativeLayout(self.output_degrees)
@@ -145,12 +145,10 @@ class Structure(ConstraintStructure):
         """
         if self.system.control_metric is not None or self.system.frictional_contacts:
             return None
-        motion = self.derivatives
+        motion, size = self.derivatives, self.system.num_states
         shown = ca.vertcat(motion.rate, motion.constraint_input)
-        solution = motion.inverse(self.highest_derivatives, commanded, shown)
-        if solution is None:
+        if (solution := motion.inverse(self.highest_derivatives, commanded, shown)) is None:
             return None
-        size = self.system.num_states
         return solution[2][:size, :], solution[2][size:, :], solution[1]
 
     def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -182,10 +180,7 @@ def find_constraint_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> ConstraintStructure:
     """Finds r_1, ..., r_m and A(x), and checks Assumptions (1)-(3)."""
-    structure, samples = examine_constraints(system, guesses(system, spread, count, seed))
-    violation = constraint_violation(structure)
-    if violation:
-        raise violation.error()
+    structure, samples = _sound_constraints(system, spread, count, seed)
     # Rows of n* that are only round-off are no feedthrough.
     actions = InputActions(samples, structure.elimination)
     acts = actions.numbers(actions.feedthrough).any(axis=(0, 2))
@@ -216,9 +211,9 @@ def find_structure(
     Raises:
         AssumptionError: An assumption is violated; the exception has the state where.
         InconsistentStateError: There is no consistent state near the nominal one.
-        ModelError: The outputs are not as many as the controls (or fewer, with a metric), or there
-            are none, a function is not finite at the nominal state, the mass matrix or the metric
-            is not symmetric and positive definite, or count or spread make no sense.
+        ModelError: The outputs are not as many as the controls (or fewer, with a metric), a
+            function is not finite at the nominal state, or the mass matrix or the metric is not
+            symmetric and positive definite.
     """
     structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
     if violation:
@@ -232,11 +227,7 @@ def examine_structure(
     """Finds the structure as `find_structure`, but also returns it where B(x) is singular."""
     if why := why_no_law(system):
         raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
-    constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
-    violation = constraint_violation(constrained)
-    if violation:
-        raise violation.error()
-    structure = examine_outputs(constrained, samples)
+    structure = examine_outputs(*_sound_constraints(system, spread, count, seed))
     return structure, control_violation(structure)
 
 
@@ -275,12 +266,17 @@ def why_no_law(system: DaeSystem) -> str:
     )
 
 
-def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """Returns initial guesses of consistent states, shape (count + 1, n), of a sound system."""
+def _sound_constraints(
+    system: DaeSystem, spread: ArrayLike | None, count: int, seed: int
+) -> tuple[ConstraintStructure, Samples]:
+    """The structure of the constraints, which fulfil Assumptions (1)-(3), and its samples."""
     check_system(system)
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
-    return draw(system, spread, count, seed)
+    structure, samples = examine_constraints(system, draw(system, spread, count, seed))
+    if violation := constraint_violation(structure):
+        raise violation.error()
+    return structure, samples
 
 
 def check_system(system: DaeSystem) -> None:

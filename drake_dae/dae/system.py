@@ -397,6 +397,14 @@ class DaeSystem:
                 to[..., :count] = moved[..., :count]
         return parameters
 
+    def states_named(self, names: Sequence[str]) -> list[int]:
+        """Returns the indices of states by their names."""
+        known = [signal.name for signal in self.state_signals]
+        for name in names:
+            if name not in known:
+                raise ModelError(f"{self.name}: {unknown_name('state', name, known)}")
+        return [known.index(name) for name in names]
+
     def state_vector(self, state: ArrayLike) -> FloatArray:
         """Checks a state and returns it as a new array of shape (n,)."""
         return vector(f"{self.name}: a state", state, self.num_states)
