@@ -17,6 +17,7 @@ from drake_dae.analysis import (
     along,
     analyze,
     digits,
+    examine,
     limits_along,
     robot_limits,
     to_text,
@@ -37,8 +38,8 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import (
     completed_model,
-    examine_scenario,
     exogenous_references,
+    of_steered,
     reference_and_start,
     references_of,
     scenario_structure,
@@ -147,7 +148,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     completed, model, _ = completed_model(scenario)
     scenario, gains = completed.scenario, ""
     try:
-        examined = examine_scenario(model) if scenario.task is None else None
+        examined = of_steered(model, examine) if scenario.task is None else None
         structure = None if examined is None or examined.problems else examined.structure
         structure = structure or scenario_structure(model)
     except AssumptionError:
@@ -234,6 +235,7 @@ def judge_run(
     """Judges a run by its record."""
     # What exceeds its limits, and which links are behind surfaces. The last numbers of a run that
     # broke off are not those of its motion.
+    wanted = scenario.judgement
     model, changes, stop = loop.plant.robot("a scenario"), loop.changes(record), record.time.size
     limits = robot_limits(model, scenario.judgement.friction_cones)
     if failure:
@@ -300,7 +302,7 @@ def judge_run(
         record,
         loop.predicted_error(record),
         ranges,
-        tolerances=scenario.judgement.tolerated,
+        tolerances={n: np.inf if e is None else e for n, e in wanted.tolerances.items()},
         changes=changes,
         ended=ended,
         accuracy=accuracy,

@@ -1,30 +1,27 @@
 """The plants of a scenario: each member of this family makes a plant."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import ClassVar, cast
+from typing import Annotated, ClassVar, cast
 
+from pydantic import Field
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import brief
 from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import RobotModel
-from drake_dae.scenario.form import at
-from drake_dae.scenario.robot_file.robot import Payload
+from drake_dae.scenario.form import Expected, at
+from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Payload, Robot
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
 from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_plant import RobotPlant
-
-AddRobot = Callable[[DrakePlant, SceneGraph], None]
-"""Adds a robot with its payloads to a MultibodyPlant."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +63,7 @@ class ScenarioPlant(ABC):
         """Sets the numbers of `in_context` in a context of the plant."""
 
     @abstractmethod
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         """Makes the plant of a robot, with the structure of its system."""
 
 
@@ -74,7 +71,7 @@ class ScenarioPlant(ABC):
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
 
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         return RobotPlant(model, structure=structure)
 
 
@@ -101,7 +98,10 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
         names = [f.name for f in (*fields(PointMaterial), *fields(ScenarioPlant))]
         return CompliantContact(**{name: getattr(self, name) for name in names})
 
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        def add(plant: DrakePlant, scene_graph: SceneGraph) -> None:
+            read_robot(robot, plant, scene_graph, self.payloads)
+
         with at("plant or plant.parameters"):
             return ContactPlant(
                 model,
@@ -132,9 +132,15 @@ class CompliantContact(PointMaterial, ScenarioPlant):
     def begin(self, plant: Plant, context: Context) -> None:
         cast(CompliantPlant, plant).set_contact(context, self)
 
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         with at("plant or plant.parameters"):  # Whose numbers are set in a context.
             return CompliantPlant(model, self, structure=structure)
+
+
+MAKER = Expected(
+    "a module and a class in it, as my_plants:SpringyPlant",
+    Annotated[str, Field(pattern=r"^[^:]+:[^\W\d]\w*$")],
+)
 
 
 @dataclass(frozen=True)
@@ -149,18 +155,10 @@ class OwnPlant(ScenarioPlant):
         maker: The module and the class in it, as "my_plants:SpringyPlant".
     """
 
-    maker: str
+    maker: Annotated[str, MAKER]
     adjusts: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
-        module, _, name = self.maker.partition(":")
-        if not (module and name.isidentifier()):
-            raise ModelError(
-                "maker: a module and a class in it are needed, as my_plants:SpringyPlant, got "
-                f"'{brief(self.maker)}'"
-            )
-
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         module, _, name = self.maker.partition(":")
         with at("plant.maker"):
             try:
