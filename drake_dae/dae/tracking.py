@@ -52,10 +52,8 @@ class TrackingLaw:
             step counts whole without sampling: by it damping is compensated: see `acting_late`.
 
     `function` is the law as (state, reference, measured_force, integral, parameters) -> control,
-    tracking_error and integral_rate, without what the law does not have, and with the parameters of
-    `all_parameters`; `outputs` are these as expressions of `inputs`, and `pivot` is 0 where the
-    matrix that `regular` names is singular. `layout` is that of reference vectors, and
-    `reference_signals` names them.
+    tracking_error, integral_rate, as far as it has them; `outputs` are these as expressions of
+    `inputs`, and `pivot` is 0 where the matrix that `regular` names is singular.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
@@ -80,7 +78,7 @@ class TrackingLaw:
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:
-            self.deflection = Deflection.of(self.structure, contact_stiffness, constraint_damping)
+            self.deflection = Deflection(self.structure, contact_stiffness, constraint_damping)
             more = tuple(2 * (i in self.deflection.inputs) for i in range(system.num_outputs))
         self._law_structure = law_structure(
             self.structure, constraint_damping, latency, self.deflection
@@ -89,20 +87,16 @@ class TrackingLaw:
         self.reference_signals = self.layout.reference_signals(system.output_signals)
         if not measured_force and numbers("force_gain", force_gain, GainError).any():
             raise GainError("force_gain needs measured_force=True")
-        self.measured_force = (
-            ForceMeasurement.of(system, self.layout, force_gain) if measured_force else None
-        )
-        self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
+        self.measured_force: ForceMeasurement | None = None
+        if measured_force:
+            self.measured_force = ForceMeasurement(system, self.layout, force_gain)
+        self.integral = IntegralAction(system, self.degrees, integral, self.measured_force)
         self.gains = self.design(gains)
         self.function = self._trace()
 
     def __repr__(self) -> str:
         outputs = listed(signal.name for signal in self.system.output_signals)
-        force = ", measured_force" if self.measured_force else ""
-        return (
-            f"TrackingLaw('{self.system.name}', outputs={outputs}, "
-            f"degrees={list(self.degrees)}{force})"
-        )
+        return f"TrackingLaw('{self.system.name}', outputs={outputs}, degrees={list(self.degrees)})"
 
     def _trace(self) -> TracedFunction:
         """The law (28) and the tracking error (29) as one function."""
@@ -128,7 +122,7 @@ class TrackingLaw:
         outputs = {"control": control, "tracking_error": output - values}  # (29)
         if self.integral.outputs:
             inputs["integral"] = self.integral.symbol
-            outputs["integral_rate"] = self.integral.rate(chain, values, measured)
+            outputs["integral_rate"] = self.integral.rate(chain, values)
         self.control_takes_force = measured is not None and bool(
             ca.depends_on(ca.vertcat(control, output), measured.symbol)
         )
@@ -142,23 +136,19 @@ class TrackingLaw:
         )
         parameters = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         self._ubar, self.outputs, self.pivot = ubar, outputs, pivot
-        self._inputs = {"state": self.system.state, **inputs, "parameters": parameters}
+        #: Name -> symbol of each input of `function`.
+        self.inputs = {"state": self.system.state, **inputs, "parameters": parameters}
         self.regular = (
             f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}"
         )
         name, compiled = f"{self.system.name} tracking law", self.system.compiled
-        return TracedFunction(name, self._inputs, outputs, pivot, self.regular, compiled=compiled)
+        return TracedFunction(name, self.inputs, outputs, pivot, self.regular, compiled=compiled)
 
     def _deflected(self, expression: ca.SX, reference: ca.SX) -> ca.SX:
         if self.deflection is None:
             return expression
         wanted = self.deflection.wanted(reference, self.layout)
         return ca.substitute(expression, self.deflection.symbol, wanted)
-
-    @property
-    def inputs(self) -> dict[str, ca.SX]:
-        """Name -> symbol of each input of `function`."""
-        return dict(self._inputs)
 
     def trace_motion(self) -> TracedFunction | None:
         """Traces x' and v of a plant that equals the law's model, under the law."""
@@ -168,7 +158,7 @@ class TrackingLaw:
             return None
         rate, force, pivot = motion
         outputs, name = {"rate": rate, "force": force}, f"{self.system.name} under its law"
-        return TracedFunction(name, self._inputs, outputs, pivot, often=False)
+        return TracedFunction(name, self.inputs, outputs, pivot, often=False)
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -212,12 +202,10 @@ class TrackingLaw:
     def coordinate_signals(self) -> list[Signal]:
         """Names and units of the error coordinates."""
         integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))
-        signals = []
-        for i, (signal, degree) in enumerate(
-            zip(self.system.output_signals, self.degrees, strict=True)
-        ):
+        signals = list[Signal]()
+        for i, signal in enumerate(self.system.output_signals):
             signals += [integrals[i]] if i in integrals else []
-            signals += [signal.derivative(order) for order in range(degree)]
+            signals += [signal.derivative(order) for order in range(self.degrees[i])]
         return signals
 
     def control(
@@ -229,14 +217,11 @@ class TrackingLaw:
         integral: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """Returns the control u(x, R) of (28).
+        """Returns the control u(x, R) of (28), shape (p,).
 
-        Args:
-            state: x, shape (n,).
-            reference: R, shape (sum (mu_i + 1),), output-major.
-            measured_force: v, shape (m,); exactly where the law takes it.
-            integral: The integrals of the errors, shape (k,); zero if None.
-            parameters: Values of all parameters; the defaults if None.
+        The state has shape (n,), the reference shape (sum (mu_i + 1),), output-major;
+        measured_force, shape (m,), is given exactly where the law takes it; the integrals of the
+        errors, shape (k,), are zero and the parameters the defaults if None.
         """
         measured = [] if measured_force is None else [measured_force]
         if self.integral.outputs:
@@ -256,8 +241,7 @@ class TrackingLaw:
     ) -> FloatArray:
         """Returns (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
 
-        The integral of an error stands before it, where the law has one. The arguments are those of
-        `control`.
+        The integral of an error stands before it; the arguments are those of `control`.
         """
         values, sigma = self.system.parameter_vector(parameters), self._integrals(integral)
         return self.coordinates_function(state, reference, sigma, values)[0]

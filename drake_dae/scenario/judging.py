@@ -235,6 +235,7 @@ def judge_run(
     """Judges a run by its record."""
     # What exceeds its limits, and which links are behind surfaces. The last numbers of a run that
     # broke off are not those of its motion.
+    wanted = scenario.judgement
     model, changes, stop = loop.plant.robot("a scenario"), loop.changes(record), record.time.size
     limits = robot_limits(model, scenario.judgement.friction_cones)
     if failure:
@@ -301,7 +302,7 @@ def judge_run(
         record,
         loop.predicted_error(record),
         ranges,
-        tolerances=scenario.judgement.tolerated,
+        tolerances={n: np.inf if e is None else e for n, e in wanted.tolerances.items()},
         changes=changes,
         ended=ended,
         accuracy=accuracy,
