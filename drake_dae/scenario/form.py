@@ -28,12 +28,16 @@ from typing import (
 
 import numpy as np
 import pydantic
+from casadi import SX
+from numpy.typing import ArrayLike
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError, core_schema
 from typing_extensions import TypedDict
 
 from drake_dae.arrays import brief
 from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.robots import Pair, Vector
 from drake_dae.scenario.typed_yaml import TAG, first_name
+from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -130,22 +134,27 @@ def in_folder(name: str, info: pydantic.ValidationInfo) -> str:
 
 
 _TWO, _THREE = (pydantic.Field(min_length=size, max_length=size) for size in (2, 3))
-PAIR = Expected("2 numbers", Annotated[list[float], _TWO], tuple)
-TRIPLE = Expected("3 numbers", Annotated[list[float], _THREE], tuple)
-NUMBERS = Expected(
-    "a number, a list of numbers, or a matrix as a list of rows of one length",
-    float | list[float] | list[list[float]],
-    _rectangular,
-)
-NUMBER_OR_LIST = Expected("a number or a list of numbers", float | list[float])
+FILE = Expected("the name of a file", str, in_folder)
 INTERVAL = Expected(
     "a lowest and a highest value, each a number or a list of numbers",
     Annotated[list[float | list[float]], _TWO],
     tuple,
 )
-COMPILED = Expected("true, false or auto", bool | Literal["auto"])
-FILE = Expected("the name of a file", str, in_folder)
-NAMES = Expected("a name or a list of names", str | list[str])
+VALUES: dict[Any, Any] = {
+    Callable[..., SX] | str: str,
+    str | Path: FILE,
+    str | Sequence[str]: Expected("a name or a list of names", str | list[str]),
+    Compiled: Expected("true, false or auto", bool | Literal["auto"]),
+    float | list[float]: Expected("a number or a list of numbers", float | list[float]),
+    ArrayLike: Expected(
+        "a number, a list of numbers, or a matrix as a list of rows of one length",
+        float | list[float] | list[list[float]],
+        _rectangular,
+    ),
+    Vector: Expected("3 numbers", Annotated[list[float], _THREE], tuple),
+    Pair: Expected("2 numbers", Annotated[list[float], _TWO], tuple),
+}
+"""What stands in data for the types of values in annotations."""
 
 
 def _shown(data: Any) -> str:
@@ -160,6 +169,7 @@ _WORDS = {
     "float_type": "a number",
     "finite_number": "a finite number",
     "greater_than": "a positive number",
+    "greater_than_equal": "0 or more",
     "int_type": "a whole number",
     "bool_type": "true or false",
     "string_type": "text",
@@ -202,18 +212,17 @@ def _problem(text: str, wrong: str = "") -> PydanticCustomError:
 class Reader:
     """Makes a dataclass of plain data, and plain data of it.
 
-    `families` and `values` stand in data for types in annotations; `keys` are those of classes that
-    are no dataclasses, or have other defaults.
+    `families` stand in data for types in annotations, as `VALUES` do; `keys` are those of classes
+    that are no dataclasses, or have other defaults.
     """
 
     def __init__(
         self,
         form: type,
         families: Mapping[Any, Family],
-        values: Mapping[Any, Any],
         keys: Mapping[type, Mapping[str, Key]],
     ) -> None:
-        self._families, self._values, self._keys = families, values, keys
+        self._families, self._keys = families, keys
         self._types, self._free = dict[Any, Any](), set[str]()  # Keys whose names are free.
         self._tags = {c: t for f in families.values() for t, c in f.members.items()}
         self.tags = list(dict.fromkeys(self._tags.values()))
@@ -240,7 +249,7 @@ class Reader:
             for one in error.errors():
                 path = [str(part) for part in one["loc"] if str(part)[:1] != "!"]  # A tag.
                 place = place_of(".".join([*path, one["ctx"]["wrong"]]).rstrip("."))
-                problems.append((".".join(path) or "scenario", f"{one['msg']} {place}"))
+                problems.append((".".join(path) or "scenario", f"{one['ctx']['text']} {place}"))
             raise ScenarioError(*problems) from None
 
     def write(self, value: Any) -> Any:
@@ -295,7 +304,8 @@ class Reader:
         origin, parts, members = get_origin(hint), get_args(hint), _members(hint)
         if origin is Annotated:
             return Annotated[self._type(parts[0]), *parts[1:]]
-        value = next((v for base, v in self._values.items() if _members(base) <= members), None)
+        value = next((v for base, v in VALUES.items() if _members(base) <= members), None)
+        value = Annotated[Any, value] if isinstance(value, Expected) else value
         family = next((f for base, f in self._families.items() if base in members), None)
         if value is None and family is not None:
             if id(family) not in self._types:

@@ -11,7 +11,7 @@ from pydrake.geometry import SceneGraph
 
 from drake_dae.analysis import robot_limits
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import DaeSystem, Structure, ZeroDynamics, find_structure
 from drake_dae.errors import (
     AssumptionError,
@@ -169,10 +169,9 @@ def _checked_constraints(
     each("forces", forces or (), lambda f: force_rows(as_force_outputs([f], bound), bound, links))
     with at("forces"):
         as_force_outputs(forces, bound)
-    for force, value in (scenario.compliances or {}).items():
+    for force in scenario.compliances or {}:
         with at(f"compliances.{force}"):
             bound.place(force)
-            positive("a compliance", value)
     each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
     with at("law.control_weights"):
         choice = control_choice(robot.title, scenario.law.control_weights or None, actuators)

@@ -3,17 +3,17 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import ClassVar, cast
+from typing import Annotated, ClassVar, cast
 
+from pydantic import Field
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import brief
 from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import RobotModel
-from drake_dae.scenario.form import at
+from drake_dae.scenario.form import Expected, at
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Payload, Robot
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
@@ -137,6 +137,12 @@ class CompliantContact(PointMaterial, ScenarioPlant):
             return CompliantPlant(model, self, structure=structure)
 
 
+MAKER = Expected(
+    "a module and a class in it, as my_plants:SpringyPlant",
+    Annotated[str, Field(pattern=r"^[^:]+:[^\W\d]\w*$")],
+)
+
+
 @dataclass(frozen=True)
 class OwnPlant(ScenarioPlant):
     """The plant is your own class that follows the contract of `drake_dae.Plant`.
@@ -149,16 +155,8 @@ class OwnPlant(ScenarioPlant):
         maker: The module and the class in it, as "my_plants:SpringyPlant".
     """
 
-    maker: str
+    maker: Annotated[str, MAKER]
     adjusts: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        module, _, name = self.maker.partition(":")
-        if not (module and name.isidentifier()):
-            raise ModelError(
-                "maker: a module and a class in it are needed, as my_plants:SpringyPlant, got "
-                f"'{brief(self.maker)}'"
-            )
 
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         module, _, name = self.maker.partition(":")

@@ -13,8 +13,10 @@ from two_arms import GRASP
 from drake_dae import (
     AxisCoordinates,
     AxisNormalToSurface,
+    CircleReference,
     CoincidentPoints,
     ConstantReference,
+    CsvReference,
     Cylinder,
     DcMotors,
     ElectrohydraulicServos,
@@ -24,25 +26,31 @@ from drake_dae import (
     ForceCombination,
     JointCoupler,
     JointPositions,
+    LineReference,
     Plane,
     PointCoordinates,
     PointOnSurface,
     PointToPointReference,
+    PolylineReference,
     RollingWheel,
     SinusoidReference,
     Sphere,
     Squeeze,
     Torus,
+    WaypointsReference,
     build_scenario,
     load_scenario,
     shipped_model,
 )
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.references import PathLimits
 from drake_dae.robots import Blade, RollingBall
 from drake_dae.scenario import parts as forms
 from drake_dae.scenario.robot_file.robot import Pose, Robot
 from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario
+
+LIMITS = PathLimits(0.2, 1.0)
 
 
 def test_every_form_reads_back_equal(tmp_path):
@@ -97,6 +105,12 @@ def test_every_form_reads_back_equal(tmp_path):
             "b": SinusoidReference(1.0, [2.0], [3.0], [4.0]),
             "c.d, e": PointToPointReference([0.0], [1.0], 0.5, 2.0, 4),
             "f": 2.0,
+            "g": LineReference([0, 1], [1, 2], LIMITS),
+            "h": CircleReference([0, 1], 0.1, limits=LIMITS, turns=-2.0, phase=0.5),
+            "i": PolylineReference([[0, 0], [1, 0], [1, 1]], LIMITS, 0.1, order=3),
+            "j": WaypointsReference([[0, 0], [1, 0]], [0, 2], order=2),
+            "k": WaypointsReference([[0, 0], [1, 0], [0, 1]], limits=LIMITS),
+            "l": CsvReference("/a.csv", ["y", "z"], smoothing=0.1, start_time=2.0),
         },
         start=forms.Start({"joint1": 1e-9}, {"a.b": -1e300}),
         duration=1e-3,
@@ -112,7 +126,7 @@ def test_every_form_reads_back_equal(tmp_path):
     assert copy.forces == scenario.forces
     assert copy.references == scenario.references
     assert copy.law.gains == scenario.law.gains
-    assert copy.sensors.force.sensor(2).sample_period == 0.001
+    assert copy.sensors.force.sample_period == 0.001
     pairs = list(zip(copy.actuation, scenario.actuation, strict=True))
     for one, other in [*pairs, (copy.sensors.force, scenario.sensors.force)]:
         assert type(one) is type(other)
@@ -120,6 +134,15 @@ def test_every_form_reads_back_equal(tmp_path):
             np.testing.assert_array_equal(getattr(one, item.name), getattr(other, item.name))
     for key in ("integration_scheme", "max_step_size", "accuracy", "use_error_control"):
         assert getattr(copy.integrator, key) == getattr(scenario.integrator, key)
+
+
+def test_files_in_settings_of_a_shipped_scenario_are_in_the_working_directory(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "path.csv").write_text("time,y\n0,0\n1,0.1\n2,0\n")
+    monkeypatch.chdir(tmp_path)
+    chosen = two_link("references={tool.y: !Csv {file: path.csv, columns: [y]}}")
+    assert chosen.references["tool.y"].table.shape == (3, 2)
 
 
 def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
@@ -150,15 +173,10 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
         ("law.gains={outputs: {tool.z: [-3]}}", lambda s: s.law.gains.outputs == {"tool.z": [-3]}),
         ("plant.parameters.link2.mass=[5]", lambda s: s.plant.parameters == {"link2.mass": [5]}),
         ("description=a b", lambda s: s.description == "a b"),
-        ("description=", None),
     ],
 )
 def test_settings(setting, read):
-    if read is None:
-        with pytest.raises(ScenarioError, match="description: "):
-            two_link(setting)
-    else:
-        assert read(two_link(setting))
+    assert read(two_link(setting))
 
 
 def test_settings_reach_names_with_dots_in_lists():
@@ -222,20 +240,6 @@ def test_bounds_of_parameters_are_those_at_which_the_structure_is_looked_at():
         assert {p.name: p.bounds for p in system.parameters if p.bounds} == {"wall.a": (0.5, 2.0)}
     with pytest.raises(ScenarioError, match=r"A\(x\).*'wall\.a'"):
         build_scenario(two_link(TILTED, "bounds={wall.a: [0, 2]}"))
-
-
-@pytest.mark.parametrize(
-    ("bounds", "words"),
-    [
-        ("{link2.mass: [12, 6]}", r"bounds: .*'link2\.mass'"),
-        ("{link2.mass: [8, 9]}", r"bounds: .*'link2\.mass'"),
-        ("{link2.mas: [6, 9]}", r"bounds: .*'link2\.mas'"),
-        ("{link2.mass: [6]}", r"bounds\.link2\.mass: .*\[6\]"),
-    ],
-)
-def test_bounds_that_make_no_sense_are_refused(bounds, words):
-    with pytest.raises(ScenarioError, match=words):
-        build_scenario(two_link(f"bounds={bounds}"))
 
 
 def test_a_model_is_found_by_its_name():
