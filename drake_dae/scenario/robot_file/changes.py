@@ -253,7 +253,8 @@ def _leaders(
     for index, (name, ratio, offset) in follows.items():
         joint = plant.get_joint(index)
         if name == joint.name() or not plant.HasJointNamed(name, joint.model_instance()):
-            raise ModelError(f"joint '{joint.name()}' follows '{name}', which is no other joint")
+            text = f"joint '{joint.name()}' mimics '{name}', which is no other joint of its file"
+            raise ModelError(text)
         leaders[index] = plant.GetJointByName(name, joint.model_instance()), ratio, offset
     return leaders
 

@@ -49,6 +49,9 @@ def expand(root: Element, file: Path) -> list[str]:
     _include(root, file, (file.resolve(),), count(1))
     root.attrib.setdefault("model", file.stem)
     _apply_defaults(root)
+    if compiler(root).get("coordinate") == "global":
+        way = "MuJoCo up to 2.3.2 reads it, and saves it with local ones"
+        raise ModelError(f"'{file.name}' has global coordinates; {way}")
     for equality in root.iterfind("equality"):
         for constraint in list(equality):
             if constraint.attrib.pop("active", "true") == "false":

@@ -246,8 +246,8 @@ def _remarks(mender: Mender) -> Iterator[None]:
     def passes(record: logging.LogRecord) -> bool:
         is_remark = record.thread == here and record.levelno >= logging.WARNING
         if is_remark:
-            text = _of_originals(record.getMessage(), mender.originals)
-            mender.tell("Drake reads the file with remarks", text.replace(" warning:", ""))
+            text = _of_originals(record.getMessage(), mender.originals).replace(" warning:", "")
+            mender.tell("Drake reads the file with remarks", text[:200])
         return not is_remark
 
     logger.addFilter(passes)
