@@ -168,6 +168,7 @@ def _lock_joints(
             "the file has constraints other than mimic joints, with which Drake locks no joint; "
             "name them under robot.leave_out, and write them under constraints"
         )
+    welds = list[tuple[JointIndex, WeldJoint]]()
     for index, value in positions.items():
         if index not in joints:
             own = plant.get_joint(index).name()
@@ -181,19 +182,27 @@ def _lock_joints(
             raise ModelError(
                 f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
             )
-        own_name, inboard, outboard = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
         if slides:
             pose = RigidTransform(value * joint.translation_axis())
         else:
             pose = RigidTransform(AngleAxis(value, joint.revolute_axis()), np.zeros(3))
+        frames = joint.frame_on_parent(), joint.frame_on_child()
+        welds.append((index, WeldJoint(joint.name(), *frames, pose)))
+        del joint
+    # Python's joint must be gone before Drake's is: a new one at its address would be taken for it.
+    joints.clear()
+    movable.clear()
+    for index, _ in welds:
         for actuator in actuators_of(plant):
-            if actuator.joint() is joint:
+            if actuator.joint().index() == index:
                 plant.RemoveJointActuator(actuator)
         try:
-            plant.RemoveJoint(joint)
+            plant.RemoveJoint(plant.get_joint(index))
         except RuntimeError as error:
-            raise ModelError(f"'{name}' cannot be locked: {error}") from None
-        plant.AddJoint(WeldJoint(own_name, inboard, outboard, pose))
+            own = plant.get_joint(index).name()
+            raise ModelError(f"'{own}' cannot be locked: {error}") from None
+    for _, weld in welds:
+        plant.AddJoint(weld)
     return positions
 
 
