@@ -15,25 +15,28 @@ from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
-from drake_dae.trace.factorization import Factorization
 
 
-def damped(
-    structure: Structure, damping: GainDesign | FeedbackGains | None, latency: float = 0.0
+def law_structure(
+    structure: Structure,
+    damping: GainDesign | FeedbackGains | None,
+    latency: float = 0.0,
+    deflection: "Deflection | None" = None,
 ) -> Structure:
     """Returns the structure of a law's model that demands, instead of y_i^(r_i) = 0,
 
-        y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0,
+        y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0, or the symbol of a deflection,
 
     without a term in y_i itself, which would control the position of the surface instead of the
     force. On N* all y_i^(j) vanish, so that nothing changes there: alpha (13) becomes alpha - A^-1
-    (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay.
+    (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay. With a latency the mass matrix
+    changes: see `acting_late`.
 
     Where a force is an output of degree mu >= 1, the law takes the added term as constant: along
     the model its derivatives would destabilize a compliant contact, which moves otherwise.
     """
     system = acting_late(structure.system, latency)
-    if damping is None and system is structure.system:
+    if damping is None and deflection is None and system is structure.system:
         return structure
     layout = DerivativeLayout(structure.constraint_degrees)
     residual = structure.manifold.residual_expression
@@ -41,6 +44,8 @@ def damped(
     if damping is not None:
         rates = residual[np.flatnonzero(layout.orders).tolist(), :]
         force = ca.mtimes(ca.sparsify(ca.DM(damping_gains(structure, damping).matrix)), rates)
+    if deflection is not None:
+        force = force - deflection.symbol
     derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
     # The output chains of the same degrees along these derivatives.
     degrees = structure.output_degrees
@@ -71,7 +76,7 @@ def damped(
 
 
 def damping_gains(structure: Structure, damping: GainDesign | FeedbackGains) -> FeedbackGains:
-    """Returns the coefficients c of `damped`: r_i - 1 poles for each constraint."""
+    """Returns the coefficients c of `law_structure`: r_i - 1 poles for each constraint."""
     names = tuple(signal.name for signal in structure.system.constraint_output_signals)
     degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
     return designed("constraint_damping", damping, names, degrees)
@@ -269,13 +274,13 @@ class Deflection:
     """The motion of compliant contacts, lambda = -k phi, that a wanted force lambda_d needs.
 
     A law that keeps phi'' + c phi' = 0 lets a step of lambda_d make the contact oscillate with
-    sqrt(A k). With phi_d = -lambda_d / k and
+    sqrt(A k). With phi_d = -lambda_d / k its model demands instead
 
-        phi'' - phi_d'' + c (phi' - phi_d') = 0,    so    u for lambda_d + A^-1 (c lambda_d' +
-                                                          lambda_d'') / k,
+        phi'' + c phi' = phi_d'' + c phi_d' = -(lambda_d'' + c lambda_d') / k,
 
-    the error e = phi - phi_d obeys e'' + c e' + A k e = 0 for any reference that is twice
-    differentiable. A stiffness that is wrong by a factor s leaves |1 - s| of the oscillation.
+    so that e = phi - phi_d obeys e'' + c e' + A k e = 0 for any reference that is twice
+    differentiable, and friction is that of lambda_d. A stiffness that is wrong by a factor s leaves
+    |1 - s| of the oscillation. `symbol` stands for the right side, and is zero on N*.
     """
 
     def __init__(
@@ -296,16 +301,13 @@ class Deflection:
                 "velocities; leave it out"
             )
         c = np.zeros((size, size)) if damping is None else damping_gains(structure, damping).matrix
-        self._damping, self._matrix = ca.DM(c), structure.elimination.constraint_matrix
+        self._damping, self.symbol = ca.DM(c), ca.SX.sym("deflection", size)
 
-    def force(self, reference: ca.SX, layout: DerivativeLayout) -> ca.SX:
-        """A^-1 (c lambda_d' + lambda_d'') / k of each output, shape (p, 1)."""
+    def wanted(self, reference: ca.SX, layout: DerivativeLayout) -> ca.SX:
+        """-(lambda_d'' + c lambda_d') / k of each constraint, shape (m, 1)."""
         outputs, columns = list(self.inputs), list(self.inputs.values())
         first, second = (ca.SX.zeros(len(columns)) for _ in range(2))
         places = layout.lowest[outputs]
         first[columns] = reference[(places + 1).tolist()]
         second[columns] = reference[(places + 2).tolist()]
-        push = ca.mtimes(self._damping, first) + second
-        result = ca.SX.zeros(len(layout.degrees))
-        result[outputs] = (Factorization(self._matrix).solve(push) / self.stiffness)[columns]
-        return result
+        return -(second + ca.mtimes(self._damping, first)) / self.stiffness

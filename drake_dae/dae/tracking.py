@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, numbers, vector
 from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
-from drake_dae.dae.law_model import Deflection, ForceMeasurement, IntegralAction, damped
+from drake_dae.dae.law_model import Deflection, ForceMeasurement, IntegralAction, law_structure
 from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
@@ -41,14 +41,15 @@ class TrackingLaw:
         force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
             semidefinite; only with measured_force.
         constraint_damping: Damping of constraints that the plant may violate, such as a compliant
-            contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi': see `damped`.
+            contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi': see
+            `law_structure`.
         contact_stiffness: k in N/m of compliant contacts, F = -k phi, for references of forces that
             change fast: see `Deflection`.
         integral: The names of the outputs whose errors are integrated as well, positions or
             measured forces: see `IntegralAction`. They have one more pole.
         latency: The mean time in s from the measurement of x to the moment when its control acts,
-            for a sampled law delay + period / 2, and half a step more of a stepped plant: by it
-            damping is compensated: see `acting_late`.
+            for a sampled law delay + period / 2, and half a step more of a stepped plant, whose
+            step counts whole without sampling: by it damping is compensated: see `acting_late`.
 
     `function` is the law as (state, reference, measured_force, integral, parameters) -> control,
     tracking_error, integral_rate, as far as it has them; `outputs` are these as expressions of
@@ -74,12 +75,14 @@ class TrackingLaw:
         latency: float = 0.0,
     ) -> None:
         self.structure = structure_of("TrackingLaw", system, structure, find_structure)
-        self.damped_structure = damped(self.structure, constraint_damping, latency)
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:
             self.deflection = Deflection(self.structure, contact_stiffness, constraint_damping)
             more = tuple(2 * (i in self.deflection.inputs) for i in range(system.num_outputs))
+        self._law_structure = law_structure(
+            self.structure, constraint_damping, latency, self.deflection
+        )
         self.layout = DerivativeLayout(self.structure.output_degrees, more)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
         if not measured_force and numbers("force_gain", force_gain, GainError).any():
@@ -97,26 +100,24 @@ class TrackingLaw:
 
     def _trace(self) -> TracedFunction:
         """The law (28) and the tracking error (29) as one function."""
-        structure, layout, measured = self.damped_structure, self.layout, self.measured_force
+        structure, layout, measured = self._law_structure, self.layout, self.measured_force
         reference = ca.SX.sym("R", layout.reference_size)
         # Symbols only for nonzero entries of K: the errors of most outputs are not coupled.
         gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
         values = reference[layout.lowest.tolist(), :]
         highest = reference[layout.highest.tolist(), :]
-        chain = structure.chain
+        own = chain = self._deflected(structure.chain, reference)
         inputs = {"reference": reference}
         if measured:
             chain, highest = measured.chain(chain), measured.highest(highest, values)
             inputs["measured_force"] = measured.symbol
         errors = chain - reference[layout.chained.tolist(), :]
-        ahead = ca.SX.zeros(len(self.degrees))
-        if self.deflection is not None:
-            ahead = self.deflection.force(reference, layout)
-        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors)) + ahead  # (28)
+        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))  # (28)
         control, pivot = structure.control_for(ubar)
+        control = self._deflected(control, reference)
         # By the model; outputs with direct feedthrough have their reference values.
-        output = ubar - ahead
-        output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
+        output = ca.SX(ubar)
+        output[layout.dynamic.tolist(), :] = own[layout.heads.tolist(), :]
         self.exogenous_degrees = self.system.exogenous.degrees(control, output)
         outputs = {"control": control, "tracking_error": output - values}  # (29)
         if self.integral.outputs:
@@ -126,7 +127,7 @@ class TrackingLaw:
             ca.depends_on(ca.vertcat(control, output), measured.symbol)
         )
         # The initial value of (30).
-        start = self.integral.coordinates(structure.chain - reference[layout.chained.tolist(), :])
+        start = self.integral.coordinates(own - reference[layout.chained.tolist(), :])
         self.coordinates_function = self.system.trace(
             "error coordinates",
             {"coordinates": start},
@@ -143,9 +144,15 @@ class TrackingLaw:
         name, compiled = f"{self.system.name} tracking law", self.system.compiled
         return TracedFunction(name, self.inputs, outputs, pivot, self.regular, compiled=compiled)
 
+    def _deflected(self, expression: ca.SX, reference: ca.SX) -> ca.SX:
+        if self.deflection is None:
+            return expression
+        wanted = self.deflection.wanted(reference, self.layout)
+        return ca.substitute(expression, self.deflection.symbol, wanted)
+
     def trace_motion(self) -> TracedFunction | None:
         """Traces x' and v of a plant that equals the law's model, under the law."""
-        if self.damped_structure is not self.structure:
+        if self._law_structure is not self.structure:
             return None
         if (motion := self.structure.motion_for(self._ubar)) is None:
             return None

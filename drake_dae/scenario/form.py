@@ -249,7 +249,7 @@ class Reader:
             for one in error.errors():
                 path = [str(part) for part in one["loc"] if str(part)[:1] != "!"]  # A tag.
                 place = place_of(".".join([*path, one["ctx"]["wrong"]]).rstrip("."))
-                problems.append((".".join(path) or "scenario", f"{one['msg']} {place}"))
+                problems.append((".".join(path) or "scenario", f"{one['ctx']['text']} {place}"))
             raise ScenarioError(*problems) from None
 
     def write(self, value: Any) -> Any:
@@ -269,29 +269,27 @@ class Reader:
             return value.tolist()
         return str(value) if isinstance(value, Path) else value
 
-    def put(self, data: Any, key: str, value: Any) -> None:
+    def put(self, data: Any, key: str, value: Any, path: str = "") -> None:
         """Sets an entry of plain data at a dotted key, in place; chosen names may have dots too."""
         if not all(key.split(".")):
             raise ScenarioError((brief(key), "expected a dotted key, for example start.errors"))
-        path, slot, rest = "", "", key
-        while rest:
-            above, slot = slot, rest.partition(".")[0]
-            if isinstance(data, list):
-                if not (slot.isascii() and slot.isdecimal() and int(slot) < len(data)):
-                    indices = ", ".join(map(str, range(len(data)))) or "none"
-                    raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
-            elif not isinstance(data, dict):
-                raise ScenarioError((path, f"{brief(data)} has no entry '{slot}'"))
-            elif above in self._free:
-                inner = [name for name in data if isinstance(data[name], (dict, list))]
-                slot = first_name(inner, rest) or rest
-            rest, path = rest[len(slot) + 1 :], f"{path}.{slot}".lstrip(".")
-            index: Any = int(slot) if isinstance(data, list) else slot
-            if not rest:
-                data[index] = value
-            elif isinstance(data, dict) and data.get(slot) is None:
-                data[slot] = {}
-            data = data[index]
+        slot: Any = key.partition(".")[0]
+        if isinstance(data, list):
+            if not (slot.isascii() and slot.isdecimal() and int(slot) < len(data)):
+                indices = ", ".join(map(str, range(len(data)))) or "none"
+                raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
+        elif not isinstance(data, dict):
+            raise ScenarioError((path, f"{brief(data)} has no entry '{slot}'"))
+        elif path.rpartition(".")[2] in self._free:
+            slot = first_name([n for n in data if isinstance(data[n], (dict, list))], key) or key
+        rest, path = key[len(slot) + 1 :], f"{path}.{slot}".lstrip(".")
+        slot = int(slot) if isinstance(data, list) else slot
+        if not rest:
+            data[slot] = value
+            return
+        if isinstance(data, dict) and data.get(slot) is None:
+            data[slot] = {}
+        self.put(data[slot], rest, value, path)
 
     def _keys_of(self, form: type) -> Mapping[str, Key]:
         return self._keys.get(form) or keys_of(form)

@@ -26,16 +26,7 @@ from drake_dae.systems.plants.robot_plant import RobotPlant
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioPlant(ABC):
-    """What a scenario simulates; the contract of the key `plant`.
-
-    1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
-    2. With `carries`, this plant includes payloads, disturbances and changed parameters. Otherwise
-       the scenario makes a model with these payloads and disturbances, and sets the parameters in
-       the context.
-    3. `material` is the material of compliant contacts, and None for ideal contacts.
-    4. `rolled` is the member that a rollout runs instead: this member, or one with a traced plant.
-    5. `in_context` are the keys of numbers that `begin` sets in a context, even if the plant was
-       made with other numbers. Without `adjusts` the plant is made anew for each payload and force.
+    """What a scenario simulates.
 
     Attributes:
         parameters: Parameter name -> the plant's value, unknown to the law's model; one number for
@@ -47,16 +38,22 @@ class ScenarioPlant(ABC):
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
     payloads: list[Payload] = field(default_factory=list)
     disturbances: list[DisturbanceForce] = field(default_factory=list)
+
     carries: ClassVar[bool] = False
+    """Whether the plant has these itself. Else a model has the payloads and disturbances, and
+    numbers are set in a context, or, if it does not adjust, the plant is made anew for each."""
     adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
+    """The keys of numbers that `begin` sets in a context."""
 
     @property
     def material(self) -> PointMaterial | None:
+        """The material of contacts that give way."""
         return None
 
     @property
     def rolled(self) -> "ScenarioPlant":
+        """What a rollout runs: this, or what has a traced plant."""
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
@@ -64,7 +61,7 @@ class ScenarioPlant(ABC):
 
     @abstractmethod
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
-        """Makes the plant of a robot, with the structure of its system."""
+        """The plant of a robot, with the structure of its system."""
 
 
 @dataclass(frozen=True)

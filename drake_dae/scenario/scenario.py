@@ -4,9 +4,9 @@ A scenario is YAML. The library's dataclasses are written with their fields as k
 between several classes is written with the name as a tag, for example `surface: !Sphere`.
 """
 
-import pickle
 import re
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -227,10 +227,8 @@ def read_scenario(data: Mapping[str, Any]) -> Scenario:
 
 
 def varied_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain data of a scenario with other values at dotted keys; unchanged parts are shared."""
-    varied = dict(data)
-    for part in {key.partition(".")[0] for key in changes} & varied.keys():
-        varied[part] = pickle.loads(pickle.dumps(varied[part]))  # Thrice as fast as deepcopy.
+    """Plain data of a scenario with other values at dotted keys."""
+    varied = deepcopy(dict(data))
     for key, value in changes.items():
         scenario_reader().put(varied, key, value)
     return varied
