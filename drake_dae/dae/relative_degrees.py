@@ -33,7 +33,7 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
     chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
-    undecided, elsewhere = list(range(len(chains))), _Elsewhere(system.constraint_output_signals)
+    undecided, others = list(range(len(chains))), _OtherDegrees(system.constraint_output_signals)
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, explicit.g, x)
@@ -46,7 +46,7 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
         for row, i in enumerate(undecided):
             order, name = len(chains[i]), (names[i],)
             if force_acts[row].all():
-                elsewhere.check(i)
+                others.check(i)
                 continue
             if force_acts[row].any():
                 state = samples.states[int(np.argmin(force_acts[row]))]
@@ -57,7 +57,7 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
             for key, rows, assumption in (("g", by_force, 1), ("h", by_control, 3)):
                 if rows[row, :].nnz():
                     along = actions.along(chains[i][-1], key)
-                    elsewhere.examine(i, assumption, order, samples, along)
+                    others.examine(i, assumption, order, samples, along)
             following.append(i)
             if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
@@ -68,7 +68,7 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
         if sum(len(chain) for chain in chains) + len(following) > system.num_states:
             stuck = following
         if stuck:
-            raise elsewhere.never(ViolationKind.NO_FORCE, stuck, samples)
+            raise others.never(ViolationKind.NO_FORCE, stuck, samples)
         for i in following:
             derivative = lie_derivative(chains[i][-1], f, x)
             if system.exogenous:
@@ -89,7 +89,7 @@ def output_chains(
     drift, control_matrix, highest = ca.SX(count, 1), ca.SX(*shape), ca.SX(count, 1)
     round_off, need_force = np.zeros(shape, dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
-    elsewhere, actions = _Elsewhere(system.output_signals), InputActions(samples, elimination)
+    others, actions = _OtherDegrees(system.output_signals), InputActions(samples, elimination)
     slopes = actions.numbers(actions.feedthrough)
     moving = system.outputs(derivatives.constraint_input)
     following, rows = elimination.l_star, elimination.n_star
@@ -99,7 +99,7 @@ def output_chains(
         for row, i in enumerate(undecided):
             order, name = len(chains[i]), (names[i],)
             if acts[row].all():
-                elsewhere.check(i)
+                others.check(i)
                 drift[i], highest[i] = following[row], moving[row]
                 control_matrix[i, :] = rows[row, :]  # (16)
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
@@ -108,7 +108,7 @@ def output_chains(
                 raise Violation(4, ViolationKind.OUTPUT_DEGREE, name, order, state).error()
             else:
                 if not chains[i] and rows[row, :].nnz():
-                    elsewhere.examine(i, 4, 0, samples, actions.feedthrough, i)
+                    others.examine(i, 4, 0, samples, actions.feedthrough, i)
                 still.append(i)
                 chains[i].append(following[row])
                 need_force = need_force or derivatives.has_unknowns(moving[row])
@@ -126,7 +126,7 @@ def output_chains(
                 continue
             if rows[row, :].nnz():
                 along = actions.along(chains[i][-1], "h*")
-                elsewhere.examine(i, 4, len(chains[i]), samples, along)
+                others.examine(i, 4, len(chains[i]), samples, along)
             # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
             # where nothing acts although the structure allows it.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
@@ -134,7 +134,7 @@ def output_chains(
             if is_full or (rows[row, :].nnz() and samples.dependent(used)):
                 stuck.append(i)
         if stuck:
-            raise elsewhere.never(ViolationKind.NO_CONTROL, stuck, samples)
+            raise others.never(ViolationKind.NO_CONTROL, stuck, samples)
         undecided = still
     return {
         "output_chains": tuple(map(tuple, chains)),
@@ -205,7 +205,7 @@ class InputActions:
             return (h_star, h_star), (n_star, n_star)
 
 
-class _Elsewhere:
+class _OtherDegrees:
     """What is found for other parameters than the defaults, where nothing acts at these."""
 
     def __init__(self, signals: Sequence[Signal]) -> None:
