@@ -127,9 +127,9 @@ def dynamic_extension(
         columns, mixing = choice
         others, nominal = [j for j in range(len(names)) if j not in columns], held[columns]
         if mixing is not None:
-            function = extended.trace("mixing", {"mixing": mixing}, often=False)
-            here = function(extended.nominal_state, extended.parameter_values)[0]
-            nominal = nominal + here.reshape(mixing.shape) @ held[others]
+            mixed = extended.matrix("mixing", mixing)
+            here = mixed(extended.nominal_state, extended.parameter_values)
+            nominal = nominal + here @ held[others]
             for i in columns:
                 control = extended.control_signals[i]
                 bases[i] = (Signal(f"{control.name}*", control.unit), 0)

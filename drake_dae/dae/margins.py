@@ -54,12 +54,12 @@ def find_margin(
     for i, j in np.argwhere(round_off) if round_off is not None else ():
         whole[int(i), int(j)] = 0.0
     whole = ca.sparsify(whole)
-    function = system.trace("margin", {"matrix": whole}, often=False)
+    value_of = system.matrix("margin", whole)
     sizes = np.mean([np.abs(value) for (value,) in samples.values(matrix=whole)], axis=0)
     rows, columns = equilibration(sizes)
 
     def plain(state: FloatArray) -> FloatArray:
-        return function(state, system.parameter_values)[0].reshape(matrix.shape)
+        return value_of(state, system.parameter_values)
 
     def scaled(state: FloatArray) -> FloatArray:
         return plain(state) / rows[:, None] / columns

@@ -158,8 +158,7 @@ class InputActions:
     def along(self, functions: ca.SX, key: str) -> Row:
         """Returns the derivatives of functions along the columns of g, h or h* (10)."""
         system = self._system
-        gradient = ca.jacobian(functions, system.state)
-        trace = system.trace("sample", {"gradient": gradient}, often=False)
+        gradient = system.matrix("sample", ca.jacobian(functions, system.state))
 
         def row(state: FloatArray, parameters: FloatArray) -> Sized:
             if key == "h*":
@@ -167,7 +166,7 @@ class InputActions:
             else:
                 value = fields_at(system, state, parameters)[key]
                 field = value, np.abs(value)
-            gradients = trace(state, parameters)[0].reshape(gradient.shape)
+            gradients = gradient(state, parameters)
             if not np.all(np.isfinite(gradients)):
                 return (gradients @ (np.nan * field[0]),) * 2
             return multiply(gradients, field, self._scale)
