@@ -85,6 +85,9 @@ _TRIES, _PATIENCE, _SLANTED = 40, 8, 0.3
 """The postures that are tried for each normal; after how many without a tool along it the normal is
 given up; and the weight of a posture with a tool that is not along it."""
 
+_ENOUGH = 0.6
+"""The friction below which a contact does not jam along the path at a place that is good enough."""
+
 _SHARE = 0.3
 """The share of speed limits that a path may use; half of it of effort limits by the force."""
 
@@ -154,20 +157,28 @@ def placed_scenario(
     if not any(point) and (far := _far_end(links, tip, last)):
         point, why["point"] = far, "m, in that frame: its far end, where no frame of the file is"
     progress("looking for a place")
-    for fraction, place in product(_FRACTIONS, _places(links, tip, point)[:_PLACES]):
+    found = list[tuple[float, Scenario, str]]()
+    places = _places(links, tip, point)[:_PLACES]
+    for count, (fraction, place) in enumerate(product(_FRACTIONS, places)):
+        # Near a singular wrist little friction jams a contact: the next place may be better.
+        is_done = found and (found[-1][0] >= _ENOUGH or count % len(places) == 0)
+        if is_done or ((found or tried) and process_time() > end):
+            break
         scenario = _scenario(robot, tip, point, place, kind, fraction)
         name = f"{scenario.constraints[0].name} at {place.center} m"
-        if tried and process_time() > end:
-            break
         progress(f"trying a {name}")
         try:
-            notes = completed_model(scenario, None, robot=read)[0].notes
-            problem = next((n for n in notes if n.startswith(NOTHING_FOUND)), "")
+            completed = completed_model(scenario, None, robot=read)[0]
+            problem = next((n for n in completed.notes if n.startswith(NOTHING_FOUND)), "")
         except DrakeDaeError as error:
             problem = str(error)
-        if not problem:
-            return scenario, _text(scenario, {**why, "surface": place.why}, folder), read
-        tried.append(f"{name}, {fraction:g} of the usual circle: {problem[:160]}")
+        if problem:
+            tried.append(f"{name}, {fraction:g} of the usual circle: {problem[:160]}")
+        else:
+            found.append((completed.critical_friction, scenario, place.why))
+    if found:
+        _, scenario, why["surface"] = max(found, key=lambda entry: entry[0])
+        return scenario, _text(scenario, why, folder), read
     joints = ", ".join(signal.name for signal in links.position_signals)
     where = "; ".join(tried[:_PLACES]) or "surfaces along all axes of the world"
     text = (
