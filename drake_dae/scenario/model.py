@@ -50,14 +50,9 @@ T = TypeVar("T")
 NOTHING_FOUND = "no start was found"
 """How the note begins if no outputs and start are good along the references."""
 
-_TIMES = 201
-"""The number of times at which a completed scenario is examined."""
-
-_SLACK = 1e-6
-"""The excess over a limit that counts, in its unit."""
-
-_LARGE = 10.0
-"""The size of a surface in m above which its unit is doubtful."""
+_TIMES, _SLACK, _LARGE = 201, 1e-6, 10.0
+"""At how many times a completed scenario is examined; the excess over a limit that counts, in its
+unit; and the size of a surface in m above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:

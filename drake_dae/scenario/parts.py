@@ -1,6 +1,5 @@
 """Parts of a scenario without a class in the library, or written otherwise than that has it."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, TypeVar, cast
@@ -25,7 +24,6 @@ from drake_dae.robots import (
 from drake_dae.scenario.robot_file.robot import Pose
 from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.sensing.encoders import Encoders
-from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.task import Task
 
@@ -132,11 +130,6 @@ class MeasuredForce:
     drift: ArrayLike = 0.0
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
-    def sensor(self, size: int) -> ForceSensor:
-        """The sensor of m = `size` forces."""
-        lags = self.time_constant, self.sample_period
-        return ForceSensor(size, *lags, self.bias, self.noise_deviation, self.drift)
-
 
 @dataclass(frozen=True)
 class Sensors:
@@ -195,14 +188,6 @@ class Estimator(Observing):
             super().__post_init__()
 
 
-class Gains(ABC):
-    """Gains of the tracking law, as they are written."""
-
-    @abstractmethod
-    def design(self) -> GainDesign:
-        """The design of the gains."""
-
-
 @dataclass(frozen=True)
 class PerOutput:
     """Numbers for all outputs, or for each output.
@@ -221,7 +206,7 @@ class PerOutput:
 
 
 @dataclass(frozen=True)
-class Poles(PerOutput, Gains):
+class Poles(PerOutput):
     """Real poles of the errors in 1/s, one number or mu_i per output; see also Coefficients."""
 
     def design(self) -> GainDesign:
@@ -229,7 +214,7 @@ class Poles(PerOutput, Gains):
 
 
 @dataclass(frozen=True)
-class Coefficients(PerOutput, Gains):
+class Coefficients(PerOutput):
     """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first; in 1/s^mu_i, ..., 1/s."""
 
     def design(self) -> GainDesign:
@@ -237,7 +222,7 @@ class Coefficients(PerOutput, Gains):
 
 
 @dataclass(frozen=True)
-class Matrices(Gains):
+class Matrices:
     """Gains that couple outputs of equal degree; see `gain_matrices`.
 
     Attributes:
@@ -249,6 +234,9 @@ class Matrices(Gains):
 
     def design(self) -> GainDesign:
         return gain_matrices(*self.groups)
+
+
+Gains = Poles | Coefficients | Matrices
 
 
 @dataclass(frozen=True)
@@ -355,11 +343,6 @@ class Judgement:
     tolerances: dict[str, Positive | None] = field(default_factory=dict)
     friction_cones: list[FrictionCone] = field(default_factory=list)
     may_diverge: bool = False
-
-    @property
-    def tolerated(self) -> dict[str, float]:
-        """Output name -> the tolerated error; infinite if it does not count."""
-        return {name: np.inf if e is None else e for name, e in self.tolerances.items()}
 
 
 @dataclass(frozen=True)

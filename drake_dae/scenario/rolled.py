@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from math import ceil
+from math import ceil, floor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,10 +67,8 @@ def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
             f"keeps at most {MOST_ROWS:g}"
         )
     if time_step:
-        inside = time_step * np.arange(start // time_step + 1, ceil(end / time_step))
-        near = SAME * time_step
-        inside = inside[(inside > start + near) & (inside < end - near)]
-        return np.concatenate([[start], inside, [end]])
+        first, after = floor(start / time_step + SAME) + 1, ceil(end / time_step - SAME)
+        return np.concatenate([[start], time_step * np.arange(first, after), [end]])
     rows = max(1, ceil(duration / fixed - 0.01)) if fixed else ROWS
     times: FloatArray = start + np.linspace(0.0, duration, rows + 1)
     return times

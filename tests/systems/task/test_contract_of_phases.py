@@ -62,6 +62,8 @@ def test_phase_keeps_the_rules(name):
     assert phase.awaits(CONTACT_FORCE)
     # Rule 1: what leads from one law to the other says so of both ends.
     assert (phase.begins_in_contact is None) == (phase.ends_in_contact is None)
+    # Rule 5: others end before, or without a contact.
+    assert phase.holds_contact == isinstance(phase, Press | Move | Dwell)
     # Rule 2: what approaches has no goal for the distance.
     goals = phase.goals("contact")
     assert set(goals) <= {"contact"}
