@@ -9,12 +9,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers, unknown_name
-from drake_dae.dae.settling import CONSISTENT, Settling
+from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.signals import DerivativeLayout, Indices
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
-from drake_dae.trace.factorization import PositiveDefiniteFactorization
+from drake_dae.trace.factorization import PositiveDefiniteFactorization, nonzeros
 from drake_dae.trace.functions import TracedFunction, count_operations
 from drake_dae.trace.newton import (
     PRECISION,
@@ -23,6 +22,7 @@ from drake_dae.trace.newton import (
     newton,
     norm,
     shortest_steps,
+    steps_along,
 )
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
@@ -31,6 +31,16 @@ NEAR_POLE = 1e-6, 1e-3  # The distances at which poles show, in states over thei
 RESTARTS = 12  # The number of random starts of `Manifold.settle`.
 # A velocity is kept if no state moves further for it than so many times the size of the state.
 FAR = 100.0
+# A state counts as consistent, and is projected without a message, if its distance from N*
+# relative to its size is at most this; where gradients are dependent, if its residual is.
+CONSISTENT = 1e-8
+# Constraint forces do no work if they are along the gradients to this, as the sine of an angle.
+ALONG = 1e-6
+
+
+# Rows of the residual, the states that are new in them, and how many rates lead from velocities to
+# these states; None if their steps do not take the least kinetic energy.
+Level = tuple[Indices, Indices, int | None]
 FLOOR = 1e-12  # A distance from N* that is round-off even if all states are zero.
 
 
@@ -51,7 +61,7 @@ class Manifold:
         usual = np.linalg.norm(self.gradients(system.nominal_state) * self.scale, axis=1)
         # Of the residuals: how much they change while the states change by their scale.
         self._usual = positive(np.where(np.isfinite(usual).all(), usual, 0.0))
-        self._settling = Settling(system, self.layout, self.gradient, self.gradients, self.residual)
+        self._settling = _Settling(self)
 
     @property
     def dimension(self) -> int:
@@ -149,14 +159,8 @@ class Manifold:
         p = self.system.parameter_vector(parameters)
         found = self.projected(self._state(state), p)
         if self._is_at_pole(found, p):
-            left = self.residual(found, p)
-            worst = int(np.argmax(np.abs(left)))
-            raise InconsistentStateError(
-                f"{self.system.name}: {self.residual_signals[worst].name} = {left[worst]:.3g} is "
-                "left at a pole of the constraint, as where a rotation is half a turn off: start "
-                "nearer to the constraint",
-                left,
-            )
+            why = "a pole of the constraint, as where a rotation is half a turn off"
+            raise self._failed(found, p, f"{why}: start nearer to the constraint")
         return found
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
@@ -194,8 +198,13 @@ class Manifold:
         found: FloatArray = scale * z
         # Otherwise the residual is round-off in coarse units, or no state changes it.
         if not converged and not self._relative_size(found, p) <= CONSISTENT:
-            residual = self.residual(found, p)
-            raise InconsistentStateError(self._why(found, p, residual), residual)
+            why = "the end of Newton's method: start nearer to the constraint"
+            if are_dependent(self.gradients(found, p) * self.scale):
+                why = (
+                    "a state at which the gradients of the constraints depend on each other: the "
+                    "constraints contradict each other, or start away from this state"
+                )
+            raise self._failed(found, p, why)
         return found
 
     def _downhill(self, state: FloatArray, p: FloatArray) -> NewtonModel | None:
@@ -225,41 +234,29 @@ class Manifold:
         )
         return not left <= POLE or bool(near > 1.0 and near > far)
 
-    def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
-        """Returns in words why a Newton iteration that ended at a state failed."""
-        name = self.system.name
+    def _failed(self, state: FloatArray, p: FloatArray, why: str) -> InconsistentStateError:
+        """The exception for a search that ends at a state which is not consistent."""
+        residual = self.residual(state, p)
         values = zip(self.residual_signals, residual, strict=True)
         bad = [signal.name for signal, value in values if not np.isfinite(value)]
-        if bad:
-            return (
-                f"{name}: {', '.join(bad)} is not finite at the given state; start inside the "
-                "domain of the constraints"
-            )
         worst = int(np.argmax(np.abs(residual)))
         text = (
-            f"{name}: no consistent state found near the given one; "
-            f"{self.residual_signals[worst].name} = {residual[worst]:.3g} is left where "
-            "Newton's method ends. "
+            f"no consistent state found near the given one; {self.residual_signals[worst].name} = "
+            f"{residual[worst]:.3g} is left at {why}"
         )
-        if are_dependent(self.gradients(state, parameters) * self.scale):
-            return text + (
-                "The gradients of the constraints depend on each other there: the constraints "
-                "contradict each other, or start away from this state"
+        if bad:
+            text = (
+                f"{', '.join(bad)} is not finite at the given state; start inside the domain of "
+                "the constraints"
             )
-        return text + "Start nearer to the constraint, away from its singular states"
+        return InconsistentStateError(f"{self.system.name}: {text}", residual)
 
     def settle(
-        self,
-        state: ArrayLike,
-        parameters: ArrayLike | None = None,
-        fixed: Sequence[str] = (),
+        self, state: ArrayLike, parameters: ArrayLike | None = None, fixed: Sequence[str] = ()
     ) -> FloatArray:
         """Returns the consistent state next to a user's start, computed level by level."""
         start, p = self._state(state), self.system.parameter_vector(parameters)
-        names = [signal.name for signal in self.system.state_signals]
-        for name in fixed:
-            if name not in names:
-                raise ModelError(unknown_name("state", name, names))
+        chosen = np.array(self.system.states_named(fixed), dtype=np.intp)
         residual = self.residual(start, p)
         if not residual.any():
             return start
@@ -267,7 +264,6 @@ class Manifold:
         is_there = step is not None and 0.0 < norm(step) <= FLOOR
         if is_there and not self._is_at_pole(start, p):
             return self.project(start, p)  # It was there up to round-off, which no level moves.
-        chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
         error = InconsistentStateError(
             f"{self.system.name}: no consistent state is found near the given one in which "
             f"{', '.join(fixed)} keep their values; fix fewer states, or give others",
@@ -300,12 +296,164 @@ class Manifold:
 
     def _state(self, state: ArrayLike) -> FloatArray:
         """A state as a new array; its numbers need not be finite."""
-        x = numbers(f"{self.system.name}: a state", state).reshape(-1)
-        if x.size != self.system.num_states:
-            raise ModelError(
-                f"{self.system.name}: a state has shape ({self.system.num_states},), got {x.shape}"
-            )
+        name, size = self.system.name, self.system.num_states
+        x = numbers(f"{name}: a state", state).reshape(-1)
+        if x.size != size:
+            raise ModelError(f"{name}: a state has shape ({size},), got {x.shape}")
         return x
+
+
+class _Settling:
+    """From a user's start to N* level by level: positions first, then velocities.
+
+    Newton's method is used on each order of derivatives, by the states that are new in it. A
+    mechanical system E x' = f + g v has constraint forces along the gradients of its constraints.
+    Their impulses change velocities by dv = M^-1 J^T mu, the change of least kinetic energy.
+    Positions change in the same way, dq = N M^-1 N^T J_q^T mu with q' = N v. So heavy bodies move
+    little in any units, and coordinates on which no constraint force acts do not change. Where
+    constraint forces do work, steps are shortest relative to the scale of the states.
+    """
+
+    def __init__(self, manifold: Manifold) -> None:
+        self._manifold, self._system, layout = manifold, manifold.system, manifold.layout
+        self._layout = layout
+        self._levels: list[Level] = []
+        used = nonzeros(manifold.gradient.sparsity())
+        taken = np.zeros(used.shape[1], dtype=bool)
+        for order in range(max(layout.degrees, default=0)):
+            rows = np.flatnonzero(layout.orders == order)
+            new = used[rows].any(axis=0) & ~taken
+            taken |= new
+            self._levels.append((rows, np.flatnonzero(new), None))
+
+    @property
+    def places(self) -> Indices:
+        """The states on which the constraints themselves depend, such as positions."""
+        return self._levels[0][1] if self._levels else np.zeros(0, dtype=np.intp)
+
+    def given_rates(self, start: FloatArray) -> Indices:
+        """The states that are new in derivatives of constraints and not 0, where others are 0."""
+        found = [np.zeros(0, dtype=np.intp)]
+        for _, columns, _ in self._levels[1:]:
+            given = columns[start[columns] != 0.0]
+            found += [given] if given.size < columns.size else []
+        return np.concatenate(found)
+
+    def settled(
+        self, start: FloatArray, parameters: FloatArray, kept: Indices
+    ) -> FloatArray | None:
+        """The consistent state next to one, with some states kept; None if there is none near."""
+        ways = [self._levels]
+        if self._does_no_work(start, parameters):
+            # The number of further derivatives of a row until the constraint inputs act.
+            degrees, orders = self._layout.degrees, self._layout.orders
+            further = np.repeat(degrees, degrees).astype(int) - 1 - orders
+            kinetic: list[Level] = [
+                (np.flatnonzero(further == depth), self._groups[depth], depth)
+                for depth in reversed(range(len(self._groups)))
+                if np.any(further == depth)
+            ]
+            ways = [kinetic, self._levels]
+        for levels in ways:
+            state = start.copy()
+            if all(self._met(state, parameters, kept, *level) for level in levels):
+                return state
+        return None
+
+    def _met(
+        self,
+        state: FloatArray,
+        parameters: FloatArray,
+        kept: Indices,
+        rows: Indices,
+        new: Indices,
+        depth: int | None,
+    ) -> bool:
+        """Changes new states that are not kept so that some rows of the residual vanish."""
+        columns = np.setdiff1d(new, kept)
+        scale = self._system.scale[columns]
+
+        def filled(z: FloatArray) -> FloatArray:
+            x = state.copy()
+            x[columns] = scale * z
+            return x
+
+        def residual(z: FloatArray) -> FloatArray:
+            return self._manifold.residual(filled(z), parameters)[rows]
+
+        def linearize(z: FloatArray) -> NewtonModel | None:
+            x = filled(z)
+            gradients = self._manifold.gradients(x, parameters)[np.ix_(rows, columns)]
+            if depth is None or columns.size < new.size:
+                return shortest_steps(gradients * scale, residual)
+            # W^-1 C^T, where W is the metric of the states of this level.
+            mass, _, *rates = self._metric_at(x, parameters)
+            moved: FloatArray = gradients.T
+            for rate in reversed(rates[:depth]):
+                moved = rate.T @ moved
+            moved = np.asarray(np.linalg.solve(mass, moved), dtype=np.float64)
+            for rate in rates[:depth]:
+                moved = rate @ moved
+            return steps_along(gradients * scale, moved / scale[:, None], residual)
+
+        if not columns.size:
+            gradients = self._manifold.gradients(state, parameters)[rows] * self._system.scale
+            allowed = CONSISTENT * np.linalg.norm(gradients, axis=1)
+            return bool(np.all(np.abs(residual(np.zeros(0))) <= allowed))
+        z, converged = newton(state[columns] / scale, linearize)
+        state[columns] = scale * z
+        return converged
+
+    @cached_property
+    def _groups(self) -> list[Indices]:
+        """The states whose rates contain constraint inputs, then those that depend on these."""
+        system = self._system
+        mass = nonzeros(system.mass_matrix.sparsity())
+        moved = nonzeros(system.g.sparsity()).any(axis=1)
+        for _ in range(system.num_states):
+            moved = moved | mass[:, moved].any(axis=1)
+        of_one = [bool(entry.is_one()) for entry in ca.vertsplit(ca.diag(system.mass_matrix))]
+        plain = (mass.sum(axis=1) == 1) & np.array(of_one)
+        uses = nonzeros(ca.jacobian_sparsity(system.f, system.state))
+        groups, following, taken = list[Indices](), moved, moved
+        while following.any() and len(groups) < max(self._layout.degrees, default=0):
+            groups.append(np.flatnonzero(following))
+            following = uses[:, groups[-1]].any(axis=1) & ~taken & plain
+            taken = taken | following
+        return groups
+
+    @cached_property
+    def _metric(self) -> tuple[TracedFunction, list[tuple[int, int]]]:
+        """M, the forces along velocities, and dq'/dv, d(q')/dq, ...; and their shapes."""
+        system, groups = self._system, [group.tolist() for group in self._groups]
+        moving = groups[0]
+        forces = system.frictional_contacts.without_friction(system.g)[moving, :]
+        outputs = {"mass": system.mass_matrix[moving, moving], "forces": forces}
+        for depth in range(1, len(groups)):
+            rates, by = system.f[groups[depth]], system.state[groups[depth - 1]]
+            outputs[f"rate{depth}"] = ca.jacobian(rates, by)
+        dense = {name: ca.densify(value) for name, value in outputs.items()}
+        shapes = [value.shape for value in outputs.values()]
+        return system.trace("kinetic metric", dense, often=False), shapes
+
+    def _metric_at(self, state: FloatArray, parameters: FloatArray) -> list[FloatArray]:
+        function, shapes = self._metric
+        values = zip(function.evaluate(state, parameters), shapes, strict=True)
+        return [value.copy().reshape(shape) for value, shape in values]
+
+    def _does_no_work(self, state: FloatArray, parameters: FloatArray) -> bool:
+        """Whether all constraint forces are along their gradients at a state."""
+        if not len(self._groups) == max(self._layout.degrees, default=0) > 0:
+            return False
+        forces = self._metric_at(state, parameters)[1]
+        gradients = self._manifold.gradients(state, parameters)
+        across = gradients[np.ix_(self._layout.ends, self._groups[0])].T
+        lengths = np.linalg.norm(across, axis=0), np.linalg.norm(forces, axis=0)
+        if not all(np.all(np.isfinite(length)) and np.all(length > 0.0) for length in lengths):
+            return False
+        basis, unit = across / lengths[0], forces / lengths[1]
+        residual = unit - basis @ np.linalg.lstsq(basis, unit, rcond=None)[0]
+        return bool(np.max(np.abs(residual)) <= ALONG)
 
 
 def tangent(gradients: FloatArray, scale: FloatArray) -> FloatArray:

@@ -51,6 +51,7 @@ from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
 from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.task.contacts import open_contact
 from drake_dae.systems.task.controller import TaskController
 
@@ -142,7 +143,10 @@ def build_completed(
     sensor, limits = None, None
     if sensors.force is not None:
         with at("sensors.force"):
-            sensor = sensors.force.sensor(model.dae.num_constraints)
+            force = sensors.force
+            errors = force.bias, force.noise_deviation, force.drift
+            lags = force.time_constant, force.sample_period
+            sensor = ForceSensor(model.dae.num_constraints, *lags, *errors)
     if scenario.saturation:
         limits = model.control_limits
         if not np.any(np.isfinite(limits)):
@@ -274,7 +278,7 @@ def _task_controller(
             free_system, gains.design(), structure=structure, latency=law.latency
         )
     # The noise of the sum over the points.
-    noise = float(np.max(scenario.sensors.force_noise)) * len(points) ** 0.5
+    noise = scenario.sensors.force_noise * len(points) ** 0.5
     return TaskController(task.make(noise), law, free_law, sample_period=period or 1e-3)
 
 
@@ -319,7 +323,7 @@ class _NoController(TracedSystem, Controller):
 class _NoLaw:
     """Has of a law what records ask for, its system; all else of a law is an error."""
 
-    structure = None
+    structure = measured_force = None
 
     def __init__(self, system: DaeSystem) -> None:
         self.system = system

@@ -28,12 +28,16 @@ from typing import (
 
 import numpy as np
 import pydantic
+from casadi import SX
+from numpy.typing import ArrayLike
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError, core_schema
 from typing_extensions import TypedDict
 
 from drake_dae.arrays import brief
 from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.robots import Pair, Vector
 from drake_dae.scenario.typed_yaml import TAG, first_name
+from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -130,22 +134,27 @@ def in_folder(name: str, info: pydantic.ValidationInfo) -> str:
 
 
 _TWO, _THREE = (pydantic.Field(min_length=size, max_length=size) for size in (2, 3))
-PAIR = Expected("2 numbers", Annotated[list[float], _TWO], tuple)
-TRIPLE = Expected("3 numbers", Annotated[list[float], _THREE], tuple)
-NUMBERS = Expected(
-    "a number, a list of numbers, or a matrix as a list of rows of one length",
-    float | list[float] | list[list[float]],
-    _rectangular,
-)
-NUMBER_OR_LIST = Expected("a number or a list of numbers", float | list[float])
+FILE = Expected("the name of a file", str, in_folder)
 INTERVAL = Expected(
     "a lowest and a highest value, each a number or a list of numbers",
     Annotated[list[float | list[float]], _TWO],
     tuple,
 )
-COMPILED = Expected("true, false or auto", bool | Literal["auto"])
-FILE = Expected("the name of a file", str, in_folder)
-NAMES = Expected("a name or a list of names", str | list[str])
+VALUES: dict[Any, Any] = {
+    Callable[..., SX] | str: str,
+    str | Path: FILE,
+    str | Sequence[str]: Expected("a name or a list of names", str | list[str]),
+    Compiled: Expected("true, false or auto", bool | Literal["auto"]),
+    float | list[float]: Expected("a number or a list of numbers", float | list[float]),
+    ArrayLike: Expected(
+        "a number, a list of numbers, or a matrix as a list of rows of one length",
+        float | list[float] | list[list[float]],
+        _rectangular,
+    ),
+    Vector: Expected("3 numbers", Annotated[list[float], _THREE], tuple),
+    Pair: Expected("2 numbers", Annotated[list[float], _TWO], tuple),
+}
+"""What stands in data for the types of values in annotations."""
 
 
 def _shown(data: Any) -> str:
@@ -160,6 +169,7 @@ _WORDS = {
     "float_type": "a number",
     "finite_number": "a finite number",
     "greater_than": "a positive number",
+    "greater_than_equal": "0 or more",
     "int_type": "a whole number",
     "bool_type": "true or false",
     "string_type": "text",
@@ -202,18 +212,17 @@ def _problem(text: str, wrong: str = "") -> PydanticCustomError:
 class Reader:
     """Makes a dataclass of plain data, and plain data of it.
 
-    `families` and `values` stand in data for types in annotations; `keys` are those of classes that
-    are no dataclasses, or have other defaults.
+    `families` stand in data for types in annotations, as `VALUES` do; `keys` are those of classes
+    that are no dataclasses, or have other defaults.
     """
 
     def __init__(
         self,
         form: type,
         families: Mapping[Any, Family],
-        values: Mapping[Any, Any],
         keys: Mapping[type, Mapping[str, Key]],
     ) -> None:
-        self._families, self._values, self._keys = families, values, keys
+        self._families, self._keys = families, keys
         self._types, self._free = dict[Any, Any](), set[str]()  # Keys whose names are free.
         self._tags = {c: t for f in families.values() for t, c in f.members.items()}
         self.tags = list(dict.fromkeys(self._tags.values()))
@@ -240,7 +249,7 @@ class Reader:
             for one in error.errors():
                 path = [str(part) for part in one["loc"] if str(part)[:1] != "!"]  # A tag.
                 place = place_of(".".join([*path, one["ctx"]["wrong"]]).rstrip("."))
-                problems.append((".".join(path) or "scenario", f"{one['msg']} {place}"))
+                problems.append((".".join(path) or "scenario", f"{one['ctx']['text']} {place}"))
             raise ScenarioError(*problems) from None
 
     def write(self, value: Any) -> Any:
@@ -260,29 +269,27 @@ class Reader:
             return value.tolist()
         return str(value) if isinstance(value, Path) else value
 
-    def put(self, data: Any, key: str, value: Any) -> None:
+    def put(self, data: Any, key: str, value: Any, path: str = "") -> None:
         """Sets an entry of plain data at a dotted key, in place; chosen names may have dots too."""
         if not all(key.split(".")):
             raise ScenarioError((brief(key), "expected a dotted key, for example start.errors"))
-        path, slot, rest = "", "", key
-        while rest:
-            above, slot = slot, rest.partition(".")[0]
-            if isinstance(data, list):
-                if not (slot.isascii() and slot.isdecimal() and int(slot) < len(data)):
-                    indices = ", ".join(map(str, range(len(data)))) or "none"
-                    raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
-            elif not isinstance(data, dict):
-                raise ScenarioError((path, f"{brief(data)} has no entry '{slot}'"))
-            elif above in self._free:
-                inner = [name for name in data if isinstance(data[name], (dict, list))]
-                slot = first_name(inner, rest) or rest
-            rest, path = rest[len(slot) + 1 :], f"{path}.{slot}".lstrip(".")
-            index: Any = int(slot) if isinstance(data, list) else slot
-            if not rest:
-                data[index] = value
-            elif isinstance(data, dict) and data.get(slot) is None:
-                data[slot] = {}
-            data = data[index]
+        slot: Any = key.partition(".")[0]
+        if isinstance(data, list):
+            if not (slot.isascii() and slot.isdecimal() and int(slot) < len(data)):
+                indices = ", ".join(map(str, range(len(data)))) or "none"
+                raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
+        elif not isinstance(data, dict):
+            raise ScenarioError((path, f"{brief(data)} has no entry '{slot}'"))
+        elif path.rpartition(".")[2] in self._free:
+            slot = first_name([n for n in data if isinstance(data[n], (dict, list))], key) or key
+        rest, path = key[len(slot) + 1 :], f"{path}.{slot}".lstrip(".")
+        slot = int(slot) if isinstance(data, list) else slot
+        if not rest:
+            data[slot] = value
+            return
+        if isinstance(data, dict) and data.get(slot) is None:
+            data[slot] = {}
+        self.put(data[slot], rest, value, path)
 
     def _keys_of(self, form: type) -> Mapping[str, Key]:
         return self._keys.get(form) or keys_of(form)
@@ -295,7 +302,8 @@ class Reader:
         origin, parts, members = get_origin(hint), get_args(hint), _members(hint)
         if origin is Annotated:
             return Annotated[self._type(parts[0]), *parts[1:]]
-        value = next((v for base, v in self._values.items() if _members(base) <= members), None)
+        value = next((v for base, v in VALUES.items() if _members(base) <= members), None)
+        value = Annotated[Any, value] if isinstance(value, Expected) else value
         family = next((f for base, f in self._families.items() if base in members), None)
         if value is None and family is not None:
             if id(family) not in self._types:

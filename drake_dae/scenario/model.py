@@ -11,7 +11,7 @@ from pydrake.geometry import SceneGraph
 
 from drake_dae.analysis import robot_limits
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import DaeSystem, Structure, ZeroDynamics, find_structure
 from drake_dae.errors import (
     AssumptionError,
@@ -50,14 +50,9 @@ T = TypeVar("T")
 NOTHING_FOUND = "no start was found"
 """How the note begins if no outputs and start are good along the references."""
 
-_TIMES = 201
-"""The number of times at which a completed scenario is examined."""
-
-_SLACK = 1e-6
-"""The excess over a limit that counts, in its unit."""
-
-_LARGE = 10.0
-"""The size of a surface in m above which its unit is doubtful."""
+_TIMES, _SLACK, _LARGE = 201, 1e-6, 10.0
+"""At how many times a completed scenario is examined; the excess over a limit that counts, in its
+unit; and the size of a surface in m above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -169,10 +164,9 @@ def _checked_constraints(
     each("forces", forces or (), lambda f: force_rows(as_force_outputs([f], bound), bound, links))
     with at("forces"):
         as_force_outputs(forces, bound)
-    for force, value in (scenario.compliances or {}).items():
+    for force in scenario.compliances or {}:
         with at(f"compliances.{force}"):
             bound.place(force)
-            positive("a compliance", value)
     each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
     with at("law.control_weights"):
         choice = control_choice(robot.title, scenario.law.control_weights or None, actuators)

@@ -3,17 +3,17 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import ClassVar, cast
+from typing import Annotated, ClassVar, cast
 
+from pydantic import Field
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import brief
 from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import RobotModel
-from drake_dae.scenario.form import at
+from drake_dae.scenario.form import Expected, at
 from drake_dae.scenario.robot_file.reading import read_robot
 from drake_dae.scenario.robot_file.robot import Payload, Robot
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
@@ -26,16 +26,7 @@ from drake_dae.systems.plants.robot_plant import RobotPlant
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioPlant(ABC):
-    """What a scenario simulates; the contract of the key `plant`.
-
-    1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
-    2. With `carries`, this plant includes payloads, disturbances and changed parameters. Otherwise
-       the scenario makes a model with these payloads and disturbances, and sets the parameters in
-       the context.
-    3. `material` is the material of compliant contacts, and None for ideal contacts.
-    4. `rolled` is the member that a rollout runs instead: this member, or one with a traced plant.
-    5. `in_context` are the keys of numbers that `begin` sets in a context, even if the plant was
-       made with other numbers. Without `adjusts` the plant is made anew for each payload and force.
+    """What a scenario simulates.
 
     Attributes:
         parameters: Parameter name -> the plant's value, unknown to the law's model; one number for
@@ -47,16 +38,22 @@ class ScenarioPlant(ABC):
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
     payloads: list[Payload] = field(default_factory=list)
     disturbances: list[DisturbanceForce] = field(default_factory=list)
+
     carries: ClassVar[bool] = False
+    """Whether the plant has these itself. Else a model has the payloads and disturbances, and
+    numbers are set in a context, or, if it does not adjust, the plant is made anew for each."""
     adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
+    """The keys of numbers that `begin` sets in a context."""
 
     @property
     def material(self) -> PointMaterial | None:
+        """The material of contacts that give way."""
         return None
 
     @property
     def rolled(self) -> "ScenarioPlant":
+        """What a rollout runs: this, or what has a traced plant."""
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
@@ -64,7 +61,7 @@ class ScenarioPlant(ABC):
 
     @abstractmethod
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
-        """Makes the plant of a robot, with the structure of its system."""
+        """The plant of a robot, with the structure of its system."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +134,12 @@ class CompliantContact(PointMaterial, ScenarioPlant):
             return CompliantPlant(model, self, structure=structure)
 
 
+MAKER = Expected(
+    "a module and a class in it, as my_plants:SpringyPlant",
+    Annotated[str, Field(pattern=r"^[^:]+:[^\W\d]\w*$")],
+)
+
+
 @dataclass(frozen=True)
 class OwnPlant(ScenarioPlant):
     """The plant is your own class that follows the contract of `drake_dae.Plant`.
@@ -149,16 +152,8 @@ class OwnPlant(ScenarioPlant):
         maker: The module and the class in it, as "my_plants:SpringyPlant".
     """
 
-    maker: str
+    maker: Annotated[str, MAKER]
     adjusts: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        module, _, name = self.maker.partition(":")
-        if not (module and name.isidentifier()):
-            raise ModelError(
-                "maker: a module and a class in it are needed, as my_plants:SpringyPlant, got "
-                f"'{brief(self.maker)}'"
-            )
 
     def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         module, _, name = self.maker.partition(":")

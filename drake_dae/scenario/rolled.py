@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from math import ceil
+from math import ceil, floor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,17 +27,13 @@ from drake_dae.scenario.robot_file.reading import robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 
-ROWS = 1000
-"""The number of rows of a record of a rollout under error control, after the first."""
+ROWS, MOST_ROWS = 1000, 1e7
+"""The number of rows of a record under error control, after the first; and the largest number of
+rows of fixed steps, since a larger record takes gigabytes."""
 
-PERIOD = 0.2
-"""The time by the clock between checks of a running rollout for divergence, in s."""
-
-SAME = 1e-6
-"""Two times are equal if they differ by less than this fraction of a step."""
-
-MOST_ROWS = 1e7
-"""The largest number of rows of fixed steps; a larger record takes gigabytes."""
+PERIOD, SAME = 0.2, 1e-6
+"""The time by the clock in s between checks of a running rollout for divergence; and the fraction
+of a step within which two times are equal."""
 
 
 def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:
@@ -67,10 +63,8 @@ def rollout_times(scenario: Scenario, time_step: float = 0.0) -> FloatArray:
             f"keeps at most {MOST_ROWS:g}"
         )
     if time_step:
-        inside = time_step * np.arange(start // time_step + 1, ceil(end / time_step))
-        near = SAME * time_step
-        inside = inside[(inside > start + near) & (inside < end - near)]
-        return np.concatenate([[start], inside, [end]])
+        first, after = floor(start / time_step + SAME) + 1, ceil(end / time_step - SAME)
+        return np.concatenate([[start], time_step * np.arange(first, after), [end]])
     rows = max(1, ceil(duration / fixed - 0.01)) if fixed else ROWS
     times: FloatArray = start + np.linspace(0.0, duration, rows + 1)
     return times

@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from drake_dae.arrays import number_in
 from drake_dae.errors import ModelError
-from drake_dae.scenario.robot_file.xml_tree import Node, read_xml
+from drake_dae.scenario.robot_file.xml_tree import check_included, read_xml
 
 ARMATURE = "joint/armature"
 """Rotor inertia. Drake gives it to motors only."""
@@ -28,26 +28,23 @@ _ONE_DEFAULT = {
 }
 """Parents whose elements have one and the same default -> the names under which it is written."""
 
+_SERVOS = ("position", "velocity", "intvelocity", "general")
+"""Actuators whose control is no effort, while their range of forces limits an effort."""
+
+_LAW = ("dyntype", "gaintype", "biastype")
+
 _OF_GENERAL = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}
 """What motors and servos set themselves, whatever is the default."""
-
-
-def read_included(file: Path, within: tuple[Path, ...]) -> Node:
-    """The root of a file that others include, none of which it is."""
-    if file.resolve() in within:
-        names = " -> ".join(path.name for path in (*within, file))
-        raise ModelError(f"'{file.name}' includes itself: {names}")
-    return read_xml(file)
 
 
 def expand(root: Element, file: Path) -> list[str]:
     """Writes an MJCF file so that each element says all that it means, where it means it.
 
     Included files and defaults of classes go into their places. Inactive equalities go. Limits of
-    motors become those of the efforts at joints, the gear times those of motors. Position servos
-    become motors, since controls are efforts here; their names are returned. Bodies of mass 0,
-    which MuJoCo takes if they do not move or move with others, lose their inertia, and their
-    geometry its mass.
+    motors become those of the efforts at joints, the gear times those of motors. Servos become
+    motors, since controls are efforts here; their names are returned. Bodies of mass 0, which
+    MuJoCo takes if they do not move or move with others, lose their inertia, and their geometry its
+    mass.
     """
     _include(root, file, (file.resolve(),), count(1))
     root.attrib.setdefault("model", file.stem)
@@ -61,20 +58,25 @@ def expand(root: Element, file: Path) -> list[str]:
                 equality.remove(constraint)
     for joint in root.iter("joint"):  # MuJoCo takes an empty range for none.
         words = joint.get("range", "").split()
-        if "limited" not in joint.attrib and not any(map(number_in, words)):
+        if joint.get("limited", "auto" if any(map(number_in, words)) else "false") == "false":
             joint.attrib.pop("range", None)
     servos = []
-    for motor in [*root.iterfind("actuator/motor"), *root.iterfind("actuator/position")]:
-        if motor.tag == "position":  # Its control is a position, and has no limit of efforts.
+    for motor in root.iterfind("actuator/*"):
+        general = {key: motor.attrib.pop(key, "") for key in _OF_GENERAL if motor.tag == "general"}
+        gain = 1.0
+        if motor.tag == "general" and {general[key] for key in _LAW} <= {"", "none", "fixed"}:
+            motor.tag = "motor"  # Of a control in another unit.
+            gain = abs(number_in([*general["gainprm"].split(), "1"][0]) or 1.0)
+        elif motor.tag in _SERVOS:  # Its control is no effort, and neither are its limits.
             motor.tag = "motor"
             servos.append(motor.get("name", motor.get("joint", "")))
             motor.attrib.pop("ctrlrange", None)
             motor.attrib.pop("ctrllimited", None)
         gear = abs(number_in([*motor.get("gear", "").split(), "1"][0]) or 1.0)
-        for key in ("ctrlrange", "forcerange"):
+        for key, scale in (("ctrlrange", gain * gear), ("forcerange", gear)):
             bounds = [number_in(word) for word in motor.get(key, "").split()]
-            if gear != 1.0 and bounds and None not in bounds:
-                motor.set(key, " ".join(repr(gear * (bound or 0.0)) for bound in bounds))
+            if scale != 1.0 and bounds and None not in bounds:
+                motor.set(key, " ".join(repr(scale * (bound or 0.0)) for bound in bounds))
     for body in root.iter("body"):
         inertial = body.find("inertial")
         if inertial is None or weighs_by_geometry(root):
@@ -100,7 +102,8 @@ def _include(owner: Element, main: Path, within: tuple[Path, ...], number: Itera
         if next(number) > _MOST_INCLUDED:
             raise ModelError(f"'{main.name}' includes more than {_MOST_INCLUDED} files")
         file = main.parent / node.get("file", "")
-        included = read_included(file, within)
+        check_included(file, within)
+        included = read_xml(file)
         _include(included, main, (*within, file.resolve()), number)
         for part in included.iter():
             part.line = 0  # type: ignore[attr-defined]
@@ -125,7 +128,7 @@ def _apply_defaults(root: Element) -> None:
             tag = owner.tag if owner.tag in _ONE_DEFAULT else node.tag
             known = classes.get(node.attrib.pop("class", inherited), {})
             values = {} if node.tag in _ONE_DEFAULT else known.get(tag, {})
-            if node.tag in ("motor", "position"):
+            if owner.tag == "actuator" and node.tag != "general":
                 values = {key: value for key, value in values.items() if key not in _OF_GENERAL}
             if _TURNS & node.attrib.keys():
                 values = {key: value for key, value in values.items() if key not in _TURNS}
@@ -167,20 +170,18 @@ def fault(geom: Element) -> str:
     return EMPTY if is_empty or (ends and ends[:3] == ends[3:]) else ""
 
 
-def bodies(owner: Element, moves: bool = False) -> Iterator[tuple[Element, bool]]:
-    """The bodies of a world, itself the first, and whether joints can move them."""
-    yield owner, moves
-    for body in owner.iterfind("body"):
-        has_joint = body.find("joint") is not None or body.find("freejoint") is not None
-        yield from bodies(body, moves or has_joint)
+def geoms(root: Element) -> Iterator[tuple[Element, Element, bool]]:
+    """Geometries, their bodies, and whether joints can move these."""
 
+    def below(body: Element, moves: bool) -> Iterator[tuple[Element, Element, bool]]:
+        for geom in body.findall("geom"):
+            yield geom, body, moves
+        for inner in body.iterfind("body"):
+            has_joint = any(part.tag in ("joint", "freejoint") for part in inner)
+            yield from below(inner, moves or has_joint)
 
-def armatures(root: Element) -> Iterator[tuple[str, float]]:
-    """Joint -> its rotor inertia, kg m^2 or kg; "" for joints that no motor can drive."""
-    for joint in root.iter("joint"):
-        if armature := number_in(joint.get("armature", "")):
-            can_be_driven = joint.get("type", "hinge") in ("hinge", "slide")
-            yield joint.get("name", "") if can_be_driven else "", armature
+    for world in root.iterfind("worldbody"):
+        yield from below(world, False)
 
 
 def floating_bodies(root: Element, placed: Collection[str]) -> Iterator[tuple[str, str]]:

@@ -29,6 +29,11 @@ MEMBERS = {
         Moment(1.9, 20.0, 0.0, 0.0, 20.0, signal={"ready": 0.4}),
         Moment(1.9, 20.0, 0.0, 0.0, 20.0, signal={"ready": 1.0}),
     ),
+    "Move until it has settled": (
+        Move({}, until=[Condition("force error", below=2.0)]),
+        Moment(0.4, 20.0, 0.0, 0.0, 20.0),  # In its transition.
+        Moment(0.6, 18.5, 0.0, 0.0, 20.0),
+    ),
     "Move until": (
         Move({}, until=[Condition("force", above=5.0)]),
         Moment(1.0, 4.9, 0.1, -0.02, 0.1),
@@ -62,6 +67,8 @@ def test_phase_keeps_the_rules(name):
     assert phase.awaits(CONTACT_FORCE)
     # Rule 1: what leads from one law to the other says so of both ends.
     assert (phase.begins_in_contact is None) == (phase.ends_in_contact is None)
+    # Rule 5: others end before, or without a contact.
+    assert phase.holds_contact == isinstance(phase, Press | Move | Dwell)
     # Rule 2: what approaches has no goal for the distance.
     goals = phase.goals("contact")
     assert set(goals) <= {"contact"}

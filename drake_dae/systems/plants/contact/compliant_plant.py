@@ -157,22 +157,15 @@ class CompliantPlant(ParameterizedSystem, Plant):
         """Sets stiffness, dissipation, friction and radius, and places the balls on the robot.
 
         In the nominal configuration, with the parameters of the context, a ball touches at the
-        point of its constraint.
-
-        Args:
-            context: The context of the plant.
-            material: The material, with the time_step and stiction_tolerance of the plant,
-                and a friction if and only if that of the plant has one.
-
-        Raises:
-            ModelError: The material does not fit the plant, a ball its surface, or the step the
-                stages with the parameters of the context.
+        point of its constraint. A ModelError says that the material has another time_step or
+        stiction_tolerance than the plant, or a friction although that has none; that a ball does
+        not fit its surface; or that the step does not fit the stages.
         """
-        fixed, others = (
-            (given.time_step, given.stiction_tolerance, given.friction is None)
-            for given in (self.material, material)
-        )
-        if fixed != others:
+
+        def fixed(given: PointMaterial) -> tuple[float, float, bool]:
+            return given.time_step, given.stiction_tolerance, given.friction is None
+
+        if fixed(material) != fixed(self.material):
             raise ModelError(
                 f"{self.dae.name}: the plant was made with {self.material}; only its stiffness, "
                 f"dissipation, radius and a number of its friction may change, got {material}"

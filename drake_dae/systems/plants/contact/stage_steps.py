@@ -8,11 +8,9 @@ from drake_dae.errors import ModelError
 from drake_dae.robots import RobotModel
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
-_GROWTH = 1e-7
-"""The allowed excess of the spectral radius over 1: round-off of motions without a force."""
+_GROWTH = 1e-7  # allowed excess of the spectral radius over 1: round-off of motions without a force
 
-_SHORTER = np.geomspace(1.0, 0.01, 300)[1:]
-"""The fractions of a too long step that are tried for the message."""
+_SHORTER = np.geomspace(1.0, 0.01, 300)[1:]  # of a too long step, tried for the message
 
 
 def stages_after(model: RobotModel, time_step: float, control: ca.SX) -> ca.SX:
