@@ -1,6 +1,6 @@
 """The start of the runs of a scenario."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -126,8 +126,7 @@ def _at_rest(
         rest = model.rest_state(near, forces, parameters)
         return structure.manifold.settle(rest, of_law)[: near.size]
 
-    q = _unwound(model, settled, guess)
-    _check_limits(model, q, "Give")
+    q = _within_limits(model, settled, guess, "Give")
     state = model.rest_state(q, forces, parameters)
     if scenario.exogenous and not structure.manifold.is_consistent(state, of_law):
         raise ModelError(
@@ -186,39 +185,43 @@ def start_state(
     of_law: FloatArray,
 ) -> FloatArray:
     """The state at rest near start.positions, within limits, with given outputs z, shape (p,)."""
-    signals, links = model.position_signals, model.links
+    count = len(model.position_signals)
+
+    def solve(near: FloatArray) -> FloatArray:
+        return model.placing.solve(outputs[:count], near, parameters, of_law)
+
     # By default near the start of the completion.
-    guess, wanted = start_guess(scenario, links, model.nominal_positions), outputs[: len(signals)]
-    turns = np.array([signal.unit == "rad" for signal in links.position_signals])
-    low, high = links.position_limits
+    guess = start_guess(scenario, model.links, model.nominal_positions)
     try:
-        q = model.placing.solve(wanted, guess, parameters, of_law)
-        # Newton's method may add whole turns to joints.
-        near = unwound(q, guess, (low - _SLACK, high + _SLACK), turns)
-        trial = np.where(np.abs(near - q) < 1.0, q, near)
-        if np.any(trial != q):
-            with suppress(InconsistentStateError):
-                settled = model.placing.solve(wanted, trial, parameters, of_law)
-                q = settled if np.max(np.abs(settled - trial)) < 1e-6 else q
+        remedy = "Change the first values of the references, or give"
+        q = _within_limits(model, solve, guess, remedy)
     except InconsistentStateError as error:
         goal = ", ".join(
             f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
-            for signal, value in zip(signals, wanted, strict=True)
+            for signal, value in zip(model.position_signals, outputs[:count], strict=True)
         )
         raise ModelError(
             f"found no configuration near start.positions with {goal} (the references and "
             f"start.errors at the start) on the constraints: {error}"
         ) from error
-    _check_limits(model, q, "Change the first values of the references, or give")
-    return model.balance.state(q, outputs[len(signals) :], parameters)
+    return model.balance.state(q, outputs[count:], parameters)
 
 
-def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
-    """Checks that all joints of a configuration are within their limits."""
-    rows = zip(model.links.position_signals, q, *model.links.position_limits, strict=True)
+def _within_limits(
+    model: RobotModel, solve: Callable[[FloatArray], FloatArray], guess: FloatArray, remedy: str
+) -> FloatArray:
+    """A solution near a guess without the whole turns that Newton's method may add to joints."""
+    signals, (low, high) = model.links.position_signals, model.links.position_limits
+    q, turns = solve(guess), np.array([signal.unit == "rad" for signal in signals])
+    near = unwound(q, guess, (low - _SLACK, high + _SLACK), turns)
+    trial = np.where(np.abs(near - q) < 1.0, q, near)
+    if np.any(trial != q):
+        with suppress(InconsistentStateError):
+            settled = solve(trial)
+            q = settled if np.max(np.abs(settled - trial)) < 1e-6 else q
     outside = [
         f"{signal.name} = {value:.4g} {signal.unit}, and its limits are {least:g} to {most:g}"
-        for signal, value, least, most in rows
+        for signal, value, least, most in zip(signals, q, low, high, strict=True)
         if not least - _SLACK <= value <= most + _SLACK
     ]
     if outside:
@@ -226,6 +229,7 @@ def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
             f"the robot cannot start outside of its limits, and the start near start.positions has "
             f"{'; '.join(outside)}. {remedy} start.positions of all joints near where they shall be"
         )
+    return q
 
 
 @at("start.positions")
