@@ -1,5 +1,7 @@
 """A Kalman filter of a model's parameters, from the disturbance that they leave."""
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
@@ -178,6 +180,55 @@ class ParameterFilter:
         # A projection may take along another parameter beyond its bound, where the law needs it.
         inside = ca.fmin(ca.fmax(values[:num], self._low), self._high)
         return ca.vertcat(inside, values[num:])
+
+
+class Regressor:
+    """Y = -dr/dtheta at the filter's samples, which are slower than those of r.
+
+    By the derivatives of the momentum p, of its rate without inputs and of the part from the
+    inputs, d theta leaves over a sample T the disturbance
+
+        own = mean of (drift + inputs) - (p - p before) / T,
+
+    low-pass filtered as r is, along the free directions and along the constrained ones. Friction of
+    contacts has its own columns. `jumps` are the changes of r, and of p and its rate if the state
+    `is_exact`, by the last change of theta.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        known: int,
+        frictions: int,
+        rates: Sequence[float],
+        period: float,
+        is_exact: bool,
+    ) -> None:
+        self._gains, self._period = [-np.expm1(-rate * period) for rate in rates], period
+        self._value = ca.SX.sym("regressor", size, known + frictions)
+        self._slopes = [ca.SX.sym("slopes", size, known) for _ in range(3)]
+        names = ("disturbance", "momentum", "drift") if is_exact else ("disturbance",)
+        self.jumps = {name: ca.SX.sym(f"jump of {name}", size) for name in names}
+        parts = self._value, *self._slopes, *self.jumps.values()
+        self.held = ca.vertcat(*map(ca.vec, parts))
+
+    def after(
+        self, slopes: Sequence[ca.SX], turns: ca.SX, slides: ca.SX, free: ca.SX, is_used: ca.SX
+    ) -> ca.SX:
+        """Y after a sample, (k, c): `slopes` count where `turns` is 1, `slides` are of friction."""
+        (momentum, drift, inputs), (before, drifted, pushed) = slopes, self._slopes
+        mean = (drift + inputs + drifted + pushed) / 2.0
+        own = ca.mtimes(mean - (momentum - before) / self._period, ca.diag(turns))
+        signal = ca.horzcat(own, slides)
+        fast, slow = (gain * (signal - self._value) for gain in self._gains)
+        return self._value + is_used * (slow + ca.mtimes(free, fast - slow))
+
+    def held_after(self, value: ca.SX, slopes: Sequence[ca.SX], change: ca.SX) -> ca.SX:
+        """What is held after a sample that changes theta."""
+        jumps = [-ca.mtimes(value, change)]
+        if len(self.jumps) > 1:
+            jumps += [ca.mtimes(slope, change[: slope.shape[1]]) for slope in slopes[:2]]
+        return ca.vertcat(*map(ca.vec, (value, *slopes, *jumps)))
 
 
 def _pushes(pair: ca.SX, block: ca.SX) -> ca.SX:
