@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import IdentifiedTerms
+from drake_dae.dae import DaeSystem, IdentifiedTerms, Observation
 
 GAP = 1e-5
 """The standard deviation of a measured distance to a surface, in m."""
@@ -20,6 +20,9 @@ MEMORY = 100.0
 FADING = 10.0
 """The time in s in which what was measured of a place or a compliance fades. It covers the motion
 along a path and back; with 3 s and with 30 s the places of the tests are as good."""
+
+_DEVELOPED = 0.9
+"""A joint moves where its Coulomb friction has this share of its full size."""
 
 _SETTLING = 1.0
 """The time in s in which the size of what no parameter explains is averaged."""
@@ -191,44 +194,72 @@ class Regressor:
         own = mean of (drift + inputs) - (p - p before) / T,
 
     low-pass filtered as r is, along the free directions and along the constrained ones. Friction of
-    contacts has its own columns. `jumps` are the changes of r, and of p and its rate if the state
+    contacts has its own columns. That of joints turns within a sample: its mean is that of states
+    between both, `steps` of them. `jumps` are the changes of r, and of p and its rate if the state
     `is_exact`, by the last change of theta.
     """
 
     def __init__(
         self,
-        size: int,
-        known: int,
-        frictions: int,
+        system: DaeSystem,
+        observation: Observation,
         rates: Sequence[float],
         period: float,
+        steps: int,
         is_exact: bool,
     ) -> None:
         self._gains, self._period = [-np.expm1(-rate * period) for rate in rates], period
-        self._value = ca.SX.sym("regressor", size, known + frictions)
-        self._slopes = [ca.SX.sym("slopes", size, known) for _ in range(3)]
-        names = ("disturbance", "momentum", "drift") if is_exact else ("disturbance",)
-        self.jumps = {name: ca.SX.sym(f"jump of {name}", size) for name in names}
-        parts = self._value, *self._slopes, *self.jumps.values()
-        self.held = ca.vertcat(*map(ca.vec, parts))
+        self._middles = ((np.arange(steps) + 0.5) / steps).tolist()
+        parameters, size = observation.identified.parameters, len(observation.rows)
+        names = [p.name for p in parameters for _ in range(p.value.size)]
+        dry = [p for p in parameters if p.name in system.dry]
+        self._dry = [i for i, name in enumerate(names) if name in system.dry]
+        symbols = ca.vertcat(ca.SX(0, 1), *(p.symbol for p in dry))
+        turning = ca.densify(ca.jacobian(system.f[list(observation.rows)], symbols))
+        self._turning = ca.Function("turning", [system.state, system.parameter_symbol], [turning])
+        self._value = ca.SX.sym("regressor", size, len(names) + len(observation.frictions))
+        self._slopes = [ca.SX.sym("slopes", size, len(names)) for _ in range(3)]
+        self._state = ca.SX.sym("state", system.num_states)
+        named = ("disturbance", "momentum", "drift") if is_exact else ("disturbance",)
+        self.jumps = {name: ca.SX.sym(f"jump of {name}", size) for name in named}
+        self.held = _column(self._state, self._value, *self._slopes, *self.jumps.values())
 
     def after(
-        self, slopes: Sequence[ca.SX], turns: ca.SX, slides: ca.SX, free: ca.SX, is_used: ca.SX
+        self,
+        state: ca.SX,
+        parameters: ca.SX,
+        slopes: Sequence[ca.SX],
+        slides: ca.SX,
+        free: ca.SX,
+        is_used: ca.SX,
     ) -> ca.SX:
-        """Y after a sample, (k, c): `slopes` count where `turns` is 1, `slides` are of friction."""
+        """Y after a sample, (k, c); the columns `slides` are of friction of contacts."""
         (momentum, drift, inputs), (before, drifted, pushed) = slopes, self._slopes
         mean = (drift + inputs + drifted + pushed) / 2.0
-        own = ca.mtimes(mean - (momentum - before) / self._period, ca.diag(turns))
+        own = mean - (momentum - before) / self._period
+        total = ca.SX(momentum.shape[0], len(self._dry))
+        for share in self._middles if self._dry else ():
+            turning = self._turning(self._state + share * (state - self._state), parameters)
+            # A joint that rests may have any friction.
+            sizes = ca.vertcat(*(ca.mmax(ca.fabs(c)) for c in ca.horzsplit(turning)))
+            total += ca.mtimes(turning, ca.diag(sizes > _DEVELOPED))
+        own[:, self._dry] = total / len(self._middles)
         signal = ca.horzcat(own, slides)
         fast, slow = (gain * (signal - self._value) for gain in self._gains)
         return self._value + is_used * (slow + ca.mtimes(free, fast - slow))
 
-    def held_after(self, value: ca.SX, slopes: Sequence[ca.SX], change: ca.SX) -> ca.SX:
+    def held_after(
+        self, state: ca.SX, value: ca.SX, slopes: Sequence[ca.SX], change: ca.SX
+    ) -> ca.SX:
         """What is held after a sample that changes theta."""
         jumps = [-ca.mtimes(value, change)]
         if len(self.jumps) > 1:
             jumps += [ca.mtimes(slope, change[: slope.shape[1]]) for slope in slopes[:2]]
-        return ca.vertcat(*map(ca.vec, (value, *slopes, *jumps)))
+        return _column(state, value, *slopes, *jumps)
+
+
+def _column(*parts: ca.SX) -> ca.SX:
+    return ca.vertcat(*map(ca.vec, parts))
 
 
 def _pushes(pair: ca.SX, block: ca.SX) -> ca.SX:

@@ -20,9 +20,6 @@ from drake_dae.trace.factorization import PositiveDefiniteFactorization
 _PARAMETER_PERIOD = 0.01
 """The time in s, in whole samples, between samples of the filter of parameters."""
 
-_DEVELOPED = 0.9
-"""A joint moves where its Coulomb friction has this share of its full size."""
-
 _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""
 
@@ -112,8 +109,8 @@ class EstimatorSample:
         slower = max(round(_PARAMETER_PERIOD / period), 1) * period
         within, most = estimated_within(theta, observing.ranges), observing.largest_friction
         self._filter = ParameterFilter(identified, within, c, most, rates[0], slower)
-        self._regressor = Regressor(k, len(self._places), c, rates, slower, not estimates)
         self._ratio = round(slower / period)
+        self._regressor = Regressor(system, observation, rates, slower, self._ratio, not estimates)
         self._before = self._adopted()
 
         sample = ca.floor(TIME / period + _SAME)
@@ -258,20 +255,10 @@ class EstimatorSample:
         parameters = self._parameters()
         contact = self._contacts.terms(x, v, parameters)
         values = identified.slopes.function(x, u, v, parameters)
-        drift = values[1]
-        names = [p.name for p in identified.parameters for _ in range(p.value.size)]
-        turns = [  # A joint that rests may have any friction.
-            ca.mmax(ca.fabs(drift[:, i])) > _DEVELOPED if name in system.dry else 1.0
-            for i, name in enumerate(names)
-        ]
         rests = ca.mmax(contact.sticks) if contact.sticks.numel() else ca.SX(0)
-        Y = self._regressor.after(
-            values[:3],
-            ca.vertcat(*turns),
-            ca.mtimes(contact.friction, ca.diag(contact.slides)),
-            contact.free,
-            ca.logic_and(begun, ca.logic_not(rests)),
-        )
+        slides = ca.mtimes(contact.friction, ca.diag(contact.slides))
+        is_used = ca.logic_and(begun, ca.logic_not(rests))
+        Y = self._regressor.after(x, parameters, values[:3], slides, contact.free, is_used)
         mass = ca.Function("M", [system.state, system.parameter_symbol], [system.mass_matrix])
         forces = v[list(identified.pressed), :]
         excused = ca.logic_or(self.inputs["hold"] != 0, rests)
@@ -285,7 +272,7 @@ class EstimatorSample:
             forces >= self._observing.least_force,
             ca.logic_and(begun, ca.logic_not(excused)),
         )
-        held = self._regressor.held_after(Y, values[:3], filtered[: Y.shape[1]])
+        held = self._regressor.held_after(x, Y, values[:3], filtered[: Y.shape[1]])
         return where_finite(ca.vertcat(filtered, held), contact.valid)
 
     # The state from encoders.
