@@ -14,7 +14,6 @@ from drake_dae.dae.beyond.contact_gains import ContactGains, best_damping
 from drake_dae.dae.beyond.one_direction import (
     Direction,
     DirectionGains,
-    SampledLoop,
     SensorNoise,
     sampled_loop,
 )
@@ -114,6 +113,23 @@ class Part:
     by_noise: float
     roughness: float
 
+    @classmethod
+    def of(cls, situation: SensedContact, w: float, rates: DirectionGains, contact: bool) -> "Part":
+        """Of the linear loop with these gains, which belong to the rate w in 1/s."""
+        direction = situation.contact() if contact else situation.free()
+        lever = situation.contact_lever if contact else situation.lever
+        mobility = situation.mobility if contact else situation.free_mobility
+        loop = sampled_loop(direction, rates, situation.noise_of(lever))
+        error, jump = loop.deviations()
+        step = MODEL_ERROR * mobility * loop.after_step() * (loop.period / EVERY) ** 0.5
+        if contact:
+            ramp = rates.gains[2] * RAMP / (mobility * situation.stiffness)
+            whole, roughness = float(np.linalg.norm([error, step, ramp])), lever * jump / mobility
+        else:
+            _, jump = sampled_loop(direction, rates, situation.noise_of(1.0)).deviations()
+            whole, roughness = float(np.hypot(error, step)), situation.inertia * jump
+        return cls(w, rates, contact, whole, error, roughness)
+
 
 def is_stable(situation: SensedContact, part: Part) -> bool:
     """Whether a loop settles for all masses and stiffnesses for which it must be stable."""
@@ -131,32 +147,24 @@ def is_stable(situation: SensedContact, part: Part) -> bool:
     )
 
 
-def free_part(situation: SensedContact, w: float, fast: float | None) -> Part:
-    """The prediction for free directions with the rates w and that of an estimator, in 1/s."""
-    p = 1.5 * w
-    rates = DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
-    loop = sampled_loop(situation.free(), rates, situation.noise_of(situation.lever))
-    error, _ = loop.deviations()
-    _, jump = sampled_loop(situation.free(), rates, situation.noise_of(1.0)).deviations()
-    step = MODEL_ERROR * situation.free_mobility * _rms(loop)
-    return Part(w, rates, False, float(np.hypot(error, step)), error, situation.inertia * jump)
+def _free(situation: SensedContact, fast: float | None) -> list[Part]:
+    """The predictions for free directions with all rates, and that of an estimator, in 1/s."""
+    found = []
+    for w in _rates(situation):
+        p = 1.5 * w
+        rates = DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
+        found.append(Part.of(situation, w, rates, False))
+    return found
 
 
-def contact_part(situation: SensedContact, w: float, fast: float | None, share: float) -> Part:
+def _along(situation: SensedContact, fast: float | None, share: float) -> list[Part]:
     """The same along the contact, with a factor by which integral and observer are slowed."""
-    c = min(2.3 * w, situation.best_damping)
-    rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
-    loop = sampled_loop(situation.contact(), rates, situation.noise_of(situation.contact_lever))
-    error, jump = loop.deviations()
-    step = MODEL_ERROR * situation.mobility * _rms(loop)
-    ramp = rates.gains[2] * RAMP / (situation.mobility * situation.stiffness)
-    whole = float(np.linalg.norm([error, step, ramp]))
-    return Part(w, rates, True, whole, error, situation.contact_lever * jump / situation.mobility)
-
-
-def _rms(loop: SampledLoop) -> float:
-    """The rms error per disturbing acceleration that appears every `EVERY` seconds."""
-    return loop.after_step() * float(np.sqrt(loop.period / EVERY))
+    found = []
+    for w in _rates(situation):
+        c = min(2.3 * w, situation.best_damping)
+        rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
+        found.append(Part.of(situation, w, rates, True))
+    return found
 
 
 def noisiest_sensor(situation: SensedContact, part: Part, deviation: int) -> str:
@@ -282,14 +290,6 @@ def _state_rates(situation: SensedContact) -> list[float | None]:
         return [None]
     rates = [share * _rates(situation)[0] for share in (2.0, 4.0, 7.0, 12.0, 20.0)]
     return [rate for rate in rates if rate * situation.period <= 0.5]
-
-
-def _free(situation: SensedContact, fast: float | None) -> list[Part]:
-    return [free_part(situation, w, fast) for w in _rates(situation)]
-
-
-def _along(situation: SensedContact, fast: float | None, share: float) -> list[Part]:
-    return [contact_part(situation, w, fast, share) for w in _rates(situation)]
 
 
 def _pair(
