@@ -109,7 +109,7 @@ URDF = """<robot name="r">
 {dynamics}
 <limit effort="{effort}"/></joint>
 <transmission name="t"><type>transmission_interface/SimpleTransmission</type>
-<joint name="j"/><actuator name="m">{gear}</actuator></transmission>{more}
+<joint name="{driven}"/><actuator name="m">{gear}</actuator></transmission>{more}
 </robot>{after}"""
 FINE = {
     "origin": "",
@@ -119,6 +119,7 @@ FINE = {
     "axis": '<axis xyz="0 0 1"/>',
     "dynamics": '<dynamics damping="0.1"/>',
     "effort": "10",
+    "driven": "j",
     "gear": "",
     "more": "",
     "after": "",
@@ -141,9 +142,10 @@ ROBOTS = {
     "an axis of two numbers": ({"axis": '<axis xyz="0 -1"/>'}, "3 values .* 0 -1"),
     "an origin that is NaN": ({"origin": '<origin xyz="nan 0 0"/>'}, "3 values .* nan"),
     "one damping of a planar joint": (
-        {"type": "planar", "dynamics": '<dynamics damping="0"/>'},
+        {"type": "planar", "dynamics": '<dynamics damping="0"/>', "driven": "none"},
         "3 values .*damping",
     ),
+    "a motor of a planar joint": ({"type": "planar", "dynamics": ""}, "'j'"),
     "Coulomb friction": (
         {"dynamics": '<dynamics damping="0.1" friction="0.5"/>'},
         "joint 'j'",

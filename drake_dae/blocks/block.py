@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar
 
 import casadi as ca
@@ -153,8 +154,14 @@ class Block:
 
     def sources(self, *values: ca.SX) -> list[str]:
         """The names of the columns on which some values depend, in the order of `columns`."""
-        value = stacked([ca.vec(each) for each in values])
-        return [name for name, column in self.columns().items() if ca.depends_on(value, column)]
+        used = {s.element_hash() for s in ca.symvar(stacked([ca.vec(each) for each in values]))}
+        return [name for name, own in self._symbols.items() if not used.isdisjoint(own)]
+
+    @cached_property
+    def _symbols(self) -> dict[str, frozenset[int]]:
+        """Name of a column -> the hashes of its symbols."""
+        columns = {name: ca.symvar(column) for name, column in self.columns().items()}
+        return {name: frozenset(s.element_hash() for s in own) for name, own in columns.items()}
 
     def rates(self) -> dict[tuple[float, float, bool], list[str]]:
         """(period, offset, is_unrestricted) -> the held values that are updated together."""
@@ -208,9 +215,7 @@ class BlockFunction(TracedFunction):
         values: Mapping[str, ca.SX],
         compiled: Compiled = False,
     ) -> None:
-        columns = block.columns()
-        value = stacked([ca.vec(each) for each in values.values()])
-        self.sources = tuple(name for name, c in columns.items() if ca.depends_on(value, c))
+        columns, self.sources = block.columns(), tuple(block.sources(*values.values()))
         inputs = {name.removeprefix("input "): columns[name] for name in self.sources}
         super().__init__(f"{block.name} {what}".strip(), inputs, values, compiled=compiled)
         self._requirements = block.requirements

@@ -380,7 +380,7 @@ class _Walk:
             own += [Signal(f"parameter[{i}]") for i in range(len(own), count)]
             if "@" in name:  # It has no name, but an address.
                 name = name.partition("@")[0].rpartition("/")[2]
-            named += [Signal(f"{name}.{signal.name}", signal.unit) for signal in own[:count]]
+            named += [_prefixed(name, signal) for signal in own[:count]]
         return named
 
     def signals(self, outputs: Mapping[str, OutputPort]) -> dict[str, Sequence[Signal]]:
@@ -393,6 +393,13 @@ class _Walk:
             if block is not None and own in block.signals:
                 named[name] = block.signals[own]
         return named
+
+
+def _prefixed(name: str, signal: Signal) -> Signal:
+    """A checked signal with its system's name before its own, made without checks."""
+    prefixed = object.__new__(Signal)
+    vars(prefixed).update(name=f"{name}.{signal.name}", unit=signal.unit)
+    return prefixed
 
 
 def _projection(

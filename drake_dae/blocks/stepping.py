@@ -1,6 +1,6 @@
 """A block as a stepper sees it: functions of numbers, and the runs to make with them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache, cached_property
@@ -108,7 +108,7 @@ class StepFunctions:
         return {"rate": self.rate, "row": self.row, "newton": self.newton, **updates}
 
     @cached_property
-    def buffered(self) -> dict[str, Buffered]:
+    def buffered(self) -> Mapping[str, Callable[..., list[FloatArray]]]:
         """All functions, to be called on arrays."""
         return {name: Buffered(function) for name, function in self.functions.items()}
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 
 import drake_dae
-from drake_dae.commands.parser import (
-    Parser,
-    check_folder,
-    complete,
-    open_page,
-    program,
-    waiting,
-)
+from drake_dae.commands.writing import check_folder, complete, open_page, program, waiting
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter, Recorded
 from drake_dae.errors import DrakeDaeError, ModelError, ScenarioError, describe_os_error
@@ -38,7 +32,7 @@ from drake_dae.scenario.build import build_completed, build_scenario
 from drake_dae.scenario.judging import judge_run
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 from drake_dae.scenario.scenario import Scenario, load_scenario, save_scenario, scenario_data
-from drake_dae.scenario.shipped import DEFAULT_SCENARIO, find_scenario
+from drake_dae.scenario.shipped import find_scenario
 from drake_dae.scenario.start import start_scenario
 from drake_dae.scene.view import start_meshcat
 
@@ -47,23 +41,8 @@ FILES = (SCENARIO, SUMMARY, RECORD, *PLOTS, ANIMATION)
 """The files of a run in its folder."""
 
 
-def _simulate_options(parser: Parser) -> None:
-    parser.scenario(DEFAULT_SCENARIO)
-    parser.out("FOLDER", "folder for the results (default: runs/<scenario>-<time>)")
-    parser.flag("--meshcat", "show the robot while it runs, in a browser")
-    parser.flag("--open", "open the animation in a browser at the end")
-    parser.flag("--rollout", "run the whole loop as one function, without Drake's Simulator")
-    parser.flag("--check", "exit code 2 for a run that missed its task")
-    parser.json("print the verdict and the files")
-
-
-def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    """Runs a scenario and writes its record, a summary and an animation into a folder.
-
-    The first line of the summary says whether the run is GOOD, BAD or UNDECIDED, and why. A rollout
-    is faster for many runs (see sweep), not for one; its record has every fixed step, or 1000 rows
-    under error control.
-    """
+def simulate_command(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
+    """Runs a scenario into a folder of its own."""
     # The scenario, and whether its files may be written.
     path = find_scenario(options.scenario)
     scenario, remarks = load_scenario(path, options.settings), list[str]()
@@ -77,12 +56,11 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         check_unwritten((options.out / name for name in FILES), options.force)
 
     # The loop at its start.
-    began = time.perf_counter()
+    began, config = time.perf_counter(), scenario.integrator
     if options.rollout:
         scenario, *remarks = for_rollout(scenario)
     if options.meshcat:
-        rate = scenario.integrator.target_realtime_rate
-        scenario.integrator.target_realtime_rate = rate or 1.0
+        config.target_realtime_rate = config.target_realtime_rate or 1.0
     meshcat = start_meshcat() if options.meshcat else None
     with waiting(f"building {path.stem}"):
         completed, loop = build_completed(scenario, meshcat)
@@ -98,19 +76,29 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         (folder / file).unlink(missing_ok=True)
     first_line = f"# Scenario as run by drake-dae {drake_dae.__version__}"
     save_scenario(scenario, folder / SCENARIO, first_line)
-    recorded: list[RecordAfter] = [lambda after: loop.record(context, after)]
+    recorded: RecordAfter = lambda after: loop.record(context, after)  # noqa: E731
     statistics, reason, results, problems = None, "", dict[str, Any](), list[str]()
+
+    def see(record: RecordAfter) -> bool:
+        nonlocal recorded
+        recorded = record
+        return ending.signal is not None
+
     with _watched(meshcat):
         try:
             if options.rollout:
-                statistics = _roll(scenario, loop, context, recorded)
+                began = time.perf_counter()
+                with ending_signals(ending := Interruption()), waiting("rolling out"):
+                    rollout = roll_scenario(scenario, loop, context, look=see)
+                see(rollout.record.after)
+                if rollout.failure is not None:
+                    raise rollout.failure
+                times, wall = rollout.record.time, time.perf_counter() - began
+                simulated = float(times[-1] - times[0]) if times.size else 0.0
+                statistics = RunStatistics(simulated, wall, rollout.steps, ending.signal)
             else:
-                config, may_diverge = scenario.integrator, scenario.judgement.may_diverge
-                statistics = simulate(
-                    *(loop.diagram, context, scenario.duration, config),
-                    progress=True,
-                    may_diverge=may_diverge,
-                )
+                arguments = loop.diagram, context, scenario.duration, scenario.integrator
+                statistics = simulate(*arguments, True, scenario.judgement.may_diverge)
         except DrakeDaeError as error:
             reason = str(error)
             raise
@@ -118,7 +106,7 @@ def _simulate(options: argparse.Namespace) -> tuple[int, dict[str, Any]]:
             reason = "interrupted in the middle of a step"
             raise
         finally:  # The files of what has been simulated.
-            record = recorded[0](None)
+            record = recorded(None)
             if record.time.size:
                 title = f"{path.stem}: {scenario.description}".removesuffix(": ")
                 made = scenario, loop, context, record, statistics, reason
@@ -153,26 +141,6 @@ def _watched(meshcat: Meshcat | None) -> Iterator[None]:
     yield
     if is_asked:
         input("the view stays until you press Enter")
-
-
-def _roll(
-    scenario: Scenario, loop: ClosedLoop, context: Context, recorded: list[RecordAfter]
-) -> RunStatistics:
-    """Runs by `rollout`; `recorded` becomes what it has recorded."""
-    began = time.perf_counter()
-
-    def see(record: RecordAfter) -> bool:
-        recorded[0] = record
-        return ending.signal is not None
-
-    with ending_signals(ending := Interruption()), waiting("rolling out"):
-        rollout = roll_scenario(scenario, loop, context, look=see)
-    recorded[0] = rollout.record.after
-    if rollout.failure is not None:
-        raise rollout.failure
-    times, wall = rollout.record.time, time.perf_counter() - began
-    simulated = float(times[-1] - times[0]) if times.size else 0.0
-    return RunStatistics(simulated, wall, rollout.steps, ending.signal)
 
 
 def _write(
@@ -240,32 +208,17 @@ def _write(
     return {**summary.data, "files": written}, problems
 
 
-def _plot_options(parser: Parser) -> None:
-    parser.path("runs", "RUN", "a folder of a run, or a record.npz", nargs="+")
-    signals = "what to draw, as wall.force,control (default: all outputs)"
-    parser.repeatable("--signals", "NAMES", signals)
-    parser.flag("--errors", "|z - r| of outputs, over the predicted one")
-    parser.flag("--all", "all plots of each run, into its folder, as write.plots=true does")
-    film = "the robot as it moves, with the paths and the forces of its contacts"
-    parser.flag("--film", f"{film}: a .gif, or a .png for four moments side by side")
-    parser.out("FILE", "a .png, .pdf or .svg (default: plot.png), or the film (film.gif)")
-
-
-def _plot(options: argparse.Namespace) -> int:
-    """Draws outputs of runs with their references, or other signals by name, or makes a film.
-
-    Errors are drawn as predicted beside those measured, all runs in one picture.
-    """
+def plot_command(options: argparse.Namespace) -> int:
+    """Draws signals of runs, or all plots of each, or a film."""
     from drake_dae.pictures.film import save_film
     from drake_dae.pictures.plots import plot_runs, save_plots
 
-    runs = options.runs
+    runs, is_film = options.runs, options.film
     for path in runs:
         if runs.count(path) > 1:
             raise ModelError(f"the run '{path}' is named twice; name each run once")
-    if (options.all or options.film) and (
-        options.signals or options.errors or (options.all and (options.film or options.out))
-    ):
+    more = options.signals or options.errors or (options.all and (is_film or options.out))
+    if (options.all or is_film) and more:
         raise ModelError("--all and --film take no other options, but --film an --out")
     if options.all:
         check_unwritten((folder / name for folder in runs for name in PLOTS), options.force)
@@ -277,28 +230,23 @@ def _plot(options: argparse.Namespace) -> int:
             written = [name for name in PLOTS if (folder / name).exists()]
             print(f"written to {folder}/: {', '.join(written)}")
         return 0
-    if options.film:
-        if len(runs) > 1:
-            raise ModelError(f"a film is of one run, got {', '.join(map(str, runs))}")
-        path = options.out or runs[0] / "film.gif"
-        check_unwritten([path], options.force)
-        with waiting(f"filming {runs[0]}"):
-            again = _run_again(runs[0])
-            with complete(path.parent, path.name) as place:
-                save_film(*again, place / path.name)
-    else:
-        path = options.out or Path("plot.png")
-        if path.suffix not in (".png", ".pdf", ".svg"):
-            raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
-        check_unwritten([path], options.force)
-        # The whole path is the label where the last part is ambiguous.
-        same = Counter(run.name for run in runs)
-        labels = [run.name if run.name and same[run.name] == 1 else str(run) for run in runs]
-        records = dict(zip(labels, map(_load_record, runs), strict=True))
-        names = [name for text in options.signals for name in text.split(",") if name]
-        figure = plot_runs(records, names, options.errors)
+    if is_film and len(runs) > 1:
+        raise ModelError(f"a film is of one run, got {', '.join(map(str, runs))}")
+    path = options.out or (runs[0] / "film.gif" if is_film else Path("plot.png"))
+    if not is_film and path.suffix not in (".png", ".pdf", ".svg"):
+        raise ModelError(f"a plot is a .png, .pdf or .svg, got '{path}'")
+    check_unwritten([path], options.force)
+    with waiting(f"drawing {path.name}"):
+        if is_film:
+            draw = partial(save_film, *_run_again(runs[0]))
+        else:  # The whole path is the label where the last part is ambiguous.
+            same = Counter(run.name for run in runs)
+            labels = [run.name if run.name and same[run.name] == 1 else str(run) for run in runs]
+            records = dict(zip(labels, map(_load_record, runs), strict=True))
+            names = [name for text in options.signals for name in text.split(",") if name]
+            draw = partial(plot_runs(records, names, options.errors).savefig, dpi=110)
         with complete(path.parent, path.name) as place:
-            figure.savefig(place / path.name, dpi=110)
+            draw(place / path.name)
     print(f"written to {path}")
     return 0
 
@@ -326,11 +274,7 @@ def _run_again(folder: Path) -> tuple[ClosedLoop, Record, Context]:
     return loop, record, context
 
 
-def _play_options(parser: Parser) -> None:
-    parser.path("folder", "RUN", "the folder of a run")
-
-
-def _play(options: argparse.Namespace) -> int:
+def play_command(options: argparse.Namespace) -> int:
     """Opens the animation of a run in the browser."""
     folder, page = options.folder, options.folder / ANIMATION
     if not (folder / SCENARIO).is_file():
@@ -344,10 +288,3 @@ def _play(options: argparse.Namespace) -> int:
         )
     open_page(page)
     return 0
-
-
-COMMANDS = {
-    "simulate": (_simulate_options, _simulate),
-    "plot": (_plot_options, _plot),
-    "play": (_play_options, _play),
-}

@@ -16,13 +16,9 @@ from .beyond.one_direction import SensorNoise as SensorNoise
 from .contacts import UnilateralInput as UnilateralInput
 from .derivatives import Derivatives as Derivatives
 from .elimination import Elimination as Elimination
-from .equilibria import ComplexArray as ComplexArray
-from .equilibria import Stability as Stability
-from .equilibria import Verdict as Verdict
 from .extension import Extension as Extension
 from .extension import dynamic_extension as dynamic_extension
 from .fields import as_expression as as_expression
-from .floquet import StabilityAlong as StabilityAlong
 from .gains import FeedbackGains as FeedbackGains
 from .gains import GainDesign as GainDesign
 from .gains import gain_coefficients as gain_coefficients
@@ -48,6 +44,10 @@ from .signals import Parameter as Parameter
 from .signals import Signal as Signal
 from .signals import outputs_named as outputs_named
 from .signals import signals as signals
+from .stability import ComplexArray as ComplexArray
+from .stability import Stability as Stability
+from .stability import StabilityAlong as StabilityAlong
+from .stability import Verdict as Verdict
 from .structure import ConstraintStructure as ConstraintStructure
 from .structure import Structure as Structure
 from .structure import constraint_structure_of as constraint_structure_of

@@ -1,6 +1,5 @@
 """How a system can violate Assumptions (1)-(5), as values, and which rows depend on which."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -12,9 +11,7 @@ from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.elimination import Elimination
 from drake_dae.dae.family import Deciding
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.margins import RankMargin
 from drake_dae.dae.samples import Samples
-from drake_dae.dae.signals import Signal
 from drake_dae.errors import AssumptionError
 from drake_dae.trace.round_off import (
     SINGULAR,
@@ -25,46 +22,75 @@ from drake_dae.trace.round_off import (
     smallest_singular_value,
 )
 
+_NO_DEGREE = (
+    "the relative degree of {what} is not defined{where}: {acts} on its derivative {order} around "
+    "this state, but not there"
+)
+_LOSES_RANK = "A(x) loses rank{where}: {evidence}"
+
 
 class ViolationKind(Enum):
-    """The kinds of violations; the enum value is the remedy."""
+    """The kinds of violations: what is wrong, and the remedy."""
 
-    COUNT = "Remove the redundant ones"
+    COUNT = "the m = {count} constraints are more than the states", "Remove the redundant ones"
     CONSTRAINT_DEGREE = (
-        "Keep away from this state, or write the constraint so that its gradient does not vanish"
+        _NO_DEGREE,
+        "Keep away from this state, or write the constraint so that its gradient does not vanish",
     )
-    OUTPUT_DEGREE = "Choose another output, or keep away from this state"
-    EARLY_CONTROL = "Take that control out, or add an actuator state in front of it"
-    NO_FORCE = "It is redundant, or no constraint input enforces it"
-    NO_CONTROL = "Choose another output"
+    OUTPUT_DEGREE = _NO_DEGREE, "Choose another output, or keep away from this state"
+    EARLY_CONTROL = (
+        "the control acts on derivative {order} of {what}, before any constraint input "
+        "does{where}, and so binds the control, not the state",
+        "Take that control out, or add an actuator state in front of it",
+    )
+    NO_FORCE = (
+        "no constraint input ever acts on {what}: none reaches it, or its derivatives repeat each "
+        "other or fill the state; {evidence}",
+        "It is redundant, or no constraint input enforces it",
+    )
+    NO_CONTROL = (
+        "the control never acts on {what}: none reaches it, or it follows from the constraints or "
+        "from its own derivatives, so it has no relative degree and B(x) no row for it",
+        "Choose another output",
+    )
     CONSTRAINT_RANK = (
+        _LOSES_RANK,
         "Their gradients are independent there, but the constraint inputs cannot act on them "
-        "independently. Keep away from this state, or change how the constraint inputs enter"
+        "independently. Keep away from this state, or change how the constraint inputs enter",
     )
     REDUNDANT = (
+        _LOSES_RANK,
         "The constraints are redundant at every state, so that the forces are not determined. "
         "Remove one with its constraint input, as drop_constraints does, or have the forces shared "
-        "by least squares: share_forces, or `compliances` of a robot or a scenario"
+        "by least squares: share_forces, or `compliances` of a robot or a scenario",
     )
     SINGULAR_CONFIGURATION = (
+        _LOSES_RANK,
         "This is a singular configuration: forces are not determined there, and motions on N* may "
         "branch. A plant that starts elsewhere passes through it if its velocity leads across; a "
         "law cannot. Choose a nominal state and motions that keep away, or give one of the "
-        "constraints a spring or a clearance"
+        "constraints a spring or a clearance",
     )
     HIDDEN_DEGREE = (
+        _LOSES_RANK,
         "No constraint is redundant, but one less the combination of others that its row follows "
-        "from has a higher relative degree. Write this difference in its place: N* stays the same"
+        "from has a higher relative degree. Write this difference in its place: N* stays the same",
     )
     NUMBERS = (
+        "the relative degree of {what} depends on numbers: {acts} on its derivative {order} "
+        "{deciding}",
         "The structure must be the same for all values of parameters and signals. Give such a "
         "parameter or signal another default, or give its range, by `DaeSystem.with_bounds` or "
-        "`bounds` of a scenario; equal bounds fix it at its default"
+        "`bounds` of a scenario; equal bounds fix it at its default",
     )
-    BOUNDS = "Give narrower bounds, which exclude this value"
+    BOUNDS = (
+        "{matrix} loses rank within the bounds, {deciding}",
+        "Give narrower bounds, which exclude this value",
+    )
     CONTROL_RANK = (
+        "B(x) of (16) is singular{where}: {what} cannot be steered independently; {evidence}",
         "Choose other outputs, keep away from this state, or see whether `dynamic_extension` finds "
-        "integrators that help"
+        "integrators that help",
     )
 
 
@@ -104,88 +130,32 @@ class Violation:
         return AssumptionError(str(self), self.assumption, self.state, self)
 
     def __str__(self) -> str:
-        kind, cause, deciding = ViolationKind, self.cause, self.deciding
+        what, remedy = self.cause.value
         of_constraints = self.assumption <= 3
         matrix = "A(x)" if of_constraints else "B(x) of (16)"
-        what = f"{'constraint' if of_constraints else 'output'} " + ", ".join(
-            f"'{name}'" for name in self.names
-        )
         acts = "the constraint inputs act" if self.assumption == 1 else "the control acts"
-        where = "" if self.state is None else f" at x = {show(self.state)}"
-        rows = "; ".join(map(str, self.combinations))
-        value = ""
+        evidence = f"dependent rows: {'; '.join(map(str, self.combinations))}"
+        evidence = evidence if self.combinations else ""
         if self.singular_value is not None:
-            value = f"smallest singular value {self.singular_value:.1e}, rows and columns scaled"
-            value += "" if self.least is None else f", below the least_margin of {self.least:.0e}"
-        if cause is kind.COUNT:
-            text = f"the m = {len(self.names)} constraints are more than the states"
-        elif cause in (kind.CONSTRAINT_DEGREE, kind.OUTPUT_DEGREE):
-            text = (
-                f"the relative degree of {what} is not defined{where}: {acts} on its derivative "
-                f"{self.order} around this state, but not there"
+            evidence = (
+                f"smallest singular value {self.singular_value:.1e}, rows and columns scaled, "
+                f"below the least_margin of {self.least:.0e}; {evidence}"
             )
-        elif cause is kind.EARLY_CONTROL:
-            text = (
-                f"the control acts on derivative {self.order} of {what}, before any constraint "
-                f"input does{where}, and so binds the control, not the state"
-            )
-        elif cause is kind.NO_FORCE:
-            text = (
-                f"no constraint input ever acts on {what}: none reaches it, or its derivatives "
-                f"repeat each other or fill the state"
-            )
-            text += f"; gradients of constraints: {rows}" if rows else ""
-        elif cause is kind.NO_CONTROL:
-            text = (
-                f"the control never acts on {what}: none reaches it, or it follows from the "
-                "constraints or from its own derivatives, so it has no relative degree and B(x) no "
-                "row for it"
-            )
-        elif cause is kind.NUMBERS:
-            text = (
-                f"the relative degree of {what} depends on numbers: {acts} on its derivative "
-                f"{self.order} {deciding}"
-            )
-        elif cause is kind.BOUNDS:
-            places = [
-                f" of '{name}', between its default {default:.6g} and {bound:.6g}"
-                for name, bound, default in (deciding.pairs if deciding else ())
-            ]
-            text = f"{matrix} loses rank within the bounds{','.join(places)}"
-        elif cause is kind.CONTROL_RANK:
-            text = (
-                f"B(x) of (16) is singular{where}: the controlled outputs {', '.join(self.names)} "
-                f"cannot be steered independently; {value}"
-            )
-            text += f"; rows of B(x): {rows}" if rows else ""
-        else:  # A(x) has lost its rank.
-            in_rows = cause in (kind.CONSTRAINT_RANK, kind.HIDDEN_DEGREE)
-            of = "rows of A(x)" if in_rows else "gradients of constraints"
-            parts = [part for part in (value, rows and f"{of}: {rows}") if part]
-            text = f"A(x) loses rank{where}: {'; '.join(parts)}"
-        text = f"Assumption ({self.assumption}): {text}. {cause.value}"
-        if deciding is None or cause in (kind.NUMBERS, kind.BOUNDS):
+        names = ", ".join(f"'{name}'" for name in self.names)
+        text = what.format(
+            count=len(self.names),
+            what=f"{'constraint' if of_constraints else 'output'} {names}",
+            order=self.order,
+            where="" if self.state is None else f" at x = {show(self.state)}",
+            acts=acts,
+            matrix=matrix,
+            deciding=self.deciding,
+            evidence=evidence,
+        ).rstrip("; ")
+        text = f"Assumption ({self.assumption}): {text}. {remedy}"
+        if self.deciding is None or "{deciding}" in what:
             return text
-        then = {kind.NO_FORCE: "a constraint input acts", kind.NO_CONTROL: "the control acts"}
-        regular = then.get(cause, f"{matrix[:4]} is regular")
-        return f"{text}. This depends on parameter values: {regular} {deciding}"
-
-
-def rank_violation(
-    margin: RankMargin | None,
-    signals: Sequence[Signal],
-    degrees: Sequence[int],
-    vanishing: tuple[int, ViolationKind],
-    dependent: tuple[int, ViolationKind],
-) -> Violation | None:
-    """Returns the violation by a singular matrix: another kind if a whole row vanishes."""
-    if margin is None or not margin.is_singular:
-        return None
-    row, state = margin.vanishing_row, margin.state
-    if row is not None:
-        return Violation(*vanishing, (signals[row].name,), degrees[row], state)
-    names = tuple(signal.name for signal in signals)
-    return Violation(*dependent, names, None, state, margin.relative, margin.least)
+        return f"{text}. This depends on parameter values: it is not so {self.deciding}"
 
 
 def find_dependence(
@@ -201,10 +171,8 @@ def find_dependence(
         a, last = (v.reshape(len(names), -1) for v in function(state, system.parameter_values))
         return [a, last * system.scale]
 
-    def is_singular(state: FloatArray) -> bool:
-        return smallest_singular_value(equilibrated(matrices(state)[0])) < system.least_margin
-
-    everywhere = all(is_singular(state) for state in states)
+    least = system.least_margin
+    everywhere = all(smallest_singular_value(equilibrated(matrices(x)[0])) < least for x in states)
     examined = [where, *states] if everywhere else [where]
     in_gradients = all(are_dependent(manifold.gradients(x) * system.scale) for x in examined)
     # Chains may depend on each other below their last derivatives alone.

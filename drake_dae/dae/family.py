@@ -39,8 +39,8 @@ class Deciding:
         return tuple(name for name, _, _ in self.pairs)
 
     def __str__(self) -> str:
-        there = " and ".join(f"{name} = {value:.3g}" for name, value, _ in self.pairs)
-        here = " and ".join(f"{name} = {default:.3g}" for name, _, default in self.pairs)
+        there = " and ".join(f"'{name}' = {value:.3g}" for name, value, _ in self.pairs)
+        here = " and ".join(f"'{name}' = {default:.3g}" for name, _, default in self.pairs)
         return f"at {there}, and not at the default {here}"
 
 

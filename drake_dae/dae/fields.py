@@ -22,8 +22,6 @@ from drake_dae.trace.expressions import find_flaw
 def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
     """Checks the fields of a system and returns those that change, converted."""
     name, state = given["name"], given["state"]
-    if not isinstance(name, str):
-        raise ModelError(f"the name of a system must be text, got {name!r}")
     if not (is_symbol(state) and state.numel()):
         raise ModelError(
             f"{name}: 'state' must be a CasADi SX column of symbols, "
@@ -48,12 +46,7 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
     for contact in given["contacts"]:
         if contact.friction not in (None, *known):
             raise ModelError(f"{name}: {unknown_name('parameter', contact.friction, known)}")
-    metric, free = given["control_metric"], given["free_control"]
-    optional = ("mass_matrix", "control_metric", "free_control")
-    functions = {key: given[key] for key in "fghklm"}
-    functions |= {key: given[key] for key in optional if given[key] is not None}
-    functions.setdefault("mass_matrix", ca.SX.eye(state.numel()))
-    expressions = _expressions(name, functions, state, parameter_symbol(parameters))
+    expressions = _expressions(name, given, state, parameter_symbol(parameters))
     fields = {"state": state, "parameters": parameters, **expressions}
     n, m = state.numel(), expressions["k"].numel()
     p, q = expressions["h"].shape[1], expressions["l"].numel()
@@ -69,25 +62,25 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         if len(signals) != count:
             raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
         _check_unique(name, key, [signal.name for signal in signals])
-    nominal, scale = given["nominal_state"], given["state_scale"]
-    nominal = np.zeros(n) if nominal is None else nominal
-    for key, value in (("nominal_state", nominal), ("state_scale", scale)):
+    for key in ("nominal_state", "state_scale"):
+        value = np.zeros(n) if key == "nominal_state" and given[key] is None else given[key]
         if value is not None:
             fields[key] = vector(f"{name}: {key}", value, n)
             fields[key].setflags(write=False)
-    if scale is not None and not np.all(fields["state_scale"] > 0.0):
-        raise ModelError(f"{name}: state_scale must be positive, got {brief(scale)}")
-    if free is not None and metric is None:
-        raise ModelError(
-            f"{name}: free_control needs a control_metric, which measures the distance from it"
-        )
-    if metric is not None and p <= q:
+    if np.any(fields.get("state_scale", 1.0) <= 0.0):
+        raise ModelError(f"{name}: state_scale must be positive, got {brief(given['state_scale'])}")
+    if "control_metric" not in expressions:
+        if "free_control" in expressions:
+            raise ModelError(
+                f"{name}: free_control needs a control_metric, which measures the distance from it"
+            )
+        return fields
+    if p <= q:
         raise ModelError(
             f"{name}: control_metric chooses among controls, but with {p} controls and {q} "
             "controlled outputs there is nothing to choose; leave it out"
         )
-    if metric is not None and free is None:
-        fields["free_control"] = ca.SX(p, 1)
+    fields.setdefault("free_control", ca.SX(p, 1))
     return fields
 
 
@@ -140,9 +133,12 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 
 
 def _expressions(
-    owner: str, functions: Mapping[str, Any], state: ca.SX, parameters: ca.SX
+    owner: str, given: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
     """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them."""
+    optional = ("mass_matrix", "control_metric", "free_control")
+    functions = {key: given[key] for key in "fghklm"} | {"mass_matrix": ca.SX.eye(state.numel())}
+    functions |= {key: given[key] for key in optional if given[key] is not None}
     values = {key: as_expression(owner, key, value) for key, value in functions.items()}
     n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
     q = values["l"].numel()

@@ -41,8 +41,7 @@ class FeedbackGains:
                 )
         matrix.setflags(write=False)
         object.__setattr__(self, "matrix", matrix)
-        slowest = np.max(self.poles.real, initial=-np.inf)
-        if slowest >= 0.0:
+        if np.any(self.poles.real >= 0.0):
             raise GainError(
                 "the error dynamics (30) are not Hurwitz: poles "
                 f"{show(self.poles)}; all real parts must be negative"
@@ -69,13 +68,11 @@ class FeedbackGains:
     @checked(GainError)
     def error_response(self, times: ArrayLike, initial: ArrayLike) -> FloatArray:
         """Returns the exact tracking error exp(E t) e(0) of (30), (31), shape (k, p)."""
-        moments = vector("times", np.atleast_1d(times), None, GainError)
+        moments, matrix = vector("times", np.atleast_1d(times), None, GainError), self.error_matrix
         coordinates = numbers("initial", initial, GainError)
-        matrix = self.error_matrix
-        if coordinates.shape != (matrix.shape[0],):
+        if coordinates.shape != (len(matrix),):
             raise GainError(
-                f"the error has sum mu_i = {matrix.shape[0]} coordinates, got shape "
-                f"{coordinates.shape}"
+                f"the error has {len(matrix)} coordinates, got shape {coordinates.shape}"
             )
         # From one time to the next: a log with fixed steps has few different step lengths once its
         # times are rounded to a power of 2, whose differences floating-point numbers compute
@@ -136,8 +133,7 @@ def gain_coefficients(
     """Designs the gains K_i1, ..., K_i mu_i of (32) from numbers, lowest derivative first."""
 
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
-        matrix = np.zeros((len(names), sum(degrees)))
-        starts = dict(zip(names, DerivativeLayout(tuple(degrees)).starts, strict=True))
+        matrix, owners = np.zeros((len(names), sum(degrees))), DerivativeLayout(degrees).owners
         chosen: list[tuple[str, int, float | Sequence[float]]]
         chosen = _per_output(values, names, degrees)
         for name, degree, row in chosen:
@@ -147,8 +143,8 @@ def gain_coefficients(
                     f"output '{name}' has degree {degree} and takes {degree} coefficients "
                     f"K_i1, ..., K_i{degree}, got {entries.size}"
                 )
-            start = int(starts[name])
-            matrix[list(names).index(name), start : start + degree] = entries
+            i = list(names).index(name)
+            matrix[i, owners == i] = entries
         return FeedbackGains(tuple(names), tuple(degrees), matrix)
 
     return design
@@ -163,26 +159,19 @@ def gain_matrices(*groups: Sequence[ArrayLike]) -> GainDesign:
 
     def design(names: Sequence[str], degrees: Sequence[int]) -> FeedbackGains:
         occurring = sorted({degree for degree in degrees if degree}, reverse=True)
-        if len(blocks) != len(occurring):
+        if [len(group) for group in blocks] != occurring:
             raise GainError(
-                f"the outputs have the degrees {occurring}. Give a group of gain matrices for "
-                f"each degree: {len(occurring)} are needed, got {len(blocks)}"
+                f"the outputs have the degrees {occurring}. Give a group of gain matrices for each "
+                f"degree, as many as it says; got {[len(group) for group in blocks]}"
             )
-        matrix = np.zeros((len(names), sum(degrees)))
-        starts = DerivativeLayout(tuple(degrees)).starts
+        matrix, starts = np.zeros((len(names), sum(degrees))), DerivativeLayout(degrees).starts
         for degree, group in zip(occurring, blocks, strict=True):
             members = [i for i, d in enumerate(degrees) if d == degree]
-            if len(group) != degree:
-                raise GainError(
-                    f"outputs of degree {degree} take {degree} matrices, got {len(group)}"
-                )
-            for order, block in enumerate(group):
-                block = np.atleast_2d(block)
+            for order, block in enumerate(map(np.atleast_2d, group)):
                 if block.shape != (len(members), len(members)):
                     raise GainError(
                         f"a gain matrix has shape {block.shape}, but "
-                        f"{', '.join(names[i] for i in members)} need "
-                        f"({len(members)}, {len(members)})"
+                        f"{', '.join(names[i] for i in members)} need {(len(members),) * 2}"
                     )
                 # (60), (72)-(73), (82)-(83)
                 matrix[np.ix_(np.array(members), starts[members] + order)] = block

@@ -1,13 +1,13 @@
 """What a law has besides (28): damped and late models, measured forces, integrals, deflection."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers, positive, unknown_name
+from drake_dae.arrays import numbers, positive, unknown_name
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import eliminate
 from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
@@ -15,25 +15,28 @@ from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import GainError, ModelError
-from drake_dae.trace.factorization import Factorization
 
 
-def damped(
-    structure: Structure, damping: GainDesign | FeedbackGains | None, latency: float = 0.0
+def law_structure(
+    structure: Structure,
+    damping: GainDesign | FeedbackGains | None,
+    latency: float = 0.0,
+    deflection: "Deflection | None" = None,
 ) -> Structure:
     """Returns the structure of a law's model that demands, instead of y_i^(r_i) = 0,
 
-        y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0,
+        y_i^(r_i) + c_(r_i - 1) y_i^(r_i - 1) + ... + c_1 y_i' = 0, or the symbol of a deflection,
 
     without a term in y_i itself, which would control the position of the surface instead of the
     force. On N* all y_i^(j) vanish, so that nothing changes there: alpha (13) becomes alpha - A^-1
-    (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay.
+    (sum_j c_j L_f^j k_i), beta (14), the degrees, A and B stay. With a latency the mass matrix
+    changes: see `acting_late`.
 
     Where a force is an output of degree mu >= 1, the law takes the added term as constant: along
     the model its derivatives would destabilize a compliant contact, which moves otherwise.
     """
     system = acting_late(structure.system, latency)
-    if damping is None and system is structure.system:
+    if damping is None and deflection is None and system is structure.system:
         return structure
     layout = DerivativeLayout(structure.constraint_degrees)
     residual = structure.manifold.residual_expression
@@ -41,6 +44,8 @@ def damped(
     if damping is not None:
         rates = residual[np.flatnonzero(layout.orders).tolist(), :]
         force = ca.mtimes(ca.sparsify(ca.DM(damping_gains(structure, damping).matrix)), rates)
+    if deflection is not None:
+        force = force - deflection.symbol
     derivatives = Derivatives(system, residual[layout.ends.tolist(), :], force)
     # The output chains of the same degrees along these derivatives.
     degrees = structure.output_degrees
@@ -71,7 +76,7 @@ def damped(
 
 
 def damping_gains(structure: Structure, damping: GainDesign | FeedbackGains) -> FeedbackGains:
-    """Returns the coefficients c of `damped`: r_i - 1 poles for each constraint."""
+    """Returns the coefficients c of `law_structure`: r_i - 1 poles for each constraint."""
     names = tuple(signal.name for signal in structure.system.constraint_output_signals)
     degrees = tuple(degree - 1 for degree in structure.constraint_degrees)
     return designed("constraint_damping", damping, names, degrees)
@@ -118,7 +123,6 @@ def acting_late(system: DaeSystem, latency: float) -> DaeSystem:
     )
 
 
-@dataclass(frozen=True, eq=False)
 class ForceMeasurement:
     """The measurement of v in the law (28), for the outputs z_i = v_j:
 
@@ -129,24 +133,15 @@ class ForceMeasurement:
     For outputs that are combinations, z_i = m_i(x) v, Gbar is a multiple of the identity.
     """
 
-    layout: DerivativeLayout
-    rows: dict[int, ca.SX]
-    inputs: dict[int, int]
-    gain: FloatArray
-    symbol: ca.SX
-
-    @classmethod
-    def of(cls, system: DaeSystem, layout: DerivativeLayout, gain: ArrayLike) -> "ForceMeasurement":
+    def __init__(self, system: DaeSystem, layout: DerivativeLayout, gain: ArrayLike) -> None:
         if system.sharing is not None:
             raise ModelError(
                 f"{system.name}: measured_force is not supported for redundant constraints that "
                 "share their forces; leave them out with `drop_constraints`, or use the law's "
                 "own force"
             )
-        rows, inputs = _force_outputs(system)
         size, matrix = system.num_constraints, numbers("force_gain", gain, GainError)
-        if matrix.ndim == 0:
-            matrix = matrix * np.eye(size)
+        matrix = matrix * np.eye(size) if matrix.ndim == 0 else matrix
         if matrix.shape != (size, size) or not np.all(np.isfinite(matrix)):
             raise GainError(f"force_gain must be a number or shape ({size}, {size}), got {gain!r}")
         smallest = float(np.min(np.linalg.eigvalsh((matrix + matrix.T) / 2.0), initial=0.0))
@@ -155,18 +150,19 @@ class ForceMeasurement:
                 "force_gain, Gbar of (59), must be positive semidefinite: a negative one feeds the "
                 f"force error back with the wrong sign. Smallest eigenvalue {smallest:.3g}"
             )
-        for i in rows:
-            name = system.output_signals[i].name
-            if i not in inputs and np.any(matrix != matrix[0, 0] * np.eye(size)):
+        self.layout, self.gain, self.symbol = layout, matrix, ca.SX.sym("v", size)
+        self.rows, self.inputs = _force_outputs(system)
+        for i in self.rows:
+            name, degree = system.output_signals[i].name, layout.degrees[i]
+            if i not in self.inputs and np.any(matrix != matrix[0, 0] * np.eye(size)):
                 raise GainError(
                     f"force_gain must be one number, since '{name}' is a combination of forces"
                 )
-            if layout.degrees[i] and matrix[inputs.get(i, 0)].any():
+            if degree and matrix[self.inputs.get(i, 0)].any():
                 raise GainError(
-                    f"force_gain is for outputs of degree 0; '{name}' has degree "
-                    f"{layout.degrees[i]} and takes the measured force itself. Leave it 0"
+                    f"force_gain is for outputs of degree 0; '{name}' has degree {degree} and "
+                    "takes the measured force itself. Leave it 0"
                 )
-        return cls(layout, rows, inputs, matrix, ca.SX.sym("v", size))
 
     def value(self, output: int) -> ca.SX:
         """Returns the measured value of an output, m_i v."""
@@ -196,22 +192,21 @@ class ForceMeasurement:
 
 def _force_outputs(system: DaeSystem) -> tuple[dict[int, ca.SX], dict[int, int]]:
     """The outputs z_i = m_i v, as i -> m_i; and those that are one input, z_i = v_j, as i -> j."""
-    rows = {
-        i: ca.sparsify(system.m[i, :])
-        for i in range(system.num_outputs)
-        if system.l[i].is_zero() and not system.m[i, :].is_zero()
-    }
+    rows, single = dict[int, ca.SX](), dict[int, int]()
+    for i in range(system.num_outputs):
+        row = ca.sparsify(system.m[i, :])
+        if system.l[i].is_zero() and row.nnz():
+            rows[i], columns = row, row.sparsity().get_triplet()[1]
+            if len(columns) == 1 and row[columns[0]].is_one():
+                single[i] = columns[0]
     if not rows:
         raise ModelError(
             f"{system.name}: measured_force needs an output that is a constraint input or a "
             "combination of some"
         )
-    columns = {i: row.sparsity().get_triplet()[1] for i, row in rows.items()}
-    single = {i: j[0] for i, j in columns.items() if len(j) == 1 and rows[i][j[0]].is_one()}
     return rows, single
 
 
-@dataclass(frozen=True, eq=False)
 class IntegralAction:
     """The integrals sigma_i' = z_i - r_i of some outputs, which extend (30) to
 
@@ -222,20 +217,14 @@ class IntegralAction:
     to zero.
     """
 
-    outputs: tuple[int, ...]
-    degrees: tuple[int, ...]
-    signals: tuple[Signal, ...]
-    symbol: ca.SX
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         system: DaeSystem,
         degrees: Sequence[int],
         names: Sequence[str],
         measured: ForceMeasurement | None,
-    ) -> "IntegralAction":
-        known, integrated = [signal.name for signal in system.output_signals], list[int]()
+    ) -> None:
+        known, integrated = [signal.name for signal in system.output_signals], set[int]()
         for name in names:
             if name not in known:
                 raise GainError(f"integral: {unknown_name('output', name, known)}")
@@ -248,11 +237,13 @@ class IntegralAction:
                     "no error to integrate; make the law with measured_force=True, and integrate "
                     "a constraint input or a combination of some"
                 )
-            integrated.append(i)
-        chosen = tuple(sorted(integrated))
-        of = [system.output_signals[i] for i in chosen]
-        signals = tuple(Signal(f"integral of {s.name}", f"{s.unit or '1'} s") for s in of)
-        return cls(chosen, tuple(degrees), signals, ca.SX.sym("integral", len(chosen)))
+            integrated.add(i)
+        self.outputs, self.degrees, self._measured = sorted(integrated), degrees, measured
+        self._starts = DerivativeLayout(degrees).starts.tolist()
+        signals = [system.output_signals[i] for i in self.outputs]
+        named = [Signal(f"integral of {s.name}", f"{s.unit or '1'} s") for s in signals]
+        self.signals = tuple(named)
+        self.symbol = ca.SX.sym("integral", len(self.outputs))
 
     @property
     def all_degrees(self) -> tuple[int, ...]:
@@ -261,51 +252,45 @@ class IntegralAction:
 
     def coordinates(self, errors: ca.SX) -> ca.SX:
         """Returns the error coordinates, with the integrals among them."""
-        starts, rows = DerivativeLayout(self.degrees).starts.tolist(), []
-        for i, degree in enumerate(self.degrees):
+        rows = [ca.SX(0, 1)]
+        for i, (start, degree) in enumerate(zip(self._starts, self.degrees, strict=True)):
             if i in self.outputs:
                 rows.append(self.symbol[self.outputs.index(i)])
-            rows.append(errors[starts[i] : starts[i] + degree, :])
-        return ca.vertcat(ca.SX(0, 1), *rows)
+            rows.append(errors[start : start + degree, :])
+        return ca.vertcat(*rows)
 
-    def rate(self, chain: ca.SX, values: ca.SX, measured: ForceMeasurement | None) -> ca.SX:
+    def rate(self, chain: ca.SX, values: ca.SX) -> ca.SX:
         """Returns sigma' = z - r of these outputs, shape (k, 1)."""
-        starts, rows = DerivativeLayout(self.degrees).starts.tolist(), [ca.SX(0, 1)]
+        rows = [ca.SX(0, 1)]
         for i in self.outputs:
             if self.degrees[i]:
-                rows.append(chain[starts[i]] - values[i])
-            elif measured is not None:
-                rows.append(measured.value(i) - values[i])
+                rows.append(chain[self._starts[i]] - values[i])
+            elif self._measured is not None:
+                rows.append(self._measured.value(i) - values[i])
         return ca.vertcat(*rows)
 
 
-@dataclass(frozen=True, eq=False)
 class Deflection:
     """The motion of compliant contacts, lambda = -k phi, that a wanted force lambda_d needs.
 
     A law that keeps phi'' + c phi' = 0 lets a step of lambda_d make the contact oscillate with
-    sqrt(A k). With phi_d = -lambda_d / k and
+    sqrt(A k). With phi_d = -lambda_d / k its model demands instead
 
-        phi'' - phi_d'' + c (phi' - phi_d') = 0,    so    u for lambda_d + A^-1 (c lambda_d' +
-                                                          lambda_d'') / k,
+        phi'' + c phi' = phi_d'' + c phi_d' = -(lambda_d'' + c lambda_d') / k,
 
-    the error e = phi - phi_d obeys e'' + c e' + A k e = 0 for any reference that is twice
-    differentiable. A stiffness that is wrong by a factor s leaves |1 - s| of the oscillation.
+    so that e = phi - phi_d obeys e'' + c e' + A k e = 0 for any reference that is twice
+    differentiable, and friction is that of lambda_d. A stiffness that is wrong by a factor s leaves
+    |1 - s| of the oscillation. `symbol` stands for the right side, and is zero on N*.
     """
 
-    stiffness: float
-    damping: ca.DM
-    inputs: dict[int, int]
-    matrix: ca.SX
-
-    @classmethod
-    def of(
-        cls, structure: Structure, stiffness: float, damping: GainDesign | FeedbackGains | None
-    ) -> "Deflection":
+    def __init__(
+        self, structure: Structure, stiffness: float, damping: GainDesign | FeedbackGains | None
+    ) -> None:
         system, size = structure.system, structure.system.num_constraints
-        inputs = _force_outputs(system)[1]
-        degrees = [structure.output_degrees[i] for i in inputs]
-        if sorted(inputs.values()) != list(range(size)) or any(degrees) or not size:
+        self.stiffness = positive("contact_stiffness", stiffness)
+        self.inputs = _force_outputs(system)[1]
+        degrees = [structure.output_degrees[i] for i in self.inputs]
+        if sorted(self.inputs.values()) != list(range(size)) or any(degrees) or not size:
             raise ModelError(
                 f"{system.name}: a contact_stiffness is for robots with rigid joints whose "
                 "constraint forces are all outputs; leave it out"
@@ -315,21 +300,14 @@ class Deflection:
                 f"{system.name}: a contact_stiffness is for contacts, and a constraint is on "
                 "velocities; leave it out"
             )
-        c = np.zeros((size, size))
-        if damping is not None:
-            c = damping_gains(structure, damping).matrix
-        matrix = structure.elimination.constraint_matrix
-        return cls(positive("contact_stiffness", stiffness), ca.DM(c), inputs, matrix)
+        c = np.zeros((size, size)) if damping is None else damping_gains(structure, damping).matrix
+        self._damping, self.symbol = ca.DM(c), ca.SX.sym("deflection", size)
 
-    def force(self, reference: ca.SX, layout: DerivativeLayout) -> ca.SX:
-        """A^-1 (c lambda_d' + lambda_d'') / k of each output, shape (p, 1)."""
-        rates = [ca.SX.zeros(len(self.inputs)) for _ in range(2)]
-        for i, j in self.inputs.items():
-            for order, rate in enumerate(rates, 1):
-                rate[j] = reference[int(layout.lowest[i]) + order]
-        push = ca.mtimes(self.damping, rates[0]) + rates[1]
-        forces = Factorization(self.matrix).solve(push) / self.stiffness
-        result = ca.SX.zeros(len(layout.degrees))
-        for i, j in self.inputs.items():
-            result[i] = forces[j]
-        return result
+    def wanted(self, reference: ca.SX, layout: DerivativeLayout) -> ca.SX:
+        """-(lambda_d'' + c lambda_d') / k of each constraint, shape (m, 1)."""
+        outputs, columns = list(self.inputs), list(self.inputs.values())
+        first, second = (ca.SX.zeros(len(columns)) for _ in range(2))
+        places = layout.lowest[outputs]
+        first[columns] = reference[(places + 1).tolist()]
+        second[columns] = reference[(places + 2).tolist()]
+        return -(second + ca.mtimes(self._damping, first)) / self.stiffness

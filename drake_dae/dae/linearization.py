@@ -90,11 +90,11 @@ def linearize(
         InconsistentStateError: The state is not on N*.
         ModelError: A shape is wrong, a number is not finite, or A(x) is singular at the state.
     """
-    structure = constraint_structure_of("linearize", system, structure)
-    p = system.num_controls
+    structure, p = constraint_structure_of("linearize", system, structure), system.num_controls
     u = np.zeros(p) if control is None else vector(f"{system.name}: control", control, p)
-    plant = _PlantModel(structure, state, system.parameter_vector(parameters))
-    return plant.linearization(u, np.zeros((p, system.num_states)), np.eye(p))
+    values = system.parameter_vector(parameters)
+    x, feedback = _consistent(structure, state, values), np.zeros((p, system.num_states))
+    return _linearized(structure, x, values, u, feedback, np.eye(p))
 
 
 @checked(ModelError)
@@ -113,91 +113,87 @@ def linearize_loop(
             "not include; take the law without it, or convert the loop's diagram to AutoDiffXd and "
             "use Drake's Linearize"
         )
-    system = law.system
+    system, structure, n = law.system, law.structure, law.system.num_states
     R = vector(f"{system.name}: reference", reference, law.layout.reference_size)
-    plant = _PlantModel(law.structure, state, system.parameter_vector(parameters))
+    values = system.parameter_vector(parameters)
+    x = _consistent(structure, state, values)
     force = [np.zeros(system.num_constraints)] if law.measured_force else []
-    at = (plant.state, R, *force, law.all_parameters())
-    control = law.function(*at)[0].copy()
+    at = (x, R, *force, law.all_parameters())
+    control = law.function(*at)[0]
     slope = law.function.derivative(law.function.output_names.index("control"), range(2))
     gains = slope(*at)[0].reshape(control.size, -1)
-    n = system.num_states
-    return plant.linearization(control, gains[:, :n], gains[:, n:])
+    return _linearized(structure, x, values, control, gains[:, :n], gains[:, n:])
 
 
-class _PlantModel:
-    """The motion of a plant at a state: (x', v) and their derivatives by x and u."""
-
-    def __init__(
-        self, structure: ConstraintStructure, state: ArrayLike | None, parameters: FloatArray
-    ) -> None:
-        self.structure, self.system, self.parameters = structure, structure.system, parameters
-        system, manifold = self.system, structure.manifold
-        self.state = system.state_vector(structure.states[0] if state is None else state)
-        if not manifold.is_consistent(self.state, parameters):
-            raise InconsistentStateError(
-                f"{system.name}: x = {show(self.state)} is not on N*, where the motion is; "
-                "linearize at `find_structure(system).manifold.project(x)`",
-                manifold.residual(self.state, parameters),
-            )
-        motion = structure.derivatives
-        moved = ca.cse(motion.expand(ca.vertcat(motion.rate, motion.constraint_input)))
-        outputs = {"moved": moved, "by_state": ca.jacobian(moved, system.state)}
-        outputs["by_control"] = ca.jacobian(moved, motion.control)
-        inputs, pivot = {"control": motion.control}, structure.elimination.pivot
-        self._motion = system.trace("linearized motion", outputs, inputs, pivot, often=False)
-
-    def motion(self, control: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(x', v), and the derivatives by x and by u, shapes (n + m, n) and (n + m, p)."""
-        moved, *slopes = self._motion(self.state, control, self.parameters)
-        if not self._motion.is_valid:
-            raise ModelError(
-                f"{self.system.name}: A(x) of Assumption (2) is singular at x = "
-                f"{show(self.state)}, so the motion is not determined there; linearize at another "
-                "state"
-            )
-        by_state, by_control = (slope.reshape(moved.size, -1) for slope in slopes)
-        return moved, by_state, by_control
-
-    def linearization(
-        self, control: FloatArray, feedback: FloatArray, forward: FloatArray
-    ) -> Linearization:
-        """The linear models with du = feedback dx + forward dw."""
-        system, structure, x = self.system, self.structure, self.system.state
-        n, m, p = system.num_states, system.num_constraints, system.num_controls
-        moved, by_state, by_control = self.motion(control)
-        rate, force = moved[:n], moved[n:]
-        v, u, r = ca.SX.sym("v", m), ca.SX.sym("u", p), ca.SX.sym("r", n)
-        balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
-        rows = ca.vertcat(balance - ca.mtimes(system.mass_matrix, r), system.k, system.outputs(v))
-        slopes = ca.jacobian(rows, ca.vertcat(x, v, u))
-        outputs = {"mass": ca.densify(system.mass_matrix), "slopes": ca.densify(slopes)}
-        function = system.trace("linearization", outputs, {"r": r, "v": v, "u": u}, often=False)
-        mass, whole = function(self.state, rate, force, control, self.parameters)
-        whole = whole.reshape(slopes.shape)
-        A, B, C = whole[: n + m, : n + m].copy(), whole[: n + m, n + m :], whole[n + m :, : n + m]
-        # In descriptor form, in (x, v).
-        E = np.zeros((n + m, n + m))
-        E[:n, :n] = mass.reshape(n, n)
-        A[:, :n] += B @ feedback
-        unknowns = (*system.state_signals, *system.constraint_input_signals)
-        none = np.zeros((system.num_outputs, forward.shape[1]))
-        descriptor = LinearModel(E, A, B @ forward, C, none, unknowns, system.output_signals)
-        # On N*: (dx', dv) = by_state dx + by_control du.
-        by_state, by_input = by_state + by_control @ feedback, by_control @ forward
-        gradients = structure.manifold.gradients(self.state, self.parameters)
-        free, basis = coordinates(gradients, structure.scale)
-        minimal = LinearModel(
-            np.eye(free.size),
-            (by_state[:n] @ basis)[free],
-            by_input[free],
-            (C[:, :n] + C[:, n:] @ by_state[n:]) @ basis,
-            C[:, n:] @ by_input[n:],
-            tuple(system.state_signals[i] for i in free),
-            system.output_signals,
+def _linearized(
+    structure: ConstraintStructure,
+    state: FloatArray,
+    parameters: FloatArray,
+    control: FloatArray,
+    feedback: FloatArray,
+    forward: FloatArray,
+) -> Linearization:
+    """The linear models at a state with du = feedback dx + forward dw."""
+    system, motion, x = structure.system, structure.derivatives, structure.system.state
+    n, m, p = system.num_states, system.num_constraints, system.num_controls
+    # On N*: (x', v), and their derivatives by x and by u.
+    moved = ca.cse(motion.expand(ca.vertcat(motion.rate, motion.constraint_input)))
+    outputs = {"moved": moved, "by_state": ca.jacobian(moved, x)}
+    outputs["by_control"] = ca.jacobian(moved, motion.control)
+    inputs, pivot = {"control": motion.control}, structure.elimination.pivot
+    function = system.trace("linearized motion", outputs, inputs, pivot, often=False)
+    values = [value.reshape(n + m, -1) for value in function(state, control, parameters)]
+    if not function.is_valid:
+        raise ModelError(
+            f"{system.name}: A(x) of Assumption (2) is singular at x = {show(state)}, so the "
+            "motion is not determined there; linearize at another state"
         )
-        at = (self.state, rate, control, force)
-        return Linearization(descriptor, minimal, structure.index, free, basis, *at)
+    (rate, force), by_state, by_control = np.split(values[0][:, 0], [n]), *values[1:]
+    # In descriptor form, in (x, v).
+    v, u, r = ca.SX.sym("v", m), ca.SX.sym("u", p), ca.SX.sym("r", n)
+    balance = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
+    rows = ca.vertcat(balance - ca.mtimes(system.mass_matrix, r), system.k, system.outputs(v))
+    slopes = ca.jacobian(rows, ca.vertcat(x, v, u))
+    outputs = {"mass": ca.densify(system.mass_matrix), "slopes": ca.densify(slopes)}
+    function = system.trace("linearization", outputs, {"r": r, "v": v, "u": u}, often=False)
+    mass, whole = function(state, rate, force, control, parameters)
+    whole = whole.reshape(slopes.shape)
+    A, B, C = whole[: n + m, : n + m].copy(), whole[: n + m, n + m :], whole[n + m :, : n + m]
+    A[:, :n] += B @ feedback
+    E = scipy.linalg.block_diag(mass.reshape(n, n), np.zeros((m, m)))
+    unknowns = (*system.state_signals, *system.constraint_input_signals)
+    none = np.zeros((system.num_outputs, forward.shape[1]))
+    descriptor = LinearModel(E, A, B @ forward, C, none, unknowns, system.output_signals)
+    # In minimal form: (dx', dv) = by_state dx + by_input dw.
+    by_state, by_input = by_state + by_control @ feedback, by_control @ forward
+    gradients = structure.manifold.gradients(state, parameters)
+    free, basis = coordinates(gradients, structure.scale)
+    minimal = LinearModel(
+        np.eye(free.size),
+        (by_state[:n] @ basis)[free],
+        by_input[free],
+        (C[:, :n] + C[:, n:] @ by_state[n:]) @ basis,
+        C[:, n:] @ by_input[n:],
+        tuple(system.state_signals[i] for i in free),
+        system.output_signals,
+    )
+    at = (state, rate, control, force)
+    return Linearization(descriptor, minimal, structure.index, free, basis, *at)
+
+
+def _consistent(
+    structure: ConstraintStructure, state: ArrayLike | None, parameters: FloatArray
+) -> FloatArray:
+    """A state on N*, the nominal consistent one if None."""
+    system, manifold = structure.system, structure.manifold
+    x = system.state_vector(structure.states[0] if state is None else state)
+    if manifold.is_consistent(x, parameters):
+        return x
+    raise InconsistentStateError(
+        f"{system.name}: x = {show(x)} is not on N*, where the motion is; linearize at "
+        "`find_structure(system).manifold.project(x)`",
+        manifold.residual(x, parameters),
+    )
 
 
 @checked(ModelError)
@@ -232,7 +228,15 @@ def sampled_poles(
     )
     A = plant.minimal.A
     G = loop.minimal.A - A
-    _check_rest(law, loop, A + G)
+    moves = np.abs(loop.rate) / law.system.scale
+    worst = int(np.argmax(moves))
+    if moves[worst] > RESTS * np.max(np.abs(np.linalg.eigvals(A + G)), initial=0.0):
+        signal = law.system.state_signals[worst]
+        raise ModelError(
+            f"{law.system.name}: poles are computed at an equilibrium under the law, but at this "
+            f"state {signal.name} changes by {loop.rate[worst]:.3g} {signal.unit} per second. Give "
+            "a constant reference, and its steady state"
+        )
     size, late = len(A), floor(delay / period + SAME)
     if (late + 2) * size > MOST_STATES:
         raise ModelError(
@@ -240,33 +244,13 @@ def sampled_poles(
             f"{late + 2} x {size} states; at most {MOST_STATES} are allowed. Use a longer period"
         )
     rest = max(delay - late * period, 0.0)
-    begin, end = (_held(A, G, length) for length in (rest, period - rest))
+    both = np.block([[A, G], [np.zeros((size, 2 * size))]])
+    # exp(A t) and Gamma(t) G.
+    begin, end = (scipy.linalg.expm(both * t)[:size] for t in (rest, period - rest))
     matrix = np.eye((late + 2) * size, k=-size)
     matrix[:size] = 0.0
-    matrix[:size, :size] = end[0] @ begin[0]
-    matrix[:size, late * size : (late + 1) * size] += end[1]
-    matrix[:size, (late + 1) * size :] += end[0] @ begin[1]
+    matrix[:size, :size] = end[:, :size] @ begin[:, :size]
+    matrix[:size, late * size : (late + 1) * size] += end[:, size:]
+    matrix[:size, (late + 1) * size :] += end[:, :size] @ begin[:, size:]
     eigenvalues = np.linalg.eigvals(matrix).astype(complex)
     return eigenvalues[np.argsort(-np.abs(eigenvalues), kind="stable")]
-
-
-def _held(A: FloatArray, G: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
-    """Returns exp(A t) and Gamma(t) G."""
-    size = len(A)
-    both = np.block([[A, G], [np.zeros((size, 2 * size))]])
-    transition = scipy.linalg.expm(both * length)
-    return transition[:size, :size], transition[:size, size:]
-
-
-def _check_rest(law: TrackingLaw, loop: Linearization, matrix: FloatArray) -> None:
-    """Checks that a state is an equilibrium."""
-    moves = np.abs(loop.rate) / law.system.scale
-    fastest = np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0)
-    worst = int(np.argmax(moves))
-    if moves[worst] > RESTS * fastest:
-        signal = law.system.state_signals[worst]
-        raise ModelError(
-            f"{law.system.name}: poles are computed at an equilibrium under the law, but at this "
-            f"state {signal.name} changes by {loop.rate[worst]:.3g} {signal.unit} per second. Give "
-            "a constant reference, and its steady state"
-        )

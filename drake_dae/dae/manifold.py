@@ -9,21 +9,14 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from drake_dae.arrays import FloatArray, numbers, unknown_name
+from drake_dae.arrays import FloatArray, numbers
 from drake_dae.dae.settling import CONSISTENT, Settling
 from drake_dae.dae.signals import DerivativeLayout, Indices
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import TracedFunction, count_operations
-from drake_dae.trace.newton import (
-    PRECISION,
-    ROUNDING,
-    NewtonModel,
-    newton,
-    norm,
-    shortest_steps,
-)
+from drake_dae.trace.newton import PRECISION, ROUNDING, NewtonModel, newton, norm, shortest_steps
 from drake_dae.trace.round_off import are_dependent, positive, unit_rows
 
 POLE = 1e-3  # A larger residual, over its usual change by the scale of the states, is no round-off.
@@ -149,14 +142,8 @@ class Manifold:
         p = self.system.parameter_vector(parameters)
         found = self.projected(self._state(state), p)
         if self._is_at_pole(found, p):
-            left = self.residual(found, p)
-            worst = int(np.argmax(np.abs(left)))
-            raise InconsistentStateError(
-                f"{self.system.name}: {self.residual_signals[worst].name} = {left[worst]:.3g} is "
-                "left at a pole of the constraint, as where a rotation is half a turn off: start "
-                "nearer to the constraint",
-                left,
-            )
+            why = "a pole of the constraint, as where a rotation is half a turn off"
+            raise self._failed(found, p, f"{why}: start nearer to the constraint")
         return found
 
     @np.errstate(all="ignore")  # Iterates outside the domain are tried and rejected.
@@ -194,8 +181,13 @@ class Manifold:
         found: FloatArray = scale * z
         # Otherwise the residual is round-off in coarse units, or no state changes it.
         if not converged and not self._relative_size(found, p) <= CONSISTENT:
-            residual = self.residual(found, p)
-            raise InconsistentStateError(self._why(found, p, residual), residual)
+            why = "the end of Newton's method: start nearer to the constraint"
+            if are_dependent(self.gradients(found, p) * self.scale):
+                why = (
+                    "a state at which the gradients of the constraints depend on each other: the "
+                    "constraints contradict each other, or start away from this state"
+                )
+            raise self._failed(found, p, why)
         return found
 
     def _downhill(self, state: FloatArray, p: FloatArray) -> NewtonModel | None:
@@ -225,41 +217,29 @@ class Manifold:
         )
         return not left <= POLE or bool(near > 1.0 and near > far)
 
-    def _why(self, state: FloatArray, parameters: FloatArray, residual: FloatArray) -> str:
-        """Returns in words why a Newton iteration that ended at a state failed."""
-        name = self.system.name
+    def _failed(self, state: FloatArray, p: FloatArray, why: str) -> InconsistentStateError:
+        """The exception for a search that ends at a state which is not consistent."""
+        residual = self.residual(state, p)
         values = zip(self.residual_signals, residual, strict=True)
         bad = [signal.name for signal, value in values if not np.isfinite(value)]
-        if bad:
-            return (
-                f"{name}: {', '.join(bad)} is not finite at the given state; start inside the "
-                "domain of the constraints"
-            )
         worst = int(np.argmax(np.abs(residual)))
         text = (
-            f"{name}: no consistent state found near the given one; "
-            f"{self.residual_signals[worst].name} = {residual[worst]:.3g} is left where "
-            "Newton's method ends. "
+            f"no consistent state found near the given one; {self.residual_signals[worst].name} = "
+            f"{residual[worst]:.3g} is left at {why}"
         )
-        if are_dependent(self.gradients(state, parameters) * self.scale):
-            return text + (
-                "The gradients of the constraints depend on each other there: the constraints "
-                "contradict each other, or start away from this state"
+        if bad:
+            text = (
+                f"{', '.join(bad)} is not finite at the given state; start inside the domain of "
+                "the constraints"
             )
-        return text + "Start nearer to the constraint, away from its singular states"
+        return InconsistentStateError(f"{self.system.name}: {text}", residual)
 
     def settle(
-        self,
-        state: ArrayLike,
-        parameters: ArrayLike | None = None,
-        fixed: Sequence[str] = (),
+        self, state: ArrayLike, parameters: ArrayLike | None = None, fixed: Sequence[str] = ()
     ) -> FloatArray:
         """Returns the consistent state next to a user's start, computed level by level."""
         start, p = self._state(state), self.system.parameter_vector(parameters)
-        names = [signal.name for signal in self.system.state_signals]
-        for name in fixed:
-            if name not in names:
-                raise ModelError(unknown_name("state", name, names))
+        chosen = np.array(self.system.states_named(fixed), dtype=np.intp)
         residual = self.residual(start, p)
         if not residual.any():
             return start
@@ -267,7 +247,6 @@ class Manifold:
         is_there = step is not None and 0.0 < norm(step) <= FLOOR
         if is_there and not self._is_at_pole(start, p):
             return self.project(start, p)  # It was there up to round-off, which no level moves.
-        chosen = np.array([names.index(name) for name in fixed], dtype=np.intp)
         error = InconsistentStateError(
             f"{self.system.name}: no consistent state is found near the given one in which "
             f"{', '.join(fixed)} keep their values; fix fewer states, or give others",
@@ -300,11 +279,10 @@ class Manifold:
 
     def _state(self, state: ArrayLike) -> FloatArray:
         """A state as a new array; its numbers need not be finite."""
-        x = numbers(f"{self.system.name}: a state", state).reshape(-1)
-        if x.size != self.system.num_states:
-            raise ModelError(
-                f"{self.system.name}: a state has shape ({self.system.num_states},), got {x.shape}"
-            )
+        name, size = self.system.name, self.system.num_states
+        x = numbers(f"{name}: a state", state).reshape(-1)
+        if x.size != size:
+            raise ModelError(f"{name}: a state has shape ({size},), got {x.shape}")
         return x
 
 

@@ -18,8 +18,6 @@ from drake_dae.trace.round_off import unit_rows
 
 # Single states complete the chains if the sine of their smallest angle is above this.
 TRANSVERSAL = 0.05
-# xi, its signals, and the margin of the Jacobian of Phi.
-Completion = tuple[ca.SX, tuple[Signal, ...], RankMargin]
 
 
 @checked(ModelError)
@@ -46,9 +44,7 @@ class NormalForm:
         structure: The structure of the system; found if None.
 
     Attributes:
-        structure: The structure of the system.
-        completion: xi, shape (d, 1).
-        completion_signals: Names and units of xi.
+        completion, completion_signals: xi, shape (d, 1), and its names and units.
         coordinate_signals: Names and units of (y, zeta, xi), n in all.
         margin: The margin of the Jacobian of Phi over `structure.states`.
 
@@ -65,22 +61,19 @@ class NormalForm:
         structure: Structure | None = None,
     ) -> None:
         structure = structure_of("NormalForm", system, structure, find_structure)
-        self.structure = structure
-        self.system = system
-        residual = structure.manifold.residual_expression
+        self.structure, self.system = structure, system
         if structure.control_margin.is_singular:
             raise ModelError(
                 f"{system.name}: B(x) of (16) is singular at x = "
                 f"{show(structure.control_margin.state)}, so the output chains are not independent "
                 "there and are no coordinates; choose other outputs"
             )
-        chains = ca.vertcat(residual, structure.chain)  # (21)
+        chains = ca.vertcat(structure.manifold.residual_expression, structure.chain)  # (21)
         samples = Samples(structure.manifold, structure.states)
         if completion is None:
-            chosen = _chosen_completion(structure, chains, samples)
-        else:
-            chosen = _checked_completion(structure, chains, samples, completion)
-        self.completion, self.completion_signals, self.margin = chosen  # (22)
+            completion = _chosen_completion(structure, chains, samples)
+        checked_one = _checked_completion(structure, chains, samples, completion)
+        self.completion, self.completion_signals, self.margin = checked_one  # (22)
         self.coordinate_signals = (
             *structure.manifold.residual_signals,
             *structure.layout.chain_signals(system.output_signals),
@@ -98,13 +91,11 @@ class NormalForm:
 
     def coordinates(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns Phi(x) = (y, zeta, xi) of (20)-(22), for x on N* or not."""
-        x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
-        return self._at(x, p)[0]
+        return self._at(self.system.state_vector(state), parameters)[0]
 
     def jacobian(self, state: ArrayLike, parameters: ArrayLike | None = None) -> FloatArray:
         """Returns dPhi/dx, shape (n, n); it is singular where Phi is no change of coordinates."""
-        x, p = self.system.state_vector(state), self.system.parameter_vector(parameters)
-        return self._at(x, p)[1]
+        return self._at(self.system.state_vector(state), parameters)[1]
 
     def rates(
         self, state: ArrayLike, control: ArrayLike, parameters: ArrayLike | None = None
@@ -120,9 +111,7 @@ class NormalForm:
         structure, dae, layout = self.structure, self.system, self.structure.layout
         u = structure.derivatives.control
         highest = structure.drift + ca.mtimes(structure.control_matrix, u)  # (26)
-        chain = ca.SX(structure.chain)
-        if layout.chain_size:
-            chain = ca.vertcat(chain[1:, 0], 0)
+        chain = ca.vertcat(structure.chain, 0)[1:, :]
         chain[layout.ends.tolist()] = highest[layout.dynamic.tolist(), :]
         moving = structure.derivatives.expand(structure.derivatives.rate)
         rate = ca.jtimes(self.completion, dae.state, moving) + dae.exogenous.rate(self.completion)
@@ -207,16 +196,16 @@ class NormalForm:
         solution, converged = newton(state / scale, linearize)
         return scale * solution if converged else None
 
-    def _at(self, state: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _at(self, state: FloatArray, parameters: ArrayLike | None) -> tuple[FloatArray, FloatArray]:
         """Phi and its Jacobian at a state."""
-        values, jacobian = self._map(state, parameters)
+        values, jacobian = self._map(state, self.system.parameter_vector(parameters))
         return values, jacobian.reshape(values.size, -1)
 
 
 def _checked_completion(
     structure: Structure, chains: ca.SX, samples: Samples, xi: ca.SX
-) -> Completion:
-    """The user's completion, with its signals and its margin."""
+) -> tuple[ca.SX, tuple[Signal, ...], RankMargin]:
+    """A completion, with its signals and the margin of the Jacobian."""
     system, count = structure.system, structure.zero_dynamics_dimension
     if not isinstance(xi, ca.SX) or xi.shape != (count, 1):
         got = f"shape {xi.shape}" if isinstance(xi, ca.SX) else type(xi).__name__
@@ -226,12 +215,9 @@ def _checked_completion(
         )
     allowed = ca.vertcat(system.state, system.parameter_symbol)
     unknown = [s.name() for s in ca.symvar(xi) if not ca.depends_on(allowed, s)]
+    flaw = find_flaw(xi, system.state, system.parameter_symbol, "the state") if not unknown else ""
     if unknown:
-        raise ModelError(
-            f"{system.name}: the completion xi of the coordinates depends on "
-            f"{', '.join(unknown)}, which is neither a state nor a parameter"
-        )
-    flaw = find_flaw(xi, system.state, system.parameter_symbol, "the state")
+        flaw = f"depends on {', '.join(unknown)}, which is neither a state nor a parameter"
     if flaw:
         raise ModelError(f"{system.name}: the completion {flaw}")
     states = dict(zip(system.state_signals, ca.vertsplit(system.state), strict=True))
@@ -243,24 +229,23 @@ def _checked_completion(
     margin = find_margin(samples, gradient)
     if not margin.is_singular:
         return xi, signals, margin
-    if not count:
-        raise ModelError(
-            f"{system.name}: the differentials of the chains are dependent to round-off at x = "
-            f"{show(margin.state)}: A(x) of Assumption (2) or B(x) of (16) is close to singular "
-            "there"
-        )
-    # By the distance of each differential from the span of those before it.
-    distances = np.abs(np.diag(np.linalg.qr((margin.matrix * samples.scale).T)[1]))
-    worst = int(np.argmin(distances[-count:]))
-    raise ModelError(
-        f"{system.name}: the completion '{signals[worst].name}' = "
-        f"{str(xi[worst])[:60]} is not independent of the chains and of the rest of the "
-        f"completion at x = {show(margin.state)}; choose a function whose differential is not in "
-        "their span at this state and around it"
+    text = (
+        "the differentials of the chains are dependent to round-off: A(x) of Assumption (2) or "
+        "B(x) of (16) is close to singular"
     )
+    if count:
+        # By the distance of each differential from the span of those before it.
+        distances = np.abs(np.diag(np.linalg.qr((margin.matrix * samples.scale).T)[1]))
+        worst = int(np.argmin(distances[-count:]))
+        text = (
+            f"the completion '{signals[worst].name}' = {str(xi[worst])[:60]} is not independent of "
+            "the chains and of the rest of the completion; choose a function whose differential is "
+            "not in their span"
+        )
+    raise ModelError(f"{system.name}: at x = {show(margin.state)} {text}")
 
 
-def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) -> Completion:
+def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) -> ca.SX:
     """States whose differentials complete those of the chains well at all samples.
 
     They are regular on the null spaces of the chains' differentials: one QR with pivoting for all.
@@ -285,4 +270,4 @@ def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) ->
             f"{system.name}: no states complete the chains (20) at all states around the nominal "
             f"one; give a completion of {count} expressions"
         )
-    return _checked_completion(structure, chains, samples, system.state[sorted(chosen), :])
+    return system.state[sorted(chosen), :]

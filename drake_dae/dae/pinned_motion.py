@@ -12,18 +12,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 import scipy  # SciPy loads its large parts when they are used.
 
 from drake_dae.arrays import FloatArray, numbers, show
+from drake_dae.dae.samples import as_matrix
 from drake_dae.dae.settling import CONSISTENT
 from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.expressions import result_of
 from drake_dae.trace.functions import SINGULAR_PIVOT, TracedFunction
 from drake_dae.trace.newton import NewtonModel, newton, shortest_steps
+from drake_dae.trace.round_off import positive
 
 # A or B counts as singular below this fraction of its usual margin, also if it is a single number.
 VANISHED = 1e-9
@@ -39,33 +42,17 @@ LOST = 1e-2
 TimeFunction = Callable[[float], FloatArray]
 
 
-@dataclass(frozen=True, eq=False)
-class PinnedPoint:
-    """A state on Z(R) with x', u, v, A of Assumption (2) and B of (5), which may be infinite."""
+class PinnedPoint(NamedTuple):
+    """A state on Z(R) and what is known there."""
 
     state: FloatArray
-    rate: FloatArray
+    rate: FloatArray  # x', u and v, which may be infinite.
     control: FloatArray
     constraint_input: FloatArray
-    A: FloatArray
-    B: FloatArray
-    pivot: FloatArray  # 0 exactly where A or B is singular.
     unrest: FloatArray  # |E x'| relative to its terms.
-
-    @cached_property
-    def margins(self) -> tuple[float, float]:
-        """The smallest singular values of A and B; infinite without constraints."""
-        a, b = (
-            float(np.min(np.linalg.svd(matrix, compute_uv=False), initial=np.inf))
-            for matrix in (self.A, self.B)
-        )
-        return a, b
-
-    @cached_property
-    def signs(self) -> tuple[float, ...]:
-        """The signs of det A and det B; a matrix that is not square has none."""
-        matrices = [matrix for matrix in (self.A, self.B) if len(matrix) == matrix.shape[1]]
-        return tuple(float(np.linalg.slogdet(matrix)[0]) for matrix in matrices)
+    margins: tuple[float, float]  # The smallest singular values of A and B; inf if A is empty.
+    signs: tuple[float, ...]  # Of their determinants, if they are square.
+    flaw: str  # Why the motion is not determined; empty if it is.
 
 
 class PinnedOutputs:
@@ -90,11 +77,9 @@ class PinnedOutputs:
         )
         inputs = {"reference": goal}
         self.residual = system.trace("pinned outputs", {"residual": residual}, inputs)
-        self.gradient = system.trace(
-            "gradient of the pinned outputs",
-            {"gradient": ca.jacobian(ca.cse(residual), system.state)},
-            often=False,  # Common subexpressions are removed already.
-        )
+        # Common subexpressions are removed already.
+        gradient = {"gradient": ca.jacobian(ca.cse(residual), system.state)}
+        self.gradient = system.trace("gradient of the pinned outputs", gradient, often=False)
         # E x' = f + g v + h u, and the sizes of its terms, which cancel at rest.
         mass, g, h = (ca.fabs(e) for e in (system.mass_matrix, system.g, system.h))
         states = ca.fmax(ca.DM(system.scale), ca.fabs(system.state))
@@ -104,10 +89,10 @@ class PinnedOutputs:
             "rate": self._rate,
             "control": control,
             "constraint_input": constraint_input,
-            "constraint_matrix": structure.elimination.constraint_matrix,
-            "control_matrix": structure.control_matrix,
-            "pivot": ca.fmin(pivot, structure.elimination.pivot),
             "unrest": ca.fabs(ca.mtimes(system.mass_matrix, self._rate)) / sizes,
+            "A": structure.elimination.constraint_matrix,
+            "B": structure.control_matrix,
+            "pivot": ca.fmin(pivot, structure.elimination.pivot),
         }
         self.motion = system.trace("pinned motion", motion, inputs)
 
@@ -143,11 +128,21 @@ class PinnedOutputs:
         return system.trace("slope of the pinned motion", slopes, inputs, often=False)
 
     @cached_property
-    def usual_margins(self) -> tuple[float, float]:
-        """The largest margins of A and B at the states of the structure."""
-        still = self.at(np.zeros(self.layout.reference_size), self.system.parameter_values)
-        margins = [still.point(state).margins for state in self.structure.states]
-        return max(a for a, _ in margins), max(b for _, b in margins)
+    def least_margins(self) -> FloatArray:
+        """The margins below which A and B are singular, by their largest at sampled states."""
+        still, p = np.zeros(self.layout.reference_size), self.system.parameter_values
+        margins = [
+            [margin_of(as_matrix(value)) for value in self.motion.evaluate(x, still, p)[4:6]]
+            for x in self.structure.states
+        ]
+        return VANISHED * np.max(margins, axis=0)
+
+
+def margin_of(matrix: FloatArray) -> float:
+    """The smallest singular value; infinite if there is none, nan if an entry is not finite."""
+    if not np.isfinite(matrix).all():
+        return np.nan
+    return float(np.min(np.linalg.svd(matrix, compute_uv=False), initial=np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,13 +155,12 @@ class PinnedSet:
 
     def state(self, guess: FloatArray) -> FloatArray:
         """Returns a state near a guess, to round-off, or raises InconsistentStateError."""
-        system = self.outputs.system
         state, converged = self.project(guess)
         if converged:
             return state
-        residual = self.residual(state)
+        system, residual = self.outputs.system, self.residual(state)
         length = np.linalg.norm(self.gradients(state) * system.scale, axis=1)
-        missed = np.abs(residual) / np.where(length > 0.0, length, 1.0)
+        missed = np.abs(residual) / positive(length)
         worst = int(np.argmax(missed))
         if not np.all(np.isfinite(residual)):
             why = "have no value near the given state; start inside the domain of the system"
@@ -210,30 +204,25 @@ class PinnedSet:
     def point(self, state: FloatArray) -> PinnedPoint:
         """Evaluates rate, inputs and matrices at a state."""
         values = self.outputs.motion.evaluate(state, self.reference, self.parameters)
-        rate, u, v, A, B, pivot, unrest = (value.copy() for value in values)
-        A, B = A.reshape(v.size, v.size), B.reshape(self.outputs.system.num_outputs, u.size)
-        return PinnedPoint(state, rate, u, v, A, B, pivot, unrest)
-
-    def flaw(self, point: PinnedPoint) -> str:
-        """Returns why the motion is not determined at a point; empty if it is."""
-        if not (np.isfinite(point.A).all() and np.isfinite(point.B).all()):
-            return "A(x) or B(x) is not finite"
-        pairs = zip(point.margins, self.outputs.usual_margins, strict=True)
-        vanished = any(now < VANISHED * usual for now, usual in pairs)
-        if vanished or not point.pivot[0] > SINGULAR_PIVOT:
-            return "A(x) or B(x) is singular"
-        moving = np.concatenate([point.rate, point.control, point.constraint_input])
-        return "" if np.isfinite(moving).all() else "x' is not finite"
+        rate, u, v, unrest = (value.copy() for value in values[:4])
+        *matrices, pivot = (as_matrix(value) for value in values[4:])
+        margins = margin_of(matrices[0]), margin_of(matrices[1])
+        signs = [np.linalg.slogdet(each)[0] for each in matrices if len(each) == each.shape[1]]
+        flaw = ""
+        if np.isnan(margins).any():
+            flaw = "A(x) or B(x) is not finite"
+        elif np.any(margins < self.outputs.least_margins) or not pivot.item() > SINGULAR_PIVOT:
+            flaw = "A(x) or B(x) is singular"
+        elif not np.isfinite(np.concatenate([rate, u, v])).all():
+            flaw = "x' is not finite"
+        return PinnedPoint(state, rate, u, v, unrest, margins, tuple(map(float, signs)), flaw)
 
     def rate(self, state: FloatArray) -> FloatArray:
         """Returns x' = f* + h* u, shape (n,)."""
         return self.outputs.motion.evaluate(state, self.reference, self.parameters)[0].copy()
 
     def slopes(
-        self,
-        state: FloatArray,
-        directions: FloatArray | None = None,
-        by: FloatArray | None = None,
+        self, state: FloatArray, directions: FloatArray | None = None, by: FloatArray | None = None
     ) -> FloatArray:
         """Returns the derivatives of x' along columns of dx, all if None, and of dR if given."""
         columns = np.eye(state.size) if directions is None else directions
@@ -261,9 +250,9 @@ class EndCause(Enum):
     SINGULAR = "the control would be unbounded; lead the reference around its course"
 
 
-@dataclass(frozen=True, eq=False)
-class MotionEnd:
-    """The end of a motion with pinned outputs."""
+@dataclass(eq=False)
+class MotionEnd(Exception):
+    """The end of a motion with pinned outputs, raised where it is and kept by the motion."""
 
     cause: EndCause
     time: float
@@ -289,14 +278,6 @@ class PinnedMotion:
     ending: MotionEnd | None  # Why it ends before the last time; None if it does not.
 
 
-class _Ended(Exception):
-    """Raised where a motion ends."""
-
-    def __init__(self, ending: MotionEnd) -> None:
-        self.ending = ending
-        super().__init__(ending.text)
-
-
 def follow(
     pinned: PinnedOutputs,
     reference: TimeFunction,
@@ -305,21 +286,18 @@ def follow(
     parameters: TimeFunction,
 ) -> PinnedMotion:
     """Computes the motion on Z(R(t)) from a state close to a guess; see `ZeroDynamics.motion`."""
-    points: list[PinnedPoint] = []
-    ending = None
+    system, points, ending = pinned.system, list[PinnedPoint](), None
     try:
         with np.errstate(all="ignore"):  # States outside the domain are tried and rejected.
-            follower = _Follower(pinned, reference, parameters, times.tolist(), guess)
-            for point in follower.points():
-                points.append(point)
-    except _Ended as end:
-        ending = end.ending
-    system, moments = pinned.system, times[: len(points)]
+            follower = _Follower(pinned, reference, parameters, times.tolist())
+            points.extend(follower.points(guess))
+    except MotionEnd as end:
+        ending = end.with_traceback(None)
 
     def rows(values: list[FloatArray], width: int) -> FloatArray:
         return np.array(values).reshape(len(points), width)
 
-    margins = rows([np.array(point.margins) for point in points], 2)
+    moments, margins = times[: len(points)], rows([np.array(p.margins) for p in points], 2)
     return PinnedMotion(
         moments,
         rows([point.state for point in points], system.num_states),
@@ -333,7 +311,7 @@ def follow(
 
 
 class _Follower:
-    """Follows a reference from point to point; raises _Ended where the motion ends."""
+    """Follows a reference from point to point; raises MotionEnd where the motion ends."""
 
     def __init__(
         self,
@@ -341,24 +319,24 @@ class _Follower:
         reference: TimeFunction,
         parameters: TimeFunction,
         times: list[float],
-        guess: FloatArray,
     ) -> None:
         self._pinned, self._reference, self._parameters = pinned, reference, parameters
         self._system, self._times, self._time = pinned.system, times, times[0]
         self._remaining = MOST_STEPS + len(times)
+        self._last: PinnedPoint
+        self._largest: FloatArray  # The largest margins so far.
+
+    def points(self, guess: FloatArray) -> Iterator[PinnedPoint]:
+        """Yields the points of the motion, one for each time."""
         first = self._at(self._time)
         try:
-            start = first.state(guess)
+            self._last = first.point(first.state(guess))
         except InconsistentStateError as error:
             text = f"{error} (t = {self._time:.6g} s)"
-            raise _Ended(MotionEnd(EndCause.NO_START, self._time, text)) from error
-        self._last = first.point(start)
-        if first.flaw(self._last):
-            raise self._stop(EndCause.SINGULAR_START, f"x = {show(start)}")
-        self._largest = self._last.margins
-
-    def points(self) -> Iterator[PinnedPoint]:
-        """Yields the points of the motion, one for each time."""
+            raise MotionEnd(EndCause.NO_START, self._time, text) from error
+        if self._last.flaw:
+            raise self._stop(EndCause.SINGULAR_START, f"x = {show(self._last.state)}")
+        self._largest = np.array(self._last.margins)
         yield self._last
         has_dynamics = self._pinned.structure.zero_dynamics_dimension > 0
         yield from self._integrate() if has_dynamics else self._continue()
@@ -373,13 +351,13 @@ class _Follower:
                 time = end if step == end - self._time else self._time + step
                 before = self._last
                 # Adams-Bashforth: x' and its change since the previous step.
-                predicted = before.state + step * (before.rate + 0.5 * step * change)
-                if self._reach(time, predicted):
+                if self._reach(time, before.state + step * (before.rate + 0.5 * step * change)):
                     change = (self._last.rate - before.rate) / step
                     step *= 2.0
                 else:
                     step *= 0.5
-                    self._check_step(step, interval)
+                    if step < SHORTEST * interval:
+                        raise self._end(0.1 * interval)
             yield self._last
 
     def _integrate(self) -> Iterator[PinnedPoint]:
@@ -403,7 +381,8 @@ class _Follower:
                     integrator.y, integrator.f = self._last.state.copy(), self._last.rate.copy()
                 else:
                     step = 0.5 * (integrator.t - self._time)
-                    self._check_step(step, interval)
+                    if step < SHORTEST * interval:
+                        raise self._end(0.1 * interval)
                     integrator = self._integrator(end, step)
             yield self._last
 
@@ -432,39 +411,30 @@ class _Follower:
         try:
             return self._pinned.at_time(self._reference, self._parameters, time)
         except NonFiniteError as error:
-            ending = MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, str(error))
-            raise _Ended(ending) from error
+            raise MotionEnd(EndCause.REFERENCE_NOT_FINITE, time, str(error)) from error
 
     def _reach(self, time: float, state: FloatArray) -> bool:
         """Moves to the projected state, unless it is on another branch; returns whether it did."""
-        last = self._last
+        last, pinned = self._last, self._at(time)
         self._remaining -= 1
         if self._remaining < 0:
             raise self._stop(EndCause.TOO_FAST, f"x = {show(last.state)}")
-        pinned = self._at(time)
         projected, converged = pinned.project(state)
         near = JUMP * np.maximum(self._system.scale, np.abs(last.state))
         near += np.abs(state - last.state)
         if not converged or np.any(np.abs(projected - state) > near):
             return False
         point = pinned.point(projected)
-        if pinned.flaw(point) or point.signs != last.signs:
+        if point.flaw or point.signs != last.signs:
             return False
-        (a, b), (c, d) = self._largest, point.margins
-        self._time, self._last, self._largest = time, point, (max(a, c), max(b, d))
+        self._time, self._last = time, point
+        self._largest = np.maximum(self._largest, point.margins)
         return True
 
-    def _check_step(self, step: float, interval: float) -> None:
-        if step < SHORTEST * interval:
-            raise self._end(0.1 * interval)
-
-    def _end(self, ahead: float) -> _Ended:
+    def _end(self, ahead: float) -> MotionEnd:
         """Why the motion ends at the last point, also by the reference `ahead` seconds."""
         last, system = self._last, self._system
-        shares = [
-            now / largest if largest < np.inf else 1.0
-            for now, largest in zip(last.margins, self._largest, strict=True)
-        ]
+        shares = np.where(self._largest < np.inf, last.margins / self._largest, 1.0)
         which = int(np.argmin(shares))
         if shares[which] > LOST:
             # At an infinite state within a finite time a rate is so large that the state would have
@@ -486,7 +456,7 @@ class _Follower:
         detail = f"{matrix}(x) becomes singular, smallest singular value {margin}"
         return self._stop(EndCause.SINGULAR if near else EndCause.OUT_OF_REACH, detail, matrix)
 
-    def _stop(self, cause: EndCause, detail: str, matrix: str = "") -> _Ended:
+    def _stop(self, cause: EndCause, detail: str, matrix: str = "") -> MotionEnd:
         """The end of the motion at the last point."""
         text = f"{self._system.name}: {cause.value} at t = {self._time:.6g} s: {detail}"
-        return _Ended(MotionEnd(cause, self._time, text, self._last.state, matrix))
+        return MotionEnd(cause, self._time, text, self._last.state, matrix)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, unknown_name
+from drake_dae.arrays import positive as positive_number
 from drake_dae.dae.assumptions import redundant_constraints
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Samples, draw
@@ -100,21 +101,16 @@ def share_forces(
         compliances: Name of a constraint input -> c_i, for those where it is not 1.
 
     Raises:
-        InconsistentStateError: There is no consistent state near the nominal one.
-        ModelError: There is no such constraint or constraint input; a compliance is not positive; a
-            constraint that is left out is not redundant, or its input acts in an independent
-            direction; or an output is not a function of the sum G v_all, and so not determined.
+        ModelError: As of `drop_constraints`; or a compliance is not positive, or an output is not a
+            function of the sum G v_all, and so not determined.
     """
     inputs = [signal.name for signal in system.constraint_input_signals]
     weights = np.ones(len(inputs))
     for name, value in (compliances or {}).items():
         if name not in inputs:
             raise ModelError(f"{system.name}: {unknown_name('constraint force', name, inputs)}")
-        if not value > 0.0:
-            raise ModelError(
-                f"{system.name}: the compliance of '{name}' must be positive, got {value}"
-            )
-        weights[inputs.index(name)] = value
+        what = f"{system.name}: the compliance of '{name}'"
+        weights[inputs.index(name)] = positive_number(what, value)
     samples = all_constraints_hold(system)
     kept = _independent(samples) if names is None else _all_but(system, names)
     if len(kept) == system.num_constraints:

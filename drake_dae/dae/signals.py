@@ -73,10 +73,9 @@ class Parameter:
         value: The default, shape (k,); a float is taken as shape (1,).
         unit: Its SI unit as text, "" for a pure number.
         positive: Whether only positive numbers make sense, as for a mass.
-        nonnegative: Whether negative numbers make no sense, as for a coefficient of friction.
-        symbol: The CasADi symbol that stands for it in the expressions, shape (k, 1). Made where
-            not given.
+        symbol: The CasADi symbol that stands for it, shape (k, 1). Made where not given.
         exogenous: Whether it moves.
+        nonnegative: Whether negative numbers make no sense, as for a coefficient of friction.
         bounds: The range (low, high) of its values, each a number or of shape (k,). Relative
             degrees must be the same in this range. If None, half and twice the default, or -1 and 1
             where the default is 0. Equal bounds fix the value; the signal is then constant.
@@ -103,15 +102,11 @@ class Parameter:
             raise ModelError(f"parameter '{self.name}' must be one-dimensional, got {self.value!r}")
         value.setflags(write=False)
         object.__setattr__(self, "value", value)
-        if self.bounds is not None:
-            what = f"parameter '{self.name}': bounds"
-            low, high = (np.atleast_1d(numbers(what, bound)) for bound in self.bounds)
-            fits = all(bound.shape in ((1,), value.shape) for bound in (low, high))
-            if not fits or not np.all(low <= high):
-                raise ModelError(
-                    f"{what} must be a lowest and a highest value, each a number or of shape "
-                    f"({value.size},), got {self.bounds!r}"
-                )
+        if self.bounds is not None and not np.all(self.low <= self.high):
+            raise ModelError(
+                f"parameter '{self.name}': bounds must be a lowest and a highest value, got "
+                f"{self.bounds!r}"
+            )
         self.check(value)
         if self.symbol is None:
             object.__setattr__(self, "symbol", ca.SX.sym(self.name, value.size))
@@ -129,7 +124,7 @@ class Parameter:
     def low(self) -> FloatArray:
         """The lowest values for which relative degrees are checked, shape (k,)."""
         if self.bounds is not None:
-            return np.broadcast_to(np.asarray(self.bounds[0], dtype=float), self.value.shape)
+            return self.entries(self.bounds[0])
         least = -1.0 if not (self.positive or self.nonnegative) else 0.0
         return np.where(self.value == 0.0, least, np.minimum(0.5 * self.value, 2.0 * self.value))
 
@@ -137,7 +132,7 @@ class Parameter:
     def high(self) -> FloatArray:
         """The highest values for which relative degrees are checked, shape (k,)."""
         if self.bounds is not None:
-            return np.broadcast_to(np.asarray(self.bounds[1], dtype=float), self.value.shape)
+            return self.entries(self.bounds[1])
         return np.where(self.value == 0.0, 1.0, np.maximum(0.5 * self.value, 2.0 * self.value))
 
     @property
@@ -162,27 +157,20 @@ class Parameter:
         return np.broadcast_to(entries, self.value.shape).copy()
 
     def check(self, value: FloatArray) -> None:
-        """Checks that values are within the range of the parameter.
-
-        Raises:
-            ModelError: A number is not finite, has the wrong sign, or exceeds `LARGEST`.
-        """
-        least = 1.0 / LARGEST if self.positive else 0.0
-        size = np.abs(value)
+        """Raises ModelError if a value is not finite, has the wrong sign, or is out of bounds."""
+        size, wrong = np.abs(value), ""
         if not np.all(np.isfinite(value)):
             wrong = "be finite"
         elif self.positive and not np.all(value > 0.0):
             wrong = "be positive"
         elif self.nonnegative and not np.all(value >= 0.0):
             wrong = "not be negative"
-        elif np.any(size > LARGEST) or np.any(size < least):
+        elif np.any(size > LARGEST) or (self.positive and np.any(size < 1.0 / LARGEST)):
             wrong = f"be from {1.0 / LARGEST:g} to {LARGEST:g}, so that a double holds its products"
         elif self.bounds is not None and not np.all((self.low <= value) & (value <= self.high)):
-            low, high = map(brief, self.bounds)
-            wrong = f"stay in its bounds, from {low} to {high}"
-        else:
-            return
-        raise ModelError(f"parameter '{self.name}' must {wrong}, got {value}")
+            wrong = "stay in its bounds, from {} to {}".format(*map(brief, self.bounds))
+        if wrong:
+            raise ModelError(f"parameter '{self.name}' must {wrong}, got {value}")
 
 
 def is_symbol(value: Any) -> bool:
@@ -267,16 +255,12 @@ class Exogenous:
 class DerivativeLayout:
     """The indices of p signals and their derivatives in the stacked vectors of section 2.
 
-    A chain holds mu_i derivatives of each signal, and a reference one more:
+    A chain holds mu_i derivatives of each signal, and a reference one more, or `more` of them:
 
         chain     = (z_1, z_1', ..., z_1^(mu_1 - 1), z_2, ...)    sum mu_i numbers
         reference = (r_1, r_1', ..., r_1^(mu_1),     r_2, ...)    sum (mu_i + 1) numbers
 
     The constraint chains of (4) are stacked likewise, with r_i in place of mu_i.
-
-    Args:
-        degrees: mu_1, ..., mu_p.
-        more: The number of further derivatives of each signal in a reference; none if empty.
     """
 
     def __init__(self, degrees: Sequence[int], more: Sequence[int] = ()) -> None:
@@ -304,8 +288,8 @@ class DerivativeLayout:
 
     def chain_signals(self, signals: Sequence[Signal]) -> tuple[Signal, ...]:
         """Returns names and units of the entries of a chain."""
-        pairs = zip(signals, self.degrees, strict=True)
-        return tuple(signal.derivative(order) for signal, d in pairs for order in range(d))
+        pairs = zip(self.owners, self.orders, strict=True)
+        return tuple(signals[int(i)].derivative(int(order)) for i, order in pairs)
 
     def reference_signals(self, signals: Sequence[Signal]) -> tuple[Signal, ...]:
         """Returns names and units of the entries of a reference vector."""

@@ -1,6 +1,7 @@
 """The structure of a system: relative degrees, index, N*, Assumptions (1)-(5) with margins."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TypeVar
@@ -12,11 +13,11 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import Booleans, FloatArray, check_whole_number, show
 from drake_dae.dae.assumptions import (
+    Combination,
     Violation,
     ViolationKind,
     combinations_of,
     find_dependence,
-    rank_violation,
     redundant_constraints,
 )
 from drake_dae.dae.derivatives import Derivatives
@@ -27,7 +28,7 @@ from drake_dae.dae.margins import RankMargin, find_margin
 from drake_dae.dae.redundancy import all_constraints_hold
 from drake_dae.dae.relative_degrees import InputActions, constraint_chains, output_chains
 from drake_dae.dae.samples import Samples, draw
-from drake_dae.dae.signals import DerivativeLayout
+from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 from drake_dae.trace.factorization import Factorization, nearest_solution
@@ -116,7 +117,7 @@ class Structure(ConstraintStructure):
         degrees = f"r={self.constraint_degrees}, mu={self.output_degrees}"
         return f"Structure({self.system.name!r}, {degrees}, index={self.index})"
 
-    @property
+    @cached_property
     def layout(self) -> DerivativeLayout:
         """The layout of reference vectors and output chains."""
         return DerivativeLayout(self.output_degrees)
@@ -144,12 +145,10 @@ class Structure(ConstraintStructure):
         """
         if self.system.control_metric is not None or self.system.frictional_contacts:
             return None
-        motion = self.derivatives
+        motion, size = self.derivatives, self.system.num_states
         shown = ca.vertcat(motion.rate, motion.constraint_input)
-        solution = motion.inverse(self.highest_derivatives, commanded, shown)
-        if solution is None:
+        if (solution := motion.inverse(self.highest_derivatives, commanded, shown)) is None:
             return None
-        size = self.system.num_states
         return solution[2][:size, :], solution[2][size:, :], solution[1]
 
     def control_for(self, commanded: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -181,10 +180,7 @@ def find_constraint_structure(
     system: DaeSystem, *, spread: ArrayLike | None = None, count: int = 12, seed: int = 0
 ) -> ConstraintStructure:
     """Finds r_1, ..., r_m and A(x), and checks Assumptions (1)-(3)."""
-    structure, samples = examine_constraints(system, guesses(system, spread, count, seed))
-    violation = constraint_violation(structure)
-    if violation:
-        raise violation.error()
+    structure, samples = _sound_constraints(system, spread, count, seed)
     # Rows of n* that are only round-off are no feedthrough.
     actions = InputActions(samples, structure.elimination)
     acts = actions.numbers(actions.feedthrough).any(axis=(0, 2))
@@ -215,9 +211,9 @@ def find_structure(
     Raises:
         AssumptionError: An assumption is violated; the exception has the state where.
         InconsistentStateError: There is no consistent state near the nominal one.
-        ModelError: The outputs are not as many as the controls (or fewer, with a metric), or there
-            are none, a function is not finite at the nominal state, the mass matrix or the metric
-            is not symmetric and positive definite, or count or spread make no sense.
+        ModelError: The outputs are not as many as the controls (or fewer, with a metric), a
+            function is not finite at the nominal state, or the mass matrix or the metric is not
+            symmetric and positive definite.
     """
     structure, violation = examine_structure(system, spread=spread, count=count, seed=seed)
     if violation:
@@ -231,11 +227,7 @@ def examine_structure(
     """Finds the structure as `find_structure`, but also returns it where B(x) is singular."""
     if why := why_no_law(system):
         raise ModelError(f"{system.name}: {why}. `DaePlant` simulates it without these")
-    constrained, samples = examine_constraints(system, guesses(system, spread, count, seed))
-    violation = constraint_violation(constrained)
-    if violation:
-        raise violation.error()
-    structure = examine_outputs(constrained, samples)
+    structure = examine_outputs(*_sound_constraints(system, spread, count, seed))
     return structure, control_violation(structure)
 
 
@@ -274,30 +266,28 @@ def why_no_law(system: DaeSystem) -> str:
     )
 
 
-def guesses(system: DaeSystem, spread: ArrayLike | None, count: int, seed: int) -> FloatArray:
-    """Returns initial guesses of consistent states, shape (count + 1, n), of a sound system."""
+def _sound_constraints(
+    system: DaeSystem, spread: ArrayLike | None, count: int, seed: int
+) -> tuple[ConstraintStructure, Samples]:
+    """The structure of the constraints, which fulfil Assumptions (1)-(3), and its samples."""
     check_system(system)
     check_whole_number(f"{system.name}: count", count, 1)
     check_whole_number(f"{system.name}: seed", seed, 0)
-    return draw(system, spread, count, seed)
+    structure, samples = examine_constraints(system, draw(system, spread, count, seed))
+    if violation := constraint_violation(structure):
+        raise violation.error()
+    return structure, samples
 
 
 def check_system(system: DaeSystem) -> None:
     """Checks the number of constraints and the mass matrix of a system."""
     _check_positive_definite(system, "mass_matrix", system.nominal_state[None])
     if system.num_constraints > system.num_states:
-        names = tuple(signal.name for signal in system.constraint_output_signals)
-        raise Violation(2, ViolationKind.COUNT, names).error()
+        raise Violation(2, ViolationKind.COUNT, _names(system)).error()
 
 
-REMEDIES = {
-    "mass_matrix": (
-        "An equation in which no derivative stands is a constraint 0 = k(x) with a constraint "
-        "input; where it holds an unknown z that has no derivative, lift it: make z a state with "
-        "z' = v, v a new constraint input, and keep the equation as constraint"
-    ),
-    "control_metric": "Give each control a positive weight",
-}
+def _names(system: DaeSystem) -> tuple[str, ...]:
+    return tuple(signal.name for signal in system.constraint_output_signals)
 
 
 def _check_positive_definite(system: DaeSystem, key: str, states: FloatArray) -> None:
@@ -307,16 +297,22 @@ def _check_positive_definite(system: DaeSystem, key: str, states: FloatArray) ->
     for state in states:
         value = function(state, system.parameter_values)[0].reshape(matrix.shape)
         length = np.sqrt(np.abs(np.diag(value)))
-        is_definite = bool(np.all(np.isfinite(value)) and np.all(length > 0.0))
-        if is_definite:
+        if np.all(np.isfinite(value)) and np.all(length > 0.0):
             scaled = value / length / length[:, None]  # Independent of units.
             is_symmetric = np.allclose(scaled, scaled.T, rtol=0.0, atol=1e-9)
-            is_definite = bool(is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12)
-        if not is_definite:
-            raise ModelError(
-                f"{system.name}: {key} is not symmetric and positive definite at x = "
-                f"{show(state)}. {REMEDIES[key]}"
-            )
+            if is_symmetric and np.linalg.eigvalsh(scaled)[0] > 1e-12:
+                continue
+        remedy = (
+            "An equation in which no derivative stands is a constraint 0 = k(x) with a constraint "
+            "input; where it holds an unknown z that has no derivative, lift it: make z a state "
+            "with z' = v, v a new constraint input, and keep the equation as constraint"
+        )
+        if key == "control_metric":
+            remedy = "Give each control a positive weight"
+        raise ModelError(
+            f"{system.name}: {key} is not symmetric and positive definite at x = {show(state)}. "
+            f"{remedy}"
+        )
 
 
 def examine_constraints(
@@ -367,14 +363,13 @@ def examine_outputs(constrained: ConstraintStructure, samples: Samples) -> Struc
 
 def constraint_violation(structure: ConstraintStructure) -> Violation | None:
     """Returns the violation of Assumption (1) or (2) by a singular A(x); None if it is regular."""
-    causes = ((1, ViolationKind.CONSTRAINT_DEGREE), (2, ViolationKind.CONSTRAINT_RANK))
-    signals, margin = structure.system.constraint_output_signals, structure.constraint_margin
+    system, elimination = structure.system, structure.elimination
+    margin, signals = structure.constraint_margin, system.constraint_output_signals
     if margin is None:
         return None
-    system, elimination = structure.system, structure.elimination
     matrix = system.frictional_contacts.without_friction(elimination.constraint_matrix)
-    violation = rank_violation(margin, signals, structure.constraint_degrees, *causes)
-    violation = _for_the_family(violation, 2, structure, matrix)
+    kinds = ((1, ViolationKind.CONSTRAINT_DEGREE), (2, ViolationKind.CONSTRAINT_RANK))
+    violation = _singular(structure, matrix, margin, signals, structure.constraint_degrees, kinds)
     if violation is None or violation.cause is ViolationKind.BOUNDS:
         return violation
     if violation.cause is ViolationKind.CONSTRAINT_RANK:
@@ -387,22 +382,32 @@ def constraint_violation(structure: ConstraintStructure) -> Violation | None:
 
 def control_violation(structure: Structure) -> Violation | None:
     """Returns the violation of Assumption (4) or (5) by a singular B(x); None if it is regular."""
-    causes = ((4, ViolationKind.OUTPUT_DEGREE), (5, ViolationKind.CONTROL_RANK))
     margin, signals = structure.control_margin, structure.system.output_signals
-    violation = rank_violation(margin, signals, structure.output_degrees, *causes)
+    kinds = ((4, ViolationKind.OUTPUT_DEGREE), (5, ViolationKind.CONTROL_RANK))
+    matrix, degrees = structure.control_matrix, structure.output_degrees
+    violation = _singular(structure, matrix, margin, signals, degrees, kinds)
     if violation is not None and violation.cause is ViolationKind.CONTROL_RANK:
         rows = combinations_of([signal.name for signal in signals], [margin.matrix])
         violation = replace(violation, combinations=tuple(rows))
-    return _for_the_family(violation, 5, structure, structure.control_matrix)
+    return violation
 
 
-def _for_the_family(
-    violation: Violation | None, assumption: int, structure: ConstraintStructure, matrix: ca.SX
+def _singular(
+    structure: ConstraintStructure,
+    matrix: ca.SX,
+    margin: RankMargin,
+    signals: Sequence[Signal],
+    degrees: Sequence[int],
+    kinds: Sequence[tuple[int, ViolationKind]],
 ) -> Violation | None:
-    """The violation by a matrix, also for other parameters than the defaults."""
-    system, states = structure.system, structure.states
-    bounded = any(p.bounds is not None for p in system.parameters)
-    if violation is None and not (bounded and matrix.is_square()):
+    """The violation by a matrix, one kind if a row vanishes; also for other parameters."""
+    system, states, violation = structure.system, structure.states, None
+    if margin.is_singular and (row := margin.vanishing_row) is not None:
+        violation = Violation(*kinds[0], (signals[row].name,), degrees[row], margin.state)
+    elif margin.is_singular:
+        names = tuple(signal.name for signal in signals)
+        violation = Violation(*kinds[1], names, None, margin.state, margin.relative, margin.least)
+    elif not (matrix.is_square() and any(p.bounds is not None for p in system.parameters)):
         return None
     function = system.trace("rank", {"matrix": ca.densify(matrix)}, often=False)
     family = Family(structure.manifold, states)
@@ -423,35 +428,30 @@ def _for_the_family(
         return replace(violation, deciding=family.deciding(is_regular))
     usual = [np.abs(value(x, system.parameter_values)) for x in states]
     rows, columns = equilibration(np.mean(usual, axis=0))
-    first = equilibrated(value(states[0], system.parameter_values))
-    sign = np.linalg.slogdet(first)[0]
+    sign = np.linalg.slogdet(equilibrated(value(states[0], system.parameter_values)))[0]
 
     @np.errstate(all="ignore")
-    def margin(state: FloatArray, parameters: FloatArray) -> float:
+    def least(state: FloatArray, parameters: FloatArray) -> float:
         """The smallest singular value; minus one where the determinant has another sign."""
         scaled = value(state, parameters) / rows[:, None] / columns
         if not np.all(np.isfinite(scaled)):
             return np.inf
-        if np.linalg.slogdet(scaled)[0] * sign < 0.0:
-            return -1.0
-        return smallest_singular_value(scaled)
+        other = np.linalg.slogdet(scaled)[0] * sign < 0.0
+        return -1.0 if other else smallest_singular_value(scaled)
 
-    lost = family.lost(margin, system.least_margin)
-    return Violation(assumption, ViolationKind.BOUNDS, (), deciding=lost) if lost else None
+    lost = family.lost(least, system.least_margin)
+    return Violation(kinds[1][0], ViolationKind.BOUNDS, (), deciding=lost) if lost else None
 
 
 def _as_redundant(system: DaeSystem, violation: Violation) -> Violation:
     """The actual violation if redundant constraints led to a singular configuration."""
     possible = (ViolationKind.CONSTRAINT_DEGREE, ViolationKind.SINGULAR_CONFIGURATION)
-    if violation.cause not in possible:
-        return violation
-    try:
-        combinations = redundant_constraints(all_constraints_hold(system))
-    except InconsistentStateError:
-        return violation
+    combinations: tuple[Combination, ...] = ()
+    if violation.cause in possible:
+        with suppress(InconsistentStateError):
+            combinations = redundant_constraints(all_constraints_hold(system))
     # A gradient that vanishes wherever its constraint holds does not depend on others.
     if not combinations or not all(combination.others for combination in combinations):
         return violation
-    names = tuple(signal.name for signal in system.constraint_output_signals)
-    redundant, deciding = ViolationKind.REDUNDANT, violation.deciding
-    return Violation(2, redundant, names, combinations=combinations, deciding=deciding)
+    names, redundant = _names(system), ViolationKind.REDUNDANT
+    return Violation(2, redundant, names, combinations=combinations, deciding=violation.deciding)

@@ -26,10 +26,10 @@ from drake_dae.trace.round_off import SINGULAR
 class ForceSharing:
     """The distribution of forces among redundant constraints, some of which are removed."""
 
-    split: ca.SX
-    signals: tuple[Signal, ...]
-    undetermined: tuple[str, ...]
-    left_out: ca.SX
+    split: ca.SX  # T of v_all = T v.
+    signals: tuple[Signal, ...]  # Of v_all.
+    undetermined: tuple[str, ...]  # The constraint inputs that (1)-(3) do not determine.
+    left_out: ca.SX  # The constraints that are removed.
     left_out_signals: tuple[Signal, ...]
 
 
@@ -68,8 +68,7 @@ class DaeSystem:
         dry: The names of parameters that are coefficients of Coulomb friction in f.
 
     Raises:
-        ModelError: A shape does not fit, a symbol is unknown, names are not unique, a number is not
-            finite, or a function is not smooth in the state, such as fabs.
+        ModelError: A shape, a symbol, a name or a number does not fit, or a function is not smooth.
     """
 
     state: ca.SX
@@ -129,7 +128,7 @@ class DaeSystem:
         Each function is called once with a CasADi column x, and, if there are `parameters`, with a
         namespace p of their symbols: `f=lambda x, p: [x[1], -p.stiffness * x[0]]`. It returns an
         expression, or a list (of lists for a matrix, row by row). Use functions of CasADi, such as
-        casadi.sin. numpy.sin works but CasADi warns about it; math.sin does not work.
+        casadi.sin; math.sin does not work.
 
         Args:
             state: Names (or Signals) of the states, or their number n.
@@ -139,9 +138,6 @@ class DaeSystem:
             exogenous: The names of the parameters that are exogenous signals w(t).
             bounds: Name of a parameter -> its range (low, high); see `with_bounds`.
             labels: The remaining fields of the class.
-
-        Raises:
-            ModelError: A function fails, or the functions do not form a system; see the class.
         """
         functions = {"f": f, "g": g, "h": h, "k": k, "l": l, "m": m}
         system = cls(**fields_of_functions(state, functions, parameters or {}, labels))
@@ -265,15 +261,11 @@ class DaeSystem:
 
     @checked(ModelError)
     def with_bounds(self, bounds: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> "DaeSystem":
-        """Returns the same system with bounds for some parameters.
+        """Returns the same system with bounds for some parameters: name -> (low, high).
 
         Relative degrees must be the same for all values of the parameters: an input acts on a
         derivative for all of them or for none. Bounds restrict the values to those for which this
-        holds.
-
-        Args:
-            bounds: Name -> (low, high), each a number or one for each entry; the default lies
-                between them. Equal bounds fix the parameter; as an exogenous signal it is constant.
+        holds; see `Parameter`.
         """
         return self._with_parameters("bounds", bounds)
 
@@ -337,8 +329,8 @@ class DaeSystem:
         Further inputs stand between these; the other arguments are those of `TracedFunction`.
         """
         every = {"state": self.state, **(inputs or {}), "parameters": self.parameter_symbol}
-        whole = f"{self.name} {name}"
-        return TracedFunction(whole, every, outputs, pivot, regular, often, self.compiled)
+        name = f"{self.name} {name}"
+        return TracedFunction(name, every, outputs, pivot, regular, often, self.compiled)
 
     def agree(self, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
         """Returns whether two expressions agree at random states around the nominal state.
@@ -399,11 +391,19 @@ class DaeSystem:
                 continue
             parameters[..., own.slices[p.name]] = values[..., others.slices[p.name]]
             if p.name in own.rates and p.name in others.rates:
-                to, source = own.rates[p.name], others.rates[p.name]
-                count = min(to.stop - to.start, source.stop - source.start)
-                moved = values[..., source.start : source.start + count]
-                parameters[..., to.start : to.start + count] = moved
+                moved = values[..., others.rates[p.name]]
+                to = parameters[..., own.rates[p.name]]
+                count = min(to.shape[-1], moved.shape[-1])
+                to[..., :count] = moved[..., :count]
         return parameters
+
+    def states_named(self, names: Sequence[str]) -> list[int]:
+        """Returns the indices of states by their names."""
+        known = [signal.name for signal in self.state_signals]
+        for name in names:
+            if name not in known:
+                raise ModelError(f"{self.name}: {unknown_name('state', name, known)}")
+        return [known.index(name) for name in names]
 
     def state_vector(self, state: ArrayLike) -> FloatArray:
         """Checks a state and returns it as a new array of shape (n,)."""

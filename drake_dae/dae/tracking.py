@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, listed, numbers, vector
 from drake_dae.dae.gains import FeedbackGains, GainDesign, designed
-from drake_dae.dae.law_model import Deflection, ForceMeasurement, IntegralAction, damped
+from drake_dae.dae.law_model import Deflection, ForceMeasurement, IntegralAction, law_structure
 from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
@@ -41,20 +41,19 @@ class TrackingLaw:
         force_gain: Gbar of (59) for the outputs with mu_i = 0, a number or shape (m, m), positive
             semidefinite; only with measured_force.
         constraint_damping: Damping of constraints that the plant may violate, such as a compliant
-            contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi': see `damped`.
+            contact: a design such as `poles(-200.0)`, with r_i - 1 poles of phi': see
+            `law_structure`.
         contact_stiffness: k in N/m of compliant contacts, F = -k phi, for references of forces that
             change fast: see `Deflection`.
         integral: The names of the outputs whose errors are integrated as well, positions or
             measured forces: see `IntegralAction`. They have one more pole.
         latency: The mean time in s from the measurement of x to the moment when its control acts,
-            for a sampled law delay + period / 2, and half a step more of a stepped plant: by it
-            damping is compensated: see `acting_late`.
+            for a sampled law delay + period / 2, and half a step more of a stepped plant, whose
+            step counts whole without sampling: by it damping is compensated: see `acting_late`.
 
     `function` is the law as (state, reference, measured_force, integral, parameters) -> control,
-    tracking_error and integral_rate, without what the law does not have, and with the parameters of
-    `all_parameters`; `outputs` are these as expressions of `inputs`, and `pivot` is 0 where the
-    matrix that `regular` names is singular. `layout` is that of reference vectors, and
-    `reference_signals` names them.
+    tracking_error, integral_rate, as far as it has them; `outputs` are these as expressions of
+    `inputs`, and `pivot` is 0 where the matrix that `regular` names is singular.
 
     Raises:
         AssumptionError: The system violates an assumption of the theory.
@@ -76,63 +75,59 @@ class TrackingLaw:
         latency: float = 0.0,
     ) -> None:
         self.structure = structure_of("TrackingLaw", system, structure, find_structure)
-        self.damped_structure = damped(self.structure, constraint_damping, latency)
         self.system, self.latency = system, float(latency)
         self.deflection, more = None, tuple[int, ...]()
         if contact_stiffness is not None:
-            self.deflection = Deflection.of(self.structure, contact_stiffness, constraint_damping)
+            self.deflection = Deflection(self.structure, contact_stiffness, constraint_damping)
             more = tuple(2 * (i in self.deflection.inputs) for i in range(system.num_outputs))
+        self._law_structure = law_structure(
+            self.structure, constraint_damping, latency, self.deflection
+        )
         self.layout = DerivativeLayout(self.structure.output_degrees, more)
         self.reference_signals = self.layout.reference_signals(system.output_signals)
         if not measured_force and numbers("force_gain", force_gain, GainError).any():
             raise GainError("force_gain needs measured_force=True")
-        self.measured_force = (
-            ForceMeasurement.of(system, self.layout, force_gain) if measured_force else None
-        )
-        self.integral = IntegralAction.of(system, self.degrees, integral, self.measured_force)
+        self.measured_force: ForceMeasurement | None = None
+        if measured_force:
+            self.measured_force = ForceMeasurement(system, self.layout, force_gain)
+        self.integral = IntegralAction(system, self.degrees, integral, self.measured_force)
         self.gains = self.design(gains)
         self.function = self._trace()
 
     def __repr__(self) -> str:
         outputs = listed(signal.name for signal in self.system.output_signals)
-        force = ", measured_force" if self.measured_force else ""
-        return (
-            f"TrackingLaw('{self.system.name}', outputs={outputs}, "
-            f"degrees={list(self.degrees)}{force})"
-        )
+        return f"TrackingLaw('{self.system.name}', outputs={outputs}, degrees={list(self.degrees)})"
 
     def _trace(self) -> TracedFunction:
         """The law (28) and the tracking error (29) as one function."""
-        structure, layout, measured = self.damped_structure, self.layout, self.measured_force
+        structure, layout, measured = self._law_structure, self.layout, self.measured_force
         reference = ca.SX.sym("R", layout.reference_size)
         # Symbols only for nonzero entries of K: the errors of most outputs are not coupled.
         gain = ca.SX.sym("K", ca.sparsify(ca.DM(self.gains.matrix)).sparsity())
         values = reference[layout.lowest.tolist(), :]
         highest = reference[layout.highest.tolist(), :]
-        chain = structure.chain
+        own = chain = self._deflected(structure.chain, reference)
         inputs = {"reference": reference}
         if measured:
             chain, highest = measured.chain(chain), measured.highest(highest, values)
             inputs["measured_force"] = measured.symbol
         errors = chain - reference[layout.chained.tolist(), :]
-        ahead = ca.SX.zeros(len(self.degrees))
-        if self.deflection is not None:
-            ahead = self.deflection.force(reference, layout)
-        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors)) + ahead  # (28)
+        ubar = highest - ca.mtimes(gain, self.integral.coordinates(errors))  # (28)
         control, pivot = structure.control_for(ubar)
+        control = self._deflected(control, reference)
         # By the model; outputs with direct feedthrough have their reference values.
-        output = ubar - ahead
-        output[layout.dynamic.tolist(), :] = structure.chain[layout.heads.tolist(), :]
+        output = ca.SX(ubar)
+        output[layout.dynamic.tolist(), :] = own[layout.heads.tolist(), :]
         self.exogenous_degrees = self.system.exogenous.degrees(control, output)
         outputs = {"control": control, "tracking_error": output - values}  # (29)
         if self.integral.outputs:
             inputs["integral"] = self.integral.symbol
-            outputs["integral_rate"] = self.integral.rate(chain, values, measured)
+            outputs["integral_rate"] = self.integral.rate(chain, values)
         self.control_takes_force = measured is not None and bool(
             ca.depends_on(ca.vertcat(control, output), measured.symbol)
         )
         # The initial value of (30).
-        start = self.integral.coordinates(structure.chain - reference[layout.chained.tolist(), :])
+        start = self.integral.coordinates(own - reference[layout.chained.tolist(), :])
         self.coordinates_function = self.system.trace(
             "error coordinates",
             {"coordinates": start},
@@ -141,27 +136,29 @@ class TrackingLaw:
         )
         parameters = ca.vertcat(self.system.parameter_symbol, *gain.nonzeros())
         self._ubar, self.outputs, self.pivot = ubar, outputs, pivot
-        self._inputs = {"state": self.system.state, **inputs, "parameters": parameters}
+        #: Name -> symbol of each input of `function`.
+        self.inputs = {"state": self.system.state, **inputs, "parameters": parameters}
         self.regular = (
             f"A(x) or B(x) of Assumptions (2), (5) for the outputs {', '.join(self.gains.names)}"
         )
         name, compiled = f"{self.system.name} tracking law", self.system.compiled
-        return TracedFunction(name, self._inputs, outputs, pivot, self.regular, compiled=compiled)
+        return TracedFunction(name, self.inputs, outputs, pivot, self.regular, compiled=compiled)
 
-    @property
-    def inputs(self) -> dict[str, ca.SX]:
-        """Name -> symbol of each input of `function`."""
-        return dict(self._inputs)
+    def _deflected(self, expression: ca.SX, reference: ca.SX) -> ca.SX:
+        if self.deflection is None:
+            return expression
+        wanted = self.deflection.wanted(reference, self.layout)
+        return ca.substitute(expression, self.deflection.symbol, wanted)
 
     def trace_motion(self) -> TracedFunction | None:
         """Traces x' and v of a plant that equals the law's model, under the law."""
-        if self.damped_structure is not self.structure:
+        if self._law_structure is not self.structure:
             return None
         if (motion := self.structure.motion_for(self._ubar)) is None:
             return None
         rate, force, pivot = motion
         outputs, name = {"rate": rate, "force": force}, f"{self.system.name} under its law"
-        return TracedFunction(name, self._inputs, outputs, pivot, often=False)
+        return TracedFunction(name, self.inputs, outputs, pivot, often=False)
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -205,12 +202,10 @@ class TrackingLaw:
     def coordinate_signals(self) -> list[Signal]:
         """Names and units of the error coordinates."""
         integrals = dict(zip(self.integral.outputs, self.integral.signals, strict=True))
-        signals = []
-        for i, (signal, degree) in enumerate(
-            zip(self.system.output_signals, self.degrees, strict=True)
-        ):
+        signals = list[Signal]()
+        for i, signal in enumerate(self.system.output_signals):
             signals += [integrals[i]] if i in integrals else []
-            signals += [signal.derivative(order) for order in range(degree)]
+            signals += [signal.derivative(order) for order in range(self.degrees[i])]
         return signals
 
     def control(
@@ -222,14 +217,11 @@ class TrackingLaw:
         integral: ArrayLike | None = None,
         parameters: ArrayLike | None = None,
     ) -> FloatArray:
-        """Returns the control u(x, R) of (28).
+        """Returns the control u(x, R) of (28), shape (p,).
 
-        Args:
-            state: x, shape (n,).
-            reference: R, shape (sum (mu_i + 1),), output-major.
-            measured_force: v, shape (m,); exactly where the law takes it.
-            integral: The integrals of the errors, shape (k,); zero if None.
-            parameters: Values of all parameters; the defaults if None.
+        The state has shape (n,), the reference shape (sum (mu_i + 1),), output-major;
+        measured_force, shape (m,), is given exactly where the law takes it; the integrals of the
+        errors, shape (k,), are zero and the parameters the defaults if None.
         """
         measured = [] if measured_force is None else [measured_force]
         if self.integral.outputs:
@@ -249,8 +241,7 @@ class TrackingLaw:
     ) -> FloatArray:
         """Returns (e_1, e_1', ..., e_p^(mu_p - 1)), shape (sum mu_i,): the initial value of (30).
 
-        The integral of an error stands before it, where the law has one. The arguments are those of
-        `control`.
+        The integral of an error stands before it; the arguments are those of `control`.
         """
         values, sigma = self.system.parameter_vector(parameters), self._integrals(integral)
         return self.coordinates_function(state, reference, sigma, values)[0]

@@ -14,25 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, numbers, show, vector
-from drake_dae.dae.equilibria import (
+from drake_dae.arrays import FloatArray, numbers, positive, show, vector
+from drake_dae.dae.pinned_motion import PinnedMotion, PinnedOutputs, PinnedSet, TimeFunction, follow
+from drake_dae.dae.stability import (
     AT_REST,
     ISOLATED,
     ComplexArray,
     Equilibria,
+    PeriodicMotions,
     Stability,
+    StabilityAlong,
     Verdict,
     judge,
     linearized_eigenvalues,
     without_dynamics,
-)
-from drake_dae.dae.floquet import PeriodicMotions, StabilityAlong
-from drake_dae.dae.pinned_motion import (
-    PinnedMotion,
-    PinnedOutputs,
-    PinnedSet,
-    TimeFunction,
-    follow,
 )
 from drake_dae.dae.structure import Structure, find_structure, structure_of
 from drake_dae.dae.system import DaeSystem
@@ -105,18 +100,17 @@ class ZeroDynamics:
 
         Without zero dynamics each state follows from the one before by Newton's method. Else
         x' = f* + h* u is integrated (Radau IIA of order 5) and projected after each step.
+        Why it ends before the last time is in the returned motion; see `PinnedMotion.ending`.
 
         Args:
             reference: The function t -> R(t); it is also evaluated between the times.
             times: Times in s, increasing, shape (k,).
             guess: A state near the first one; it decides which of several solutions is followed.
-            exogenous: The references of the exogenous signals, as for `make_closed_loop`; without
-                any they stand still.
+            exogenous: The references of the exogenous signals; without any they stand still.
 
         Raises:
             ReferenceSignalError: An exogenous signal is not smooth enough.
-            ModelError: A shape is wrong, or the times do not increase. Other failures are in
-                the returned motion; see `PinnedMotion.ending`.
+            ModelError: A shape is wrong, or the times do not increase.
         """
         grid = self._vector("times", times)
         if grid.size == 0 or np.any(np.diff(grid) <= 0.0):
@@ -154,13 +148,8 @@ class ZeroDynamics:
 
         The derivative of f* + h* u(x, R) maps the tangent space of Z(R) into itself; these are its
         eigenvalues there. In closed loop they stand beside the roots of (32). Those of a linear
-        system are its invariant zeros.
-
-        Args:
-            state: x, shape (n,).
-            outputs: z, shape (p,). If None, those of the state; outputs with mu_i = 0, which the
-                state does not determine, are those with the smallest x'. Give them if this
-                choice is not unique, as for a force that does not affect the motion.
+        system are its invariant zeros. `outputs` are as in `stability`: give them if the choice is
+        not unique, as for a force that does not affect the motion.
 
         Raises:
             ModelError: The state is not an equilibrium on N*.
@@ -189,8 +178,8 @@ class ZeroDynamics:
 
         Args:
             state: The initial guess of the equilibrium.
-            outputs: z at the equilibrium, shape (p,). If None those of the state, where outputs
-                with mu_i = 0, which depend on the control, are as brings it nearest to rest.
+            outputs: z at the equilibrium. If None those of the state, where outputs with mu_i = 0,
+                which depend on the control, are as brings it nearest to rest.
 
         Raises:
             InconsistentStateError: The state is not near N*.
@@ -217,20 +206,12 @@ class ZeroDynamics:
     ) -> FloatArray:
         """Returns the equilibria with the same outputs, found from guesses, shape (l, n).
 
-        Args:
-            guesses: States from which the search starts, shape (k, n); `structure.states` if None.
-            outputs: z, shape (p,). If None those of the first guess, as in `stability`.
-
-        Raises:
-            InconsistentStateError: The first guess is not near N*.
+        The guesses have shape (k, n), `structure.states` if None; if `outputs` are None, those of
+        the first guess are taken, which must be near N*.
         """
-        name = self.system.name
-        rows = numbers(f"{name}: guesses", self.structure.states if guesses is None else guesses)
-        if rows.ndim != 2 or not len(rows):
-            raise ModelError(
-                f"{name}: guesses must have shape (k, {self.system.num_states}), got {rows.shape}"
-            )
-        starts, p = [self._guess(row) for row in rows], self.system.parameter_vector(parameters)
+        p = self.system.parameter_vector(parameters)
+        rows = self.structure.states if guesses is None else numbers("guesses", guesses)
+        starts = [self._guess(row) for row in np.atleast_2d(rows)]
         pinned = self._resting(self.structure.manifold.project(starts[0], p), outputs, p)
         distinct = np.zeros((0, self.system.num_states))
         for start in starts:
@@ -264,19 +245,13 @@ class ZeroDynamics:
             period: The period of R(t) and of the exogenous signals, in s.
 
         Raises:
-            ModelError: A shape is wrong, a number is not finite, or the period is not one.
+            ModelError: The period is not one of the reference.
         """
-        if not (np.isfinite(period) and period > 0.0):
-            raise ModelError(f"{self.system.name}: period must be positive, got {period!r}")
+        period = positive(f"{self.system.name}: period", period)
         if self.dimension == 0:
             at_rest = without_dynamics(self.structure)
             return StabilityAlong(at_rest.verdict, at_rest.reason, period)
-        p, n = self.system.parameter_vector(parameters), self.system.num_states
-        if motion.states.shape != (motion.times.size, n):
-            raise ModelError(
-                f"{self.system.name}: the motion belongs to another system: its states have shape "
-                f"{motion.states.shape}, and not {(motion.times.size, n)}"
-            )
+        p = self.system.parameter_vector(parameters)
         at = partial(self._pinned.at_time, reference, self._moving(p, exogenous))
         return PeriodicMotions(at, self._equilibria.sizes, period).judge(motion)
 
@@ -287,17 +262,17 @@ class ZeroDynamics:
         if not exogenous:
             return lambda time: parameters
         structure, system = self.structure, self.system
-        residual, v = structure.manifold.residual_expression, structure.elimination.alpha
-        matrices = [structure.control_matrix, structure.elimination.constraint_matrix]
+        needed = [structure.manifold.residual_expression, structure.chain, structure.drift]
+        needed += [structure.control_matrix, structure.elimination.constraint_matrix]
+        needed += [structure.elimination.alpha]
         if system.control_metric is not None:
-            matrices += [system.control_metric, system.free_control]
-        degrees = system.exogenous.degrees(residual, structure.chain, structure.drift, v, *matrices)
-        size = sum(reference.size for reference in exogenous)
-        if size != len(degrees):
-            raise ModelError(
-                f"{system.name}: exogenous covers {size} signals, the system has {len(degrees)}"
-            )
+            needed += [system.control_metric, system.free_control]
+        degrees = system.exogenous.degrees(*needed)
         ends = np.cumsum([0, *(reference.size for reference in exogenous)])
+        if ends[-1] != len(degrees):
+            raise ModelError(
+                f"{system.name}: exogenous covers {ends[-1]} signals, the system has {len(degrees)}"
+            )
         signals = [
             reference.derivatives(degrees[first:last])
             for reference, (first, last) in zip(exogenous, pairwise(ends), strict=True)
@@ -315,8 +290,8 @@ class ZeroDynamics:
         return vector(f"{self.system.name}: {what}", np.ravel(value), size)
 
     def _guess(self, guess: ArrayLike | None) -> FloatArray:
-        state = self.system.nominal_state if guess is None else guess
-        return self._vector("state", state, self.system.num_states)
+        nominal = self.system.nominal_state
+        return self._vector("state", nominal if guess is None else guess, nominal.size)
 
     def _resting(
         self, state: FloatArray, outputs: ArrayLike | None, parameters: FloatArray

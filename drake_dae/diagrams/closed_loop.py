@@ -16,7 +16,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.traced_system import context_in
 from drake_dae.dae import Signal
 from drake_dae.diagrams.parts import encoder_seed as seed_of_encoders
-from drake_dae.diagrams.record import Record, computed_record, recorded_values
+from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems.control.contract import Controller, PhaseChange
 from drake_dae.systems.control.references import ReferenceGenerator
@@ -40,36 +40,26 @@ class ClosedLoop:
             `constraint_residual`, `controlled_output`, `control`, further signals of plant,
             controller and sensors such as `reference`, further ports of the controller such as
             `tracking_error`, and `link_state` of a robot.
-        plant, controller: The systems in it.
-        generator: The generator of references; None for a controller that plans them itself.
-        log: The log, one sample per step: all signals, stacked.
         signals: Names and units of each logged signal, in their order in the log.
-        scene_graph: The geometry of the robot, or None.
-        sensor: The sensor of the constraint force, or None.
-        noise: The source of the sensor's noise, or None.
-        exogenous: The generator of the exogenous signals for the law, or None.
-        plant_exogenous: The generator of the exogenous signals for the plant, or None.
-        encoders: The sensor of the state for the law, or None.
-        encoder_noise: The source of its noise, or None.
-        observer: The observer of the disturbance or the state, or None.
-        memory: A cache for rollouts.
+
+    The other attributes are its parts, or None where it has none.
     """
 
     diagram: Diagram
     plant: Plant
     controller: Controller
-    generator: ReferenceGenerator | None
-    log: VectorLogSink
+    generator: ReferenceGenerator | None  # None for a controller that plans its references itself
+    log: VectorLogSink  # one sample per step: all signals, stacked
     signals: Mapping[str, Sequence[Signal]]
     scene_graph: SceneGraph | None = None
     sensor: ForceSensor | None = None
-    noise: RandomSource | None = None
-    exogenous: ReferenceGenerator | None = None
+    noise: RandomSource | None = None  # of the sensor
+    exogenous: ReferenceGenerator | None = None  # for the law
     plant_exogenous: ReferenceGenerator | None = None
     encoders: StateSensor | None = None
     encoder_noise: RandomSource | None = None
     observer: StateEstimator | None = None
-    memory: dict[str, Any] = field(default_factory=dict, repr=False)
+    memory: dict[str, Any] = field(default_factory=dict, repr=False)  # of rollouts
 
     def __repr__(self) -> str:
         return f"ClosedLoop('{self.plant.dae.name}', logs {', '.join(self.signals)})"
@@ -78,10 +68,7 @@ class ClosedLoop:
     def reference(self) -> ReferenceGenerator:
         """The generator of references, or a ModelError."""
         if self.generator is None:
-            raise ModelError(
-                f"{self.controller.get_name()} plans its references itself, so that the loop "
-                "has no generator of references"
-            )
+            raise ModelError(f"{self.controller.get_name()} plans its references itself")
         return self.generator
 
     def set_seed(self, context: Context, seed: int, encoder_seed: int | None = None) -> None:
@@ -89,13 +76,11 @@ class ClosedLoop:
 
         Without it they are the same in every run of a loop. `context` is that of the diagram.
         """
-        if self.noise is not None:
-            self.noise.SetRandomContext(context_in(self.noise, context), RandomGenerator(seed))
-        if self.encoder_noise is not None and encoder_seed is not None:
-            # Another one than that of the force sensor, so that their noise is independent.
-            generator = RandomGenerator(seed_of_encoders(encoder_seed))
-            at_noise = context_in(self.encoder_noise, context)
-            self.encoder_noise.SetRandomContext(at_noise, generator)
+        # Other numbers for the encoders, so that both noises are independent.
+        of_encoders = None if encoder_seed is None else seed_of_encoders(encoder_seed)
+        for source, number in ((self.noise, seed), (self.encoder_noise, of_encoders)):
+            if source is not None and number is not None:
+                source.SetRandomContext(context_in(source, context), RandomGenerator(number))
 
     @checked(WiringError)
     def set_state(self, context: Context, state: ArrayLike) -> None:
@@ -116,11 +101,8 @@ class ClosedLoop:
         """The record of a run: the logged signals up to now, and signals computed from them.
 
         It includes `desired_output` r, `tracking_error` z - r (29), and further signals of the
-        controller; see its class. At a change of phase, values are those before it.
-
-        Args:
-            context: The diagram's context.
-            after: Only later samples than this time, in s; None for all.
+        controller. At a change of phase, values are those before it. With `after` only samples
+        later than this time, in s. `context` is that of the diagram.
         """
         context_in(self.plant, context)  # The log has no name.
         logged = Record.from_log(self.log, self.signals, context, after)
@@ -131,7 +113,7 @@ class ClosedLoop:
         """Adds the derived signals of the controller, such as `tracking_error`, to a record."""
         values = {name: recorded.values for name, recorded in record.signals.items()}
         derived = self.controller.derived(values)
-        added = {name: recorded_values(v, tuple(signals)) for name, (v, signals) in derived.items()}
+        added = {name: Recorded(v, signals) for name, (v, signals) in derived.items()}
         return computed_record(record.time, {**record.signals, **added})
 
     @checked(WiringError)
@@ -140,11 +122,10 @@ class ClosedLoop:
 
         They are those of the context after the run, and exogenous ones those of the record.
         """
-        plant = self.plant
-        own = plant.parameters(context_in(plant, context))
+        own = self.plant.parameters(context_in(self.plant, context))
         values = np.tile(own, (record.time.size, 1))
         if "exogenous" in record:
-            values[:, plant.exogenous_places] = record["exogenous"]
+            values[:, self.plant.exogenous_places] = record["exogenous"]
         return values
 
     @checked(WiringError)

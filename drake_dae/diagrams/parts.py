@@ -1,6 +1,6 @@
 """The parts of a closed loop besides plant, controller and references: settings and checks."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -12,8 +12,7 @@ from pydrake.systems.primitives import RandomSource
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import unknown_name
-from drake_dae.dae import DaeSystem
-from drake_dae.errors import ModelError, WiringError
+from drake_dae.errors import WiringError
 from drake_dae.references import ConstantReference, Reference
 from drake_dae.robots import velocities_are_rates
 from drake_dae.systems.control.commanded import CommandedReferences
@@ -70,88 +69,51 @@ class LoopSettings:
         return step if self.sampling is None else self.sampling.period
 
 
-AnySystem = TypeVar("AnySystem", bound=System)
-
-
-def add_block(builder: DiagramBuilder, block: AnySystem) -> AnySystem:
-    """Adds a block of the caller, or refuses one that belongs to another diagram."""
-    taken = WiringError(
-        f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
-    )
-    # Drake's AddSystem refuses a block of an unfinished diagram, but one of a built diagram only
-    # its Build, which would fail here without the name of the argument.
-    if block.GetSystemPathname() not in (f"::{block.get_name()}", "::_"):
-        raise taken
-    try:
-        return builder.AddSystem(block)
-    except RuntimeError:
-        raise taken from None
-
-
-def check_parts(
+def misfits(
     plant: Plant, controller: Controller, reference: ReferenceGenerator | None, parts: LoopSettings
-) -> None:
-    """Refuses parts that do not fit; Drake would name only the ports."""
-    if controller.HasInputPort("reference") is not (reference is not None):
-        needs = "plans its references itself: leave `reference` out"
-        if reference is None:
-            needs = (
-                "needs a ReferenceGenerator(references, controller.law.layout.reference_degrees)"
-            )
-        raise WiringError(f"{controller.get_name()} {needs}")
-    sensor, dae = parts.sensor, plant.dae
-    if sensor is not None and (size := sensor.GetInputPort("force").size()) != dae.num_constraints:
+) -> Iterator[str]:
+    """What does not fit together, for messages; Drake would name only the ports."""
+    sensor, encoders, observer, dae = parts.sensor, parts.encoders, parts.observer, plant.dae
+    measured, forces = controller.law.measured_force, dae.num_constraints
+    takes_references = controller.HasInputPort("reference")
+    if takes_references and reference is None:
+        remedy = "ReferenceGenerator(references, controller.law.layout.reference_degrees)"
+        yield f"{controller.get_name()} needs a {remedy}"
+    if reference is not None and not takes_references:
+        yield f"{controller.get_name()} plans its references itself: leave `reference` out"
+    if sensor is not None:
+        felt = sensor.GetInputPort("force").size()
         names = ", ".join(signal.name for signal in dae.constraint_input_signals) or "none"
-        raise WiringError(
-            f"the sensor measures {size} forces, the plant '{dae.name}' has "
-            f"{dae.num_constraints} ({names}); make it as ForceSensor({dae.num_constraints}, "
-            "...)"
-        )
-    if sensor is not None and not controller.HasInputPort("measured_force"):
-        raise WiringError("the law takes no measured force; make it with measured_force=True")
-
-
-# ----------------------------------------------------------------------------------------- sensors
-
-
-def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:
-    """The encoders of a robot, sampled with its law."""
-    if not period:
-        raise WiringError(
-            "encoders are read at samples, and this law acts continuously; give it a sampling"
-        )
-    if plant.model is None:
-        raise WiringError(
-            "encoders measure the positions of a robot: a RobotPlant or a ContactPlant"
-        )
-    links = plant.model.links
-    if encoders.velocity_bandwidth is not None and not velocities_are_rates(links):
-        raise WiringError(
-            "velocities from differences need q' = v, and this robot has a body with q' = N(q) v; "
-            "leave velocity_bandwidth out"
-        )
-    try:
-        return StateSensor(plant.dae.num_states, links.q.numel(), encoders, period)
-    except ModelError as error:
-        raise WiringError(str(error)) from None
-
-
-def encoder_seed(seed: int) -> int:
-    """The seed of the noise of encoders for a user's seed below 2^32, which a force sensor uses."""
-    return (seed + 2**31) % 2**32
-
-
-def add_noise(
-    builder: DiagramBuilder, sensor: System, period: float, name: str
-) -> RandomSource | None:
-    """Adds the source of a sensor's noise; None for a sensor without noise."""
-    if not sensor.HasInputPort("noise"):
-        return None
-    port = sensor.GetInputPort("noise")
-    noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, port.size(), period))
-    noise.set_name(name)
-    builder.Connect(noise.get_output_port(), port)
-    return noise
+        if felt != forces:
+            has = f"the plant '{dae.name}' has {forces} ({names})"
+            yield f"the sensor measures {felt} forces, {has}; take ForceSensor({forces}, ...)"
+        if not controller.HasInputPort("measured_force"):
+            yield "the law takes no measured force; make it with measured_force=True"
+    if (
+        parts.control_limits is not None
+        and (size := np.size(parts.control_limits)) != dae.num_controls
+    ):
+        yield f"control_limits has {size} entries, there are {dae.num_controls} controls"
+    if observer is None:
+        return
+    plans, estimates = (
+        controller.HasOutputPort("contact_reference"),
+        observer.state_rate is not None,
+    )
+    if reference is None and not plans:
+        yield "observer: it needs the references of a generator, and there is none"
+    if not parts.period(plant.time_step):
+        yield "an observer observes at samples: take a sampling=Sampling(period) or a ContactPlant"
+    remedy = "make the law with measured_force=True (in a scenario: sensors.force)"
+    if forces and not (measured or estimates):
+        or_state = "or give the observer a state_rate and the loop encoders"
+        yield f"an observer needs the measured force: {remedy}, {or_state}"
+    if plans and not measured:
+        yield f"the observer of a task needs the measured force, as its contact opens: {remedy}"
+    if estimates and encoders is None:
+        yield "a state_rate is for encoders, whose noise the observer filters: give the loop some"
+    if estimates and encoders is not None and encoders.velocity_bandwidth is not None:
+        yield "an observer with a state_rate takes positions alone: leave velocity_bandwidth out"
 
 
 def check_force_loop(
@@ -172,22 +134,18 @@ def check_force_loop(
             )
         return
     gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
-    if sensor is not None and gain >= sensor.largest_stable_gain():
+    diverges = f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample"
+    if sensor is not None and gain >= (most := sensor.largest_stable_gain()):
         raise WiringError(
-            f"the sampled force loop diverges: ||Gbar|| = {gain:.3g}, but each sample "
-            "multiplies the force error by -Gbar; it must stay below "
-            f"{sensor.largest_stable_gain():.3g}. Lower force_gain, or give the sensor a "
-            "time_constant well above its sample_period"
+            f"{diverges} multiplies the force error by -Gbar; it must stay below {most:.3g}. Lower "
+            "force_gain, or give the sensor a time_constant well above its sample_period"
         )
-    if sampling is not None and at_once:
-        radius = _radius(gain, sensor, sampling)
-        if radius >= 1.0:
-            raise WiringError(
-                f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample of "
-                f"{sampling.period:g} s multiplies the force error by {radius:.3g}. Lower "
-                "force_gain, or give the sensor a time_constant well above the sampling's period "
-                "and delay"
-            )
+    if sampling is not None and at_once and (radius := _radius(gain, sensor, sampling)) >= 1.0:
+        raise WiringError(
+            f"{diverges} of {sampling.period:g} s multiplies the force error by {radius:.3g}. "
+            "Lower force_gain, or give the sensor a time_constant well above the sampling's period "
+            "and delay"
+        )
 
 
 def _radius(gain: float, sensor: ForceSensor | None, sampling: Sampling) -> float:
@@ -208,56 +166,36 @@ def _radius(gain: float, sensor: ForceSensor | None, sampling: Sampling) -> floa
     return float(np.max(np.abs(np.roots(polynomial)), initial=0.0))
 
 
-def make_observer(
-    plant: Plant,
-    controller: Controller,
-    observing: Observing,
-    sampling: Sampling | None,
-    encoders: Encoders | None,
-) -> StateEstimator:
-    """The observer of a loop; `sampling` is that of the hold after the controller."""
-    law, step = controller.law, plant.time_step
-    period = step if sampling is None else sampling.period
+def make_observer(plant: Plant, controller: Controller, parts: LoopSettings) -> StateEstimator:
+    """The observer of a loop, whose settings are checked."""
+    assert parts.observer is not None
+    step, period, rest, late = plant.time_step, parts.period(plant.time_step), 0.0, 0.0
+    if parts.sampling is not None:
+        hold = hold_before(plant, parts.sampling)
+        rest, late = hold.rest, hold.delay + step
+    noise: tuple[ArrayLike, ArrayLike] = (0.0, 0.0)
+    if parts.encoders is not None and parts.observer.state_rate is not None:
+        noise = parts.encoders.position_deviation, parts.encoders.velocity_noise
+    # The previous control acts for a share of a sample.
+    lag, delay = min((rest + step) / period, 1.0), late + period / 2.0
+    return StateEstimator(
+        controller.law, parts.observer, period, lag, delay, step, *noise, plant.is_ideal
+    )
+
+
+def make_sensor(plant: Plant, encoders: Encoders, period: float) -> StateSensor:
+    """The encoders of a robot, sampled with its law."""
     if not period:
         raise WiringError(
-            "an observer observes at samples: give the loop a sampling=Sampling(period), or a "
-            "ContactPlant"
+            "encoders are read at samples, and this law acts continuously; give it a sampling"
         )
-    estimates = observing.state_rate is not None
-    if plant.dae.num_constraints and not (law.measured_force or estimates):
+    links = plant.robot("the encoders").links
+    if encoders.velocity_bandwidth is not None and not velocities_are_rates(links):
         raise WiringError(
-            "an observer needs the measured force: make the law with measured_force=True, or give "
-            "the observer a state_rate and the loop encoders, by which the model's force serves"
+            "velocities from differences need q' = v, and this robot has a body with q' = N(q) v; "
+            "leave velocity_bandwidth out"
         )
-    if controller.HasOutputPort("contact_reference") and not law.measured_force:
-        raise WiringError(
-            "the observer of a task needs the measured force, since the model's force is that of a "
-            "closed contact: make the law with measured_force=True (in a scenario: sensors.force: "
-            "{sample_period: ...})"
-        )
-    if estimates and encoders is None:
-        raise WiringError(
-            "a state_rate is for encoders, whose noise the observer filters: give the loop "
-            "encoders, or leave it out"
-        )
-    noise: tuple[ArrayLike, ArrayLike] = (0.0, 0.0)
-    if estimates and encoders is not None:
-        if encoders.velocity_bandwidth is not None:
-            raise WiringError(
-                "an observer that estimates the state takes positions and forms no differences: "
-                "leave the encoders' velocity_bandwidth out"
-            )
-        noise = encoders.position_deviation, encoders.velocity_noise
-    # The previous control acts for a share of a sample.
-    rest, late = (0.0, 0.0) if sampling is None else (sampling.rest, sampling.delay + step)
-    lag, delay = min((rest + step) / period, 1.0), late + period / 2.0
-    try:
-        return StateEstimator(law, observing, period, lag, delay, step, *noise, plant.is_ideal)
-    except ModelError as error:
-        raise WiringError(str(error)) from None
-
-
-# ------------------------------------------------------------------------------ control and inputs
+    return StateSensor(plant.dae.num_states, links.q.numel(), encoders, period)
 
 
 def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
@@ -272,25 +210,54 @@ def hold_before(plant: Plant, sampling: Sampling) -> Sampling:
     return replace(sampling, delay=max(sampling.delay - step, 0.0))
 
 
+AnySystem = TypeVar("AnySystem", bound=System)
+
+
+def add_block(builder: DiagramBuilder, block: AnySystem) -> AnySystem:
+    """Adds a block of the caller, or refuses one that belongs to another diagram."""
+    try:
+        # AddSystem refuses a block of an unfinished diagram, but one of a built diagram only Build.
+        if block.GetSystemPathname() in (f"::{block.get_name()}", "::_"):
+            return builder.AddSystem(block)
+    except RuntimeError:
+        pass
+    raise WiringError(
+        f"'{block.get_name()}' belongs to another diagram already; make a new one for this loop"
+    )
+
+
+def encoder_seed(seed: int) -> int:
+    """The seed of the noise of encoders for a user's seed below 2^32, which a force sensor uses."""
+    return (seed + 2**31) % 2**32
+
+
+def add_noise(
+    builder: DiagramBuilder, sensor: System, period: float, name: str
+) -> RandomSource | None:
+    """Adds the source of a sensor's noise; None for a sensor without noise."""
+    if not sensor.HasInputPort("noise"):
+        return None
+    port = sensor.GetInputPort("noise")
+    noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, port.size(), period))
+    noise.set_name(name)
+    builder.Connect(noise.get_output_port(), port)
+    return noise
+
+
 def add_exogenous(
-    builder: DiagramBuilder,
-    block: Plant | Controller,
-    dae: DaeSystem,
-    exogenous: Sequence[Reference],
-    depth: int,
+    builder: DiagramBuilder, block: Plant | Controller, exogenous: Sequence[Reference], depth: int
 ) -> ReferenceGenerator:
     """Adds the generator of a block's exogenous signals, commanded with that many lags if any."""
-    signals = dae.exogenous.signals
-    size = sum(reference.size for reference in exogenous)
+    dae = block.dae if isinstance(block, Plant) else block.law.system
+    signals, size = dae.exogenous.signals, sum(reference.size for reference in exogenous)
     if size != len(signals):
         raise WiringError(
-            f"the references of exogenous signals cover {size}, '{dae.name}' has "
-            f"{len(signals)}: {', '.join(signal.name for signal in signals) or 'none'}"
+            f"the references of exogenous signals cover {size}, '{dae.name}' has {len(signals)}: "
+            f"{', '.join(signal.name for signal in signals) or 'none'}"
         )
     if any(reference.parameters for reference in exogenous):
         raise WiringError(
-            "references of exogenous signals take no parameters: write their numbers into the "
-            "expressions"
+            "references of exogenous signals take no parameters: write numbers into the expressions"
         )
     degrees = block.exogenous_layout.degrees
     generator = ReferenceGenerator(exogenous, degrees)
@@ -306,25 +273,20 @@ def add_signals(
     builder: DiagramBuilder, controller: Controller, signals: Mapping[str, Reference | float]
 ) -> None:
     """Connects the signals for which a controller waits; without a source they become inputs."""
-    ports = [controller.get_input_port(i) for i in range(controller.num_input_ports())]
-    names = [port.get_name() for port in ports]
-    waited_for = [name.removeprefix(SIGNAL) for name in names if name.startswith(SIGNAL)]
-    for name in signals:
-        if name not in waited_for:
-            raise WiringError(
-                f"{unknown_name('signal', name, waited_for)}, for which a phase waits"
-            )
-    for name in waited_for:
-        port = controller.GetInputPort(SIGNAL + name)
-        if name not in signals:
-            builder.ExportInput(port, SIGNAL + name)
-            continue
-        signal = signals[name]
+    ports = {
+        name.removeprefix(SIGNAL): controller.GetInputPort(name)
+        for i in range(controller.num_input_ports())
+        if (name := controller.get_input_port(i).get_name()).startswith(SIGNAL)
+    }
+    for name, signal in signals.items():
         reference = signal if isinstance(signal, Reference) else ConstantReference(signal)
-        if reference.size != 1:
-            raise WiringError(
-                f"the signal '{name}' is one number, its reference has {reference.size}"
-            )
+        if name not in ports:
+            raise WiringError(f"{unknown_name('signal', name, ports)}, for which a phase waits")
+        if (size := reference.size) != 1:
+            raise WiringError(f"the signal '{name}' is one number, its reference has {size}")
         source = builder.AddSystem(ReferenceGenerator([reference], [0]))
         source.set_name(SIGNAL + name)
-        builder.Connect(source.GetOutputPort("reference"), port)
+        builder.Connect(source.GetOutputPort("reference"), ports[name])
+    for name, port in ports.items():
+        if name not in signals:
+            builder.ExportInput(port, SIGNAL + name)

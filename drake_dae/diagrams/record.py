@@ -1,7 +1,6 @@
 """The record of a run: every signal over time, with names and units."""
 
 import csv
-import html
 import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -25,26 +24,14 @@ from drake_dae.files import MOST_RECORDED, check_file, open_file
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """A vector signal over time.
+    """A vector signal over time, with the name and unit of each column."""
 
-    Attributes:
-        values: The values, one row per time, shape (k, size).
-        signals: The name and unit of each column.
-    """
-
-    values: FloatArray
+    values: FloatArray  # one row per time, shape (k, size)
     signals: tuple[Signal, ...]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", numbers("the values of a signal", self.values))
         object.__setattr__(self, "signals", tuple(self.signals))
-
-
-def recorded_values(values: FloatArray, signals: tuple[Signal, ...]) -> Recorded:
-    """A signal that the library itself has recorded, made without checks of the arguments."""
-    recorded = object.__new__(Recorded)
-    vars(recorded).update(values=values, signals=signals)
-    return recorded
 
 
 def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Record":
@@ -59,16 +46,14 @@ def computed_record(time: FloatArray, signals: Mapping[str, Recorded]) -> "Recor
 class Record:
     """All signals of a run at the ends of the integrator's steps.
 
-    The file `record.npz` can be read with NumPy: `numpy.load("record.npz")` has "time" in s, and
-    for each signal its values, shape (k, size), "<signal>.names" and "<signal>.units". "about"
-    is JSON with the versions of the software and, if the command made the run, the scenario with
-    all seeds.
+    NumPy reads its file: `numpy.load("record.npz")` has "time" in s, for each signal its values,
+    shape (k, size), "<signal>.names" and "<signal>.units", and "about" as JSON: the versions of the
+    software and, if the command made the run, the scenario with all seeds.
 
     Attributes:
         time: The times in s, shape (k,), strictly increasing.
         signals: Name of a signal -> its values.
-        about: The data to repeat the run: "versions" of the library, its dependencies and the
-            machine, which `save` adds; and "scenario", if it is known.
+        about: What repeats the run: the "versions", which `save` adds, and the "scenario" if known.
     """
 
     time: FloatArray
@@ -78,9 +63,8 @@ class Record:
     def __post_init__(self) -> None:
         time = numbers("the times of a record", self.time)
         object.__setattr__(self, "time", time)
-        lengths = {"time": time.shape[:1]} | {
-            name: np.shape(recorded.values)[:1] for name, recorded in self.signals.items()
-        }
+        values = {"time": time} | {name: r.values for name, r in self.signals.items()}
+        lengths = {name: np.shape(each)[:1] for name, each in values.items()}
         if time.ndim != 1 or len(set(lengths.values())) != 1:
             text = ", ".join(f"{name} {size}" for name, size in lengths.items())
             raise ModelError(
@@ -108,33 +92,16 @@ class Record:
         return name in self.signals
 
     def __repr__(self) -> str:
+        count, extent = self.time.size, "empty"
+        if count:
+            extent = f"{count} times from {self.time[0]:g} to {self.time[-1]:g} s"
         text = listed((f"{name} ({len(r.signals)})" for name, r in self.signals.items()), 20)
-        return f"Record({self._extent()}, signals={text})"
-
-    def _repr_html_(self) -> str:
-        """A table of the signals, as a notebook shows it."""
-        rows = "".join(
-            f"<tr><td>{html.escape(name)}</td><td>{len(recorded.signals)}</td>"
-            f"<td>{html.escape(listed(map(_label, recorded.signals))[1:-1])}</td></tr>"
-            for name, recorded in self.signals.items()
-        )
-        return (
-            f"<p>Record: {self._extent()}</p><table><thead><tr><th>signal</th><th>size</th>"
-            f"<th>names and units</th></tr></thead><tbody>{rows}</tbody></table>"
-        )
-
-    def _extent(self) -> str:
-        if not self.time.size:
-            return "empty"
-        return f"{self.time.size} times from {self.time[0]:g} to {self.time[-1]:g} s"
+        return f"Record({extent}, signals={text})"
 
     @checked(ModelError)
     def after(self, time: float | None) -> Self:
         """The part of the record later than a time in s; the whole record for None."""
-        if time is None:
-            return self
-        first = int(np.searchsorted(self.time, time, side="right"))
-        return self._rows(slice(first, None))
+        return self if time is None else self._rows(slice(_first_after(self.time, time), None))
 
     def while_finite(self) -> Self:
         """The record up to the first time at which some signal is not finite."""
@@ -142,11 +109,8 @@ class Record:
         return self if count == self.time.size else self._rows(slice(count))
 
     def _rows(self, rows: slice) -> Self:
-        signals = {
-            name: recorded_values(recorded.values[rows], recorded.signals)
-            for name, recorded in self.signals.items()
-        }
-        return type(self)(self.time[rows], signals, self.about)
+        cut = {name: Recorded(r.values[rows], r.signals) for name, r in self.signals.items()}
+        return type(self)(self.time[rows], cut, self.about)
 
     @classmethod
     def from_log(
@@ -156,40 +120,29 @@ class Record:
         context: Context,
         after: float | None = None,
     ) -> Self:
-        """Collects what a log has up to now.
-
-        Args:
-            log: The log of the signals, stacked.
-            signals: Name -> names and units of a signal, in the order of the log.
-            context: The context of the diagram.
-            after: Only later samples than this time are collected, in s; None for all.
+        """Collects what a log of signals, stacked in this order, has later than a time in s.
 
         Raises:
             ModelError: The log has another number of entries than the signals.
         """
-        samples, stops = log.FindLog(context), np.cumsum([len(each) for each in signals.values()])
-        size = int(stops[-1]) if stops.size else 0
-        if size != samples.get_input_size():
+        samples, stops = log.FindLog(context), np.cumsum([0, *map(len, signals.values())])
+        if (size := samples.get_input_size()) != stops[-1]:
             raise ModelError(
-                f"the signals of a log have {size} names together, but the log has "
-                f"{samples.get_input_size()} entries"
+                f"the signals of a log have {stops[-1]} names together, but the log has {size} "
+                "entries"
             )
         time = samples.sample_times()
-        first = 0 if after is None else int(np.searchsorted(time, after, side="right"))
+        first = 0 if after is None else _first_after(time, after)
         rows = samples.data()[:, first:].T
         # The last step of a failed run may have values that are not numbers.
         finite = _finite_rows(len(rows), [rows])
         time = time[first : first + finite]
         # The last sample of a time is the one after the projection.
         last = np.append(np.diff(time) > 0.0, True)[: time.size]
-        columns = np.split(rows[:finite][last], stops[:-1], axis=1)
-        return cls(
-            time[last],
-            {
-                name: recorded_values(np.ascontiguousarray(values), tuple(each))
-                for (name, each), values in zip(signals.items(), columns, strict=True)
-            },
-        )
+        columns = np.split(rows[:finite][last], stops[1:-1], axis=1)
+        pairs = zip(signals.items(), columns, strict=True)
+        found = {n: Recorded(np.ascontiguousarray(v), tuple(each)) for (n, each), v in pairs}
+        return cls(time[last], found)
 
     @checked(ModelError)
     def save(self, path: str | Path) -> None:
@@ -208,18 +161,16 @@ class Record:
 
         The columns are "time [s]" and "<signal>.<name> [<unit>]"; numbers have all their digits.
         """
-        pairs = [(name, signal) for name, r in self.signals.items() for signal in r.signals]
-        rows = np.column_stack([self.time, *(r.values for r in self.signals.values())])
         with open(path, "w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(["time [s]", *(f"{name}.{_label(signal)}" for name, signal in pairs)])
-            writer.writerows(rows.tolist())
+            writer.writerow(["time [s]", *map(".".join, self._labels())])
+            writer.writerows(np.column_stack([self.time, self._stacked()]).tolist())
 
     def to_dataframe(self) -> Any:
         """The record as a pandas DataFrame, one row for each time, "time [s]".
 
-        Its columns have two levels, the signal and the name with its unit:
-        `frame["control"]` are all controls, and `frame["control"].plot()` draws them.
+        Its columns have two levels, the signal and the name with its unit: `frame["control"]` are
+        all controls.
 
         Raises:
             ModelError: pandas is not installed.
@@ -228,12 +179,15 @@ class Record:
             pandas: Any = import_module("pandas")
         except ImportError:
             raise ModelError("to_dataframe needs pandas: pip install 'drake_dae[data]'") from None
-        pairs = [(name, _label(signal)) for name, r in self.signals.items() for signal in r.signals]
-        return pandas.DataFrame(
-            np.hstack([np.zeros((self.time.size, 0)), *(r.values for r in self.signals.values())]),
-            index=pandas.Index(self.time, name="time [s]"),
-            columns=pandas.MultiIndex.from_tuples(pairs, names=["signal", "name"]),
-        )
+        index = pandas.Index(self.time, name="time [s]")
+        columns = pandas.MultiIndex.from_tuples(self._labels(), names=["signal", "name"])
+        return pandas.DataFrame(self._stacked(), index=index, columns=columns)
+
+    def _labels(self) -> list[tuple[str, str]]:
+        return [(name, _label(each)) for name, r in self.signals.items() for each in r.signals]
+
+    def _stacked(self) -> FloatArray:
+        return np.hstack([np.zeros((self.time.size, 0)), *map(self.__getitem__, self.signals)])
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -246,8 +200,11 @@ class Record:
         try:
             with open_file(path) as rows:
                 file = np.load(rows, allow_pickle=False)
-                names = [key for key in file.files if f"{key}.names" in file.files]
-                signals = {name: _read(file, name) for name in names}
+                signals = {}
+                for name in (key for key in file.files if f"{key}.names" in file.files):
+                    labels = zip(file[f"{name}.names"], file[f"{name}.units"], strict=True)
+                    named = tuple(Signal(str(label), str(unit)) for label, unit in labels)
+                    signals[name] = Recorded(file[name], named)
                 about = json.loads(str(file["about"])) if "about" in file.files else {}
                 return cls(file["time"], signals, about)
         except Exception as error:  # zip files, NumPy's headers and JSON raise many kinds.
@@ -268,6 +225,10 @@ def versions() -> dict[str, str]:
     return versions_of
 
 
+def _first_after(times: FloatArray, time: float) -> int:
+    return int(np.searchsorted(times, time, side="right"))
+
+
 def _label(signal: Signal) -> str:
     return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
 
@@ -278,12 +239,6 @@ def _finite_rows(count: int, columns: Sequence[FloatArray]) -> int:
     for values in columns:
         finite &= np.isfinite(values).all(axis=1)
     return count if finite.all() else int(np.argmin(finite))
-
-
-def _read(file: Mapping[str, np.ndarray], name: str) -> Recorded:
-    labels = zip(file[f"{name}.names"], file[f"{name}.units"], strict=True)
-    signals = tuple(Signal(str(label), str(unit)) for label, unit in labels)
-    return Recorded(file[name], signals)
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from drake_dae.diagrams.parts import (
     add_noise,
     add_signals,
     check_force_loop,
-    check_parts,
     hold_before,
     make_observer,
     make_sensor,
+    misfits,
 )
 from drake_dae.errors import DrakeDaeError, WiringError
 from drake_dae.references import Reference, references_by_name
@@ -107,7 +107,8 @@ def wire_loop(
     """The closed loop of a plant and any controller, such as that of a task: `make_closed_loop`."""
     parts = settings or LoopSettings()
     controller.check_plant(plant)
-    check_parts(plant, controller, reference, parts)
+    for text in misfits(plant, controller, reference, parts):
+        raise WiringError(text)
     builder, period, dae = DiagramBuilder(), parts.period(plant.time_step), plant.dae
     named = Named()
 
@@ -118,12 +119,9 @@ def wire_loop(
     for block in (plant, reference, controller):
         if block is not None:
             add_block(builder, block)
-    goal = None
     if reference is not None:
         goal = reference.GetOutputPort("reference")
         connect(goal, controller, "reference")
-    elif controller.HasOutputPort("contact_reference"):
-        goal = controller.GetOutputPort("contact_reference")
 
     # The state goes to the controller, through encoders.
     state, encoders, encoder_noise = plant.GetOutputPort("state"), None, None
@@ -135,21 +133,15 @@ def wire_loop(
         named["estimated_state"] = (state, dae.state_signals)
 
     # Its control goes to the plant, held between samples and limited by drives.
-    control, sampling, limits = controller.GetOutputPort("control"), None, None
+    control, is_limited = controller.GetOutputPort("control"), None
     if parts.sampling is not None:
-        sampling = hold_before(plant, parts.sampling)
-        hold = builder.AddSystem(ControlHold(control.size(), sampling))
+        hold = builder.AddSystem(ControlHold(control.size(), hold_before(plant, parts.sampling)))
         connect(control, hold, "control")
         control = hold.get_output_port()
     if parts.control_limits is not None:
         limits = builder.AddSystem(ControlLimits(parts.control_limits))
-        if limits.limits.size != control.size():
-            raise WiringError(
-                f"control_limits has {limits.limits.size} entries, there are {control.size()} "
-                "controls"
-            )
         connect(control, limits, "control")
-        control = limits.GetOutputPort("control")
+        control, is_limited = (limits.GetOutputPort(name) for name in ("control", "is_limited"))
     connect(control, plant, "control")
 
     # Exogenous signals go to the plant, and to the law as known there. Commands pass as many lags
@@ -159,20 +151,17 @@ def wire_loop(
     depth = max(degrees, default=0) + 1 if parts.commanded else 0
     moves = parts.exogenous if parts.plant_exogenous is None else parts.plant_exogenous
     if moves:
-        moving = add_exogenous(builder, plant, dae, moves, depth)
+        moving = add_exogenous(builder, plant, moves, depth)
     if parts.exogenous:
-        system = controller.law.system
-        known = add_exogenous(builder, controller, system, parts.exogenous, depth)
+        known = add_exogenous(builder, controller, parts.exogenous, depth)
         builder.ExportOutput(known.get_output_port(), "known_exogenous")
 
-    # An observer estimates model errors for the law, and perhaps its state. Integrals are not
-    # updated while a contact is lost, or a drive is at its limit.
-    observer, is_limited = None, None if limits is None else limits.GetOutputPort("is_limited")
+    # An observer estimates model errors for the law, and perhaps its state.
+    observer = None
     if parts.observer is not None:
-        if goal is None:
-            raise WiringError("observer: it needs the references of a generator, and there is none")
-        observer = make_observer(plant, controller, parts.observer, sampling, parts.encoders)
-        builder.AddSystem(observer)
+        observer = builder.AddSystem(make_observer(plant, controller, parts))
+        if reference is None:
+            goal = controller.GetOutputPort("contact_reference")
         connect(state, observer, "measured_state")
         connect(control, observer, "control")
         connect(goal, observer, "reference")
@@ -186,6 +175,8 @@ def wire_loop(
             state = observer.GetOutputPort("estimated_state")
             named["estimated_state"] = (state, dae.state_signals)
     connect(state, controller, "estimated_state")
+
+    # Integrals are not updated while a contact is lost, or a drive is at its limit.
     if is_limited is not None and controller.HasInputPort("hold"):
         count = controller.GetInputPort("hold").size()
         if is_limited.size() != count:  # It holds all integrals.
@@ -194,7 +185,7 @@ def wire_loop(
             is_limited = spread.get_output_port()
         connect(is_limited, controller, "hold")
     add_signals(builder, controller, parts.signals)
-    if limits is not None:
+    if parts.control_limits is not None:
         named["excess"] = (limits.GetOutputPort("excess"), dae.control_signals)
 
     # The constraint force goes through its sensor to the blocks that measure it.
@@ -220,7 +211,7 @@ def wire_loop(
         signals = plant.exogenous_layout.reference_signals(dae.exogenous.signals)
         inputs["exogenous"] = (moving.get_output_port(), signals)
     inputs |= {name: (plant.GetOutputPort(name), s) for name, s in plant.port_signals.items()}
-    if reference is not None and goal is not None:
+    if reference is not None:
         inputs["reference"] = (goal, controller.law.reference_signals)
     named = {**inputs, "control": (control, dae.control_signals), **named}
     for block in (controller, observer, plant):

@@ -37,11 +37,8 @@ from drake_dae.scene.view import (
 _DESIRED = Rgba(0.1, 0.6, 0.2, 1.0)
 _CONE = Rgba(0.95, 0.6, 0.15, 0.35)
 
-_FOREVER = 2**31 - 1
-"""The number of repetitions of the animation."""
-
-_SIDES = 6
-"""The number of sides of the tube that draws a path; browsers draw lines one pixel wide."""
+_FOREVER = 2**31 - 1  # The number of repetitions of the animation.
+_SIDES = 6  # The number of sides of the tube that draws a path; browsers draw lines one pixel wide.
 
 _OVERLAY = Path(__file__).with_name("overlay.html")
 

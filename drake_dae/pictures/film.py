@@ -46,26 +46,20 @@ from drake_dae.scene.camera import view_angles
 from drake_dae.scene.surroundings import diagonal, floor_below, surroundings
 from drake_dae.scene.view import ARROW, PIECE
 
-_RATE, _STRIP = 10, 4
-"""Pictures per second of a .gif; pictures in a .png."""
-
+_RATE, _STRIP = 10, 4  # Pictures per second of a .gif; pictures in a .png.
+# The size of a picture, and the height at its top that is free for texts, in pixels.
 _WIDTH, _HEIGHT, _TOP = 480, 400, 56
-"""The size of a picture, and the height at its top that is free for texts, in pixels."""
-
-_ANGLE = 0.62
-"""The vertical angle of view, in rad."""
-
-_LEAST_FORCE = 0.02
-"""Forces below this fraction of the run's largest force have no arrow."""
+_ANGLE = 0.62  # The vertical angle of view, in rad.
+_LEAST_FORCE = 0.02  # Forces below this fraction of the run's largest force have no arrow.
 
 _ACTUAL, _DESIRED, _FORCE = "#1f3fbf", "#2e9d4a", "#d12b1f"
 
 _LIGHTS = (([0.8, 0.6, -0.7], 1.0), ([-0.8, 0.2, -0.3], 0.4))
+# (direction, intensity) of each light; the second set is for physically based materials.
 _PHYSICAL_LIGHTS = (
     *(([0.8, 0.6, -0.7], 2.2), ([-0.8, 0.2, -0.3], 1.0)),
     *(([0.3, -0.9, -0.2], 1.0), ([0.0, 0.0, -1.0], 1.0)),
 )
-"""(direction, intensity) of each light; the second set is for physically based materials."""
 
 
 @checked(ModelError)

@@ -17,12 +17,10 @@ from drake_dae.scene.camera import direction_of, framed
 from drake_dae.scene.surroundings import scene_points
 from drake_dae.scene.view import FRAME_RATE
 
+# A path on a surface is omitted if its extent is below this fraction of the largest coordinate of
+# all contact points.
 _STILL = 1e-4
-"""A path on a surface is omitted if its extent is below this fraction of the largest coordinate of
-all contact points."""
-
-_EXTENT_STATES = 60
-"""The approximate number of states from which the extent of a run is computed."""
+_EXTENT_STATES = 60  # The approximate number of states from which the extent of a run is computed.
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,22 +21,17 @@ from drake_dae.errors import ModelError
 from drake_dae.pictures.motion import ContactPath, contact_paths, follow
 from drake_dae.running.judgement import output_sizes
 
+# The signals in which an entry's name is looked up first; of these the first has the outputs.
 _FIRST = ("controlled_output", "constraint_force", "control", "state")
-"""The signals in which an entry's name is looked up first; of these the first has the outputs."""
-
+# Signals whose entries have the names of the outputs, and are drawn with these.
 _DERIVED = ("desired_output", "tracking_error", "predicted_error")
-"""Signals whose entries have the names of the outputs, and are drawn with these."""
-
-_PHASE = 0.11
-"""The width of a phase's name, which is vertical, in inches."""
-
+_PHASE = 0.11  # The width of a phase's name, which is vertical, in inches.
+# The style of predicted errors and desired paths, below the narrow actual ones.
 _WIDE: dict[str, Any] = {"linewidth": 4, "alpha": 0.4}
-"""The style of predicted errors and desired paths, below the narrow actual ones."""
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-Entry = tuple[str, int]
-"""The name of a record's signal, and the index of an entry in it."""
+Entry = tuple[str, int]  # The name of a record's signal, and the index of an entry in it.
 
 
 class ShownFigure(Figure):

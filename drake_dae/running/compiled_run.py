@@ -29,20 +29,13 @@ from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.errors import DrakeDaeError
 from drake_dae.systems.plants.contract import plants_in
 
-EVERY = 32
-"""The number of steps after which the context of the diagram as wired gets the results."""
-
+EVERY = 32  # The number of steps after which the context of the diagram as wired gets the results.
+# The least number of steps for which composing the diagram takes less time than it saves.
 WORTH = 500
-"""The least number of steps for which composing the diagram takes less time than it saves."""
-
-USUAL = 0.02
-"""The usual step with error control in s, of a robot that moves through some radians."""
-
-NEAR = 1e-6
-"""The distance of another state at which ports are compared, in any unit."""
-
+USUAL = 0.02  # The usual step with error control in s, of a robot that moves through some radians.
+NEAR = 1e-6  # The distance of another state at which ports are compared, in any unit.
+# The initialization of a Simulator that goes on from a context.
 NO_EVENTS = InitializeParams(suppress_initialization_events=True)
-"""The initialization of a Simulator that goes on from a context."""
 
 
 class CompiledRun:

@@ -10,8 +10,8 @@ from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray, show_state
 from drake_dae.blocks.failures import cannot_go_on, singular_configuration
-from drake_dae.dae import ConstraintStructure, EndCause, MotionEnd, Signal, Structure, ZeroDynamics
-from drake_dae.diagrams.record import computed_record, recorded_values
+from drake_dae.dae import ConstraintStructure, EndCause, Signal, Structure, ZeroDynamics
+from drake_dae.diagrams.record import Recorded, computed_record
 from drake_dae.errors import (
     DrakeDaeError,
     PainleveError,
@@ -26,43 +26,25 @@ from drake_dae.systems.control.references import ReferenceGenerator
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
-SINGULAR = 1e-3
-"""The smallest singular value of A(x) or B(x), rows and columns scaled by their usual sizes, below
-which it is why a run ends. Steps become too short long before it is zero."""
-
-NEARLY = 0.05
-"""The same, at the last state that is found along a path that ends."""
-
-OFF = 0.1
-"""The distance from N*, in units of the states, up to which A(x) is judged."""
-
-PART = 0.3
-"""An output takes part in a singular direction from this share of the largest part on."""
-
+# The smallest singular value of A(x) or B(x), rows and columns scaled by their usual sizes, below
+# which it is why a run ends: steps become too short long before it is zero. NEARLY is the same at
+# the last state that is found along a path that ends.
+SINGULAR, NEARLY = 1e-3, 0.05
+OFF = 0.1  # The distance from N*, in units of the states, up to which A(x) is judged.
+PART = 0.3  # The share of the largest part in a singular direction from which an output is named.
+# The times at which a reference is followed to the end of a run, and beyond it as a share.
 PLACES, BEYOND = 60, 0.02
-"""The times at which a reference is followed up to the end of a run, and beyond it as a share."""
-
-IMPLICIT = ("implicit", "velocity_implicit", "radau")
-"""How the names of schemes begin whose steps stiffness does not limit."""
-
+IMPLICIT = ("implicit", "velocity_implicit", "radau")  # Stiffness does not limit their steps.
+# The product of step and rate from which explicit steps may grow: of the third order on the
+# imaginary axis, where elastic joints are.
 LONGEST = 1.7
-"""The product of step and rate from which explicit steps may grow: of the third order on the
-imaginary axis, where elastic joints are."""
-
+# A run is looked at each so many steps; below this share of the longest mean they collapsed.
 EVERY, COLLAPSED = 32, 1e-5
-"""A run is looked at each so many steps; below this share of the longest mean they collapsed."""
-
+# The steps after which the pace of a run is looked at; as many as this in all are told of.
 PACE, MANY = 2000, 100_000
-"""The steps after which the pace of a run is looked at; as many as this in all are told of."""
 
-
-def blocks_of(system: System) -> Iterator[System]:
-    """The blocks of a diagram; a plant or a controller that is a diagram is one block."""
-    if isinstance(system, Diagram) and not isinstance(system, Plant | Controller):
-        for block in system.GetSystems():
-            yield from blocks_of(block)
-    else:
-        yield system
+IN_SIMULATE = "Choose integration_scheme 'radau3' or 'implicit_euler', or a slower model"
+IN_ROLLOUT = "Run it by simulate with integration_scheme 'radau3', or choose a slower model"
 
 
 def explained(
@@ -81,15 +63,26 @@ def explained(
     if state.size != plant.dae.num_states or not np.isfinite(state).all():
         state = np.zeros(0)
     if state.size and plant.is_ideal and isinstance(own, ConstraintStructure):
-        margin, _ = _margin(own, own.elimination.constraint_matrix, state)
-        if margin < SINGULAR and _is_near_manifold(own, state):
-            names = own.dependent_constraints(state, plant.dae.parameter_values)
+        # Farther off N* than a few steps lead A(x) says nothing.
+        manifold, values = own.manifold, plant.dae.parameter_values
+        usual = np.linalg.norm(manifold.gradients(own.states[0]) * own.scale, axis=1)
+        is_near = np.all(np.abs(manifold.residual(state, values)) <= OFF * usual)
+        if is_near and _margin(own, own.elimination.constraint_matrix, state)[0] < SINGULAR:
+            names = own.dependent_constraints(state, values)
             return singular_configuration(name, error.time, state, names)
     if structure is None:
         return error
     system, ending, limit = structure.system, None, SINGULAR
     if reference is not None and start is not None and not system.exogenous.moving:
-        ending = _end_of_path(structure, reference, start, error.time)
+        begin, lasted = start[0], error.time - start[0]
+        times = np.linspace(begin, error.time + BEYOND * lasted, PLACES)
+        try:
+            zero = ZeroDynamics(system, structure=structure)
+            ending = zero.motion(reference, times, start[1]).ending if lasted > 0.0 else None
+        except DrakeDaeError:
+            pass
+        told_of = (EndCause.OUT_OF_REACH, EndCause.SINGULAR, EndCause.NO_WAY_ON)
+        ending = ending if ending is not None and ending.cause in told_of else None
     if ending is not None and ending.state is not None and ending.matrix:
         # Singular where the path ends, and nearly so where the run did.
         state, limit = ending.state, NEARLY
@@ -103,11 +96,8 @@ def explained(
         constraints = tuple(s.name for s in system.constraint_output_signals if s.name in names)
     if not outputs and ending is None:
         return error
-    told = (
-        f"{name}: B(x) of Assumption (5) is singular at t = {error.time:.6g} s, state "
-        f"{show_state(state)}"
-    )
-    told = told if ending is None else str(ending)
+    told = f"{name}: B(x) of Assumption (5) is singular at t = {error.time:.6g} s, state "
+    told = f"{told}{show_state(state)}" if ending is None else str(ending)
     if outputs:
         held = f" beside {', '.join(constraints)}" if constraints else ""
         told = f"{told}. There the drives cannot steer {', '.join(outputs)}{held}"
@@ -137,13 +127,6 @@ def _dependent(
     return tuple(signals[rows[i]].name for i in np.flatnonzero(part > PART * part.max()))
 
 
-def _is_near_manifold(structure: ConstraintStructure, state: FloatArray) -> bool:
-    """Whether a state is no farther off N* than a few steps lead; elsewhere A(x) says nothing."""
-    manifold, values = structure.manifold, structure.system.parameter_values
-    usual = np.linalg.norm(manifold.gradients(structure.states[0]) * structure.scale, axis=1)
-    return bool(np.all(np.abs(manifold.residual(state, values)) <= OFF * usual))
-
-
 def _margin(
     structure: ConstraintStructure, matrix: ca.SX, state: FloatArray
 ) -> tuple[float, FloatArray]:
@@ -162,28 +145,17 @@ def _margin(
     return smallest_singular_value(value), np.abs(np.linalg.svd(value)[0][:, -1])
 
 
-def _end_of_path(
-    structure: Structure,
-    reference: Callable[[float], FloatArray],
-    start: tuple[float, FloatArray],
-    time: float,
-) -> MotionEnd | None:
-    """Where the reference leaves what the system can reach, or a singular state, up to a time."""
-    begin, guess = start
-    if not time > begin:
-        return None
-    times = np.linspace(begin, time + BEYOND * (time - begin), PLACES)
-    zero = ZeroDynamics(structure.system, structure=structure)
-    try:
-        ending = zero.motion(reference, times, guess).ending
-    except DrakeDaeError:
-        return None
-    told = (EndCause.OUT_OF_REACH, EndCause.SINGULAR, EndCause.NO_WAY_ON)
-    return ending if ending is not None and ending.cause in told else None
+def _blocks_of(system: System) -> Iterator[System]:
+    """The blocks of a diagram; a plant or a controller that is a diagram is one block."""
+    if isinstance(system, Diagram) and not isinstance(system, Plant | Controller):
+        for block in system.GetSystems():
+            yield from _blocks_of(block)
+    else:
+        yield system
 
 
+# Name of a signal -> its present values, with their names and units.
 _Rows = dict[str, tuple[FloatArray, Sequence[Signal]]]
-"""Name of a signal -> its present values, with their names and units."""
 
 
 class RunWatch:
@@ -196,28 +168,22 @@ class RunWatch:
         self, diagram: System, context: Context, config: SimulatorConfig, duration: float
     ) -> None:
         self._diagram, self._config, self._time = diagram, config, context.get_time()
-        self._duration = duration
-        blocks = list(blocks_of(diagram))
-        self._plants = [block for block in blocks if isinstance(block, Plant)]
+        self._duration, self._blocks = duration, list(_blocks_of(diagram))
+        self._plants = [block for block in self._blocks if isinstance(block, Plant)]
         self._plant = self._plants[0] if len(self._plants) == 1 else None
-        self._controller = next((b for b in blocks if isinstance(b, Controller)), None)
-        self._generator = next((b for b in blocks if isinstance(b, ReferenceGenerator)), None)
-        self._limits = next((b for b in blocks if isinstance(b, ControlLimits)), None)
+        self._controller = next((b for b in self._blocks if isinstance(b, Controller)), None)
         self._watches = dict[Plant, DivergenceWatch]()
         self._start = context.get_continuous_state_vector().CopyToVector()
         self._state = self._state_in(context)
-        self._steps, self._mark, self._is_warning = 0, self._time, config.use_error_control
+        self._steps, self._mark = 0, self._time
+        self._is_warning = config.use_error_control
         self._is_warning &= not config.integration_scheme.startswith(IMPLICIT)
         self._seen, self._longest, self._collapsed = self._time, 0.0, np.inf
 
-    def begin(self, context: Context) -> None:
-        """From here on divergence is an error."""
+    def begin(self, context: Context) -> bool:
+        """From here on divergence is an error; whether there is a plant that may diverge."""
         self._watches = {plant: DivergenceWatch(plant, self._duration) for plant in self._plants}
         self._check_divergence(context)
-
-    @property
-    def sees(self) -> bool:
-        """Whether there is a plant that may diverge."""
         return bool(self._watches)
 
     def look(self, context: Context, steps: int = 0, *, is_last: bool = False) -> None:
@@ -227,9 +193,24 @@ class RunWatch:
         if is_due or is_last:
             self._check_divergence(context, is_last=is_last)
         if is_due and self._plant is not None:
-            self._check_collapse(context, self._plant)
+            # Steps that become ever shorter end the run, if there is a cause.
+            time = context.get_time()
+            step = (time - self._seen) / EVERY
+            self._seen, self._longest = time, max(self._longest, step)
+            if step <= min(COLLAPSED * self._longest, 0.01 * self._collapsed):
+                self._collapsed = step
+                state = self._state_in(context)
+                short = SimulationError("steps have become too short", time, state)
+                if (found := self._explained(short, self._plant)) is not short:
+                    raise found
         if self._is_warning and before // PACE < self._steps // PACE:
-            self._check_pace(context)
+            time = context.get_time()
+            pace, self._mark = (time - self._mark) / PACE, time
+            left = self._time + self._duration - time
+            count = self._steps + left / pace if pace > 0.0 else 0.0
+            self._is_warning = count < MANY or not warn_if_stiff(
+                self._diagram, context, pace, count, IN_SIMULATE
+            )
 
     def explain(self, error: DrakeDaeError | RuntimeError, context: Context) -> DrakeDaeError:
         """The error with its cause.
@@ -269,110 +250,78 @@ class RunWatch:
 
     def _explained(self, error: SimulationError, plant: Plant) -> SimulationError:
         structure = None if self._controller is None else self._controller.law.structure
-        reference = None if self._generator is None else self._generator.reference
+        generator = next((b for b in self._blocks if isinstance(b, ReferenceGenerator)), None)
+        reference = None if generator is None else generator.reference
         return explained(error, plant, structure, reference, (self._time, self._state))
 
     def _without_wires(self, context: Context, error: RuntimeError) -> list[str]:
         """The input ports without a value that Drake misses."""
         return [
             f"'{port.get_name()}' of '{block.get_name()}'"
-            for block in blocks_of(self._diagram)
+            for block in self._blocks
             for port in map(block.get_input_port, range(block.num_input_ports()))
             if f"({port.get_name()})" in str(error)
             and not port.HasValue(block.GetMyContextFromRoot(context))
         ]
 
-    def _cut_off(self, context: Context) -> Sequence[str]:
+    def _cut_off(self, context: Context) -> list[str]:
         """The controls beyond the limits of the drives."""
-        if self._limits is None or self._plant is None:
+        limits = next((b for b in self._blocks if isinstance(b, ControlLimits)), None)
+        if limits is None or self._plant is None:
             return []
-        port, local = (
-            self._limits.GetOutputPort("excess"),
-            self._limits.GetMyContextFromRoot(context),
-        )
         try:
-            excess = port.Eval(local)
+            excess = limits.GetOutputPort("excess").Eval(limits.GetMyContextFromRoot(context))
         except (DrakeDaeError, RuntimeError):
             return []
-        signals = self._plant.dae.control_signals
-        return [signals[i].name for i in np.flatnonzero(excess)]
+        return [self._plant.dae.control_signals[i].name for i in np.flatnonzero(excess)]
 
     def _check_divergence(
         self, context: Context, *, is_last: bool = False, states_only: bool = False
     ) -> None:
         for plant, watch in self._watches.items():
-            local, dae = plant.GetMyContextFromRoot(context), plant.dae
-            rows: _Rows = {"state": (plant.state(local), dae.state_signals)}
+            rows: _Rows = {
+                "state": (plant.state(plant.GetMyContextFromRoot(context)), plant.dae.state_signals)
+            }
             if self._controller is not None and self._plant is not None and not states_only:
                 rows |= self._compared(context, plant, self._controller)
-            row = {name: recorded_values(one[None], tuple(of)) for name, (one, of) in rows.items()}
+            row = {name: Recorded(one[None], tuple(of)) for name, (one, of) in rows.items()}
             watch.look(computed_record(np.array([context.get_time()]), row), is_last=is_last)
 
     def _compared(self, context: Context, plant: Plant, controller: Controller) -> _Rows:
         """Present values of force, control and outputs, and what outputs are compared with."""
-        local, dae = plant.GetMyContextFromRoot(context), plant.dae
+        local, dae, given = (
+            plant.GetMyContextFromRoot(context),
+            plant.dae,
+            plant.GetInputPort("control"),
+        )
 
         def value(name: str) -> FloatArray:
-            if name == "state":
-                return plant.state(local)
-            if name != "control":
-                return np.array(plant.GetOutputPort(name).Eval(local))
-            port = plant.GetInputPort("control")
-            if port.HasValue(local):
-                return np.array(port.Eval(local))
-            # The plant evaluates the law itself.
-            if not self._diagram.HasOutputPort("control"):
-                return np.zeros(0)
-            return np.array(self._diagram.GetOutputPort("control").Eval(context))
+            return np.array(plant.GetOutputPort(name).Eval(local))
 
         rows: _Rows = {"constraint_force": (value("constraint_force"), dae.force_signals)}
-        if (control := value("control")).size:
-            rows["control"] = control, dae.control_signals
+        if given.HasValue(local):
+            rows["control"] = np.array(given.Eval(local)), dae.control_signals
         compared = controller.compared(controller.GetMyContextFromRoot(context), value)
         if compared is None:
             return rows | {"controlled_output": (value("controlled_output"), dae.output_signals)}
         outputs, wanted, signals = compared
-        return rows | {
-            "controlled_output": (outputs, signals),
-            "desired_output": (wanted, signals),
-        }
-
-    def _check_pace(self, context: Context) -> None:
-        """Warns of a stiff loop in a run of very many steps."""
-        time = context.get_time()
-        pace, self._mark = (time - self._mark) / PACE, time
-        count = self._steps + (self._time + self._duration - time) / pace if pace > 0.0 else 0.0
-        if count < MANY:
-            return
-        state = context.get_continuous_state_vector().CopyToVector()
-        rate = fastest_rate(self._diagram, context, time, state)
-        if rate * pace > 1.0:
-            self._is_warning = False
-            warnings.warn(stiffness(rate, pace, count, IN_SIMULATE), stacklevel=2)
-
-    def _check_collapse(self, context: Context, plant: Plant) -> None:
-        """Ends a run whose steps become ever shorter, if there is a cause."""
-        time = context.get_time()
-        step = (time - self._seen) / EVERY
-        self._seen, self._longest = time, max(self._longest, step)
-        if step > min(COLLAPSED * self._longest, 0.01 * self._collapsed):
-            return
-        self._collapsed = step
-        short = SimulationError("steps have become too short", time, self._state_in(context))
-        if (found := self._explained(short, plant)) is not short:
-            raise found
+        return rows | {"controlled_output": (outputs, signals), "desired_output": (wanted, signals)}
 
 
-IN_SIMULATE = "Choose integration_scheme 'radau3' or 'implicit_euler', or a slower model"
-IN_ROLLOUT = "Run it by simulate with integration_scheme 'radau3', or choose a slower model"
-
-
-def stiffness(rate: float, pace: float, count: float, remedy: str) -> str:
-    """The warning of a stiff loop, with its fastest rate in 1/s and the mean step in s."""
-    return (
+def warn_if_stiff(
+    diagram: System, context: Context, pace: float, count: float, remedy: str
+) -> bool:
+    """Warns where the fastest rate, not the accuracy, makes the mean step in s short."""
+    state = context.get_continuous_state_vector().CopyToVector()
+    rate = fastest_rate(diagram, context, context.get_time(), state)
+    if not rate * pace > 1.0:
+        return False
+    text = (
         f"the loop is stiff: its fastest rate of {rate:.3g} 1/s, not the accuracy, makes explicit "
         f"steps of {pace:.2g} s, of which this run needs about {count:.2g}. {remedy}"
     )
+    warnings.warn(text, stacklevel=4)
+    return True
 
 
 def too_long(
@@ -389,7 +338,7 @@ def too_long(
     begun, rates = context.Clone(), [fastest_rate(diagram, context, *start)]
     begun.SetTimeAndContinuousState(*start)
     # A law that cancels springs takes their rates out of the loop, and not out of its steps.
-    for plant in (block for block in blocks_of(diagram) if isinstance(block, Plant)):
+    for plant in (block for block in _blocks_of(diagram) if isinstance(block, Plant)):
         alone = plant.CreateDefaultContext()
         for i in range(plant.num_input_ports()):
             if size := plant.get_input_port(i).size():
@@ -413,15 +362,12 @@ def fastest_rate(diagram: System, context: Context, time: float, state: FloatArr
 
     By central differences, in a copy of the context; nan where the derivative has no value.
     """
-    copy = context.Clone()
-    columns = []
+    copy, columns = context.Clone(), []
     try:
         for i, step in enumerate(1e-6 * np.maximum(1.0, np.abs(state))):
             slopes = []
-            for sign in (1.0, -1.0):
-                moved = state.copy()
-                moved[i] += sign * step
-                copy.SetTimeAndContinuousState(time, moved)
+            for moved in (state[i] + step, state[i] - step):
+                copy.SetTimeAndContinuousState(time, np.r_[state[:i], moved, state[i + 1 :]])
                 slopes.append(diagram.EvalTimeDerivatives(copy).CopyToVector())
             columns.append((slopes[0] - slopes[1]) / (2.0 * step))
         return float(np.max(np.abs(np.linalg.eigvals(np.array(columns).T)), initial=0.0))

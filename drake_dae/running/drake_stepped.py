@@ -1,6 +1,7 @@
 """Rollouts of a plant that Drake steps; one block computes everything else at a sample."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from copy import copy
 
 import casadi as ca
 import numpy as np
@@ -8,10 +9,8 @@ from pydrake.systems.framework import Context, Diagram, System
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.block import stacked
-from drake_dae.blocks.failures import cannot_go_on
-from drake_dae.blocks.interpreted import LOOKED
-from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepSettings
-from drake_dae.errors import SimulationError
+from drake_dae.blocks.interpreted import run_interpreted
+from drake_dae.blocks.stepping import Run, RunProblem, StepSettings
 from drake_dae.running.rollout_program import CONTROL, RolloutProgram
 from drake_dae.trace.functions import TracedFunction
 
@@ -44,98 +43,76 @@ class DrakeSteps:
         self._part.ExecuteForcedEvents(self._local, False)
 
 
-def _function(program: RolloutProgram, what: str, values: Sequence[ca.SX]) -> TracedFunction:
-    functions = program.functions
-    held = stacked([each.symbol for each in program.block.held.values()])
-    inputs = {
-        "time": functions.columns[0],
-        "held": held,
-        "parameters": program.block.parameters,
-        "noise": program.block.inputs["noise"],
-    }
-    function = TracedFunction(what, inputs, {"value": stacked(values)}, compiled=program.choice)
-    assert function.function is not None  # Made here: several threads may share expressions.
-    return function
+Call = Callable[..., list[FloatArray]]
 
 
 def run_stepped(program: RolloutProgram, problem: RunProblem, settings: StepSettings) -> Run:
     """Makes a run of a diagram in which Drake steps one plant, and nothing has a continuous state.
 
-    At each sample, the control and the unrestricted updates are computed from the values before the
-    sample. Then Drake steps the plant, and the discrete updates follow.
+    Drake's step is one more of the unrestricted updates of its instant: it takes the control that
+    is computed, as these are, from the values before the sample.
     """
-    plant, rates, parameters = program.drake, program.functions.rates, problem.parameters
+    plant, functions = program.drake, copy(program.functions)
     assert plant is not None
     context = plant.CreateDefaultContext()
     context.SetTime(float(problem.times[0]))
     plant.set_state(context, problem.held[program.drake_state])
     plant.ExecuteInitializationEvents(context)
-    drake = DrakeSteps(plant, context)
-    reads = []
+    drake, reads = DrakeSteps(plant, context), []
     for name, (system, i) in program.stepped.items():
         local = plant.GetSubsystemContext(system, context)
         reads.append((program.held_places[name], system.get_output_port(i), local))
-    own = {place for part, *_ in reads for place in range(part.start, part.stop)}
-    bit = next(1 << i for i, rate in enumerate(rates) if own & {*rate.places})
-    groups = list(program.block.rates().values())
+    first = reads[0][0].start
+    number, rate = next((i, r) for i, r in enumerate(functions.rates) if first in r.places)
+    calls: dict[str, Call] = program.kept("stepped", lambda: _calls_of(program))
 
-    def make() -> tuple[TracedFunction, TracedFunction, list[TracedFunction]]:
-        held = program.block.held
-        updates = [
-            _function(program, "update", [held[name].next for name in names]) for names in groups
-        ]
-        row = _function(program, "row", [program.block.outputs[name] for name in program.signals])
-        return row, _function(program, "control", [program.block.outputs[CONTROL]]), updates
+    def update(
+        time: float, state: FloatArray, held: FloatArray, *given: FloatArray
+    ) -> list[FloatArray]:
+        (control,) = calls["control"](time, state, held, *given)
+        if not np.isfinite(control).all():
+            return [np.full(len(rate.places), np.nan)]
+        after = held.copy()
+        (after[rate.places],) = calls[f"update_{number}"](time, state, held, *given)
+        drake.step(time, control)
+        for part, port, local in reads:
+            after[part] = port.Eval(local)
+        return [after[rate.places]]
 
-    row, control, updates = program.kept("stepped", make)
-    kept = [[p for p in rate.places if p not in own] for rate in rates]
-    chosen = [[i for i, p in enumerate(rate.places) if p not in own] for rate in rates]
-    held, times, noise = problem.held.copy(), problem.times, problem.noise
-    rows, count, none = list[FloatArray](), 0, np.zeros(problem.noise.shape[1])
-    moment = float(times[0])
+    functions.buffered = {**functions.buffered, **calls, f"update_{number}": update}
+    return run_interpreted(functions, problem, settings)
 
-    def ended(ending: RunEnding, error: Exception | None = None) -> Run:
-        record = np.array(rows).reshape(-1, program.functions.row.numel_out(0))
-        state = np.zeros(program.functions.size)
-        return Run(record, ending, moment, state, held, count, error=error)
 
-    def update(is_unrestricted: bool) -> bool:
-        after, due = held.copy(), int(problem.due[count])
-        for i, rate in enumerate(rates):
-            if due >> i & 1 and rate.is_unrestricted == is_unrestricted and kept[i]:
-                (values,) = updates[i].evaluate(moment, held, parameters, noise[count])
-                if not updates[i].is_valid:
-                    return False
-                after[kept[i]] = values[chosen[i]]
-        held[:] = after
-        return True
+def _calls_of(program: RolloutProgram) -> dict[str, Call]:
+    """The functions of a program without a state as `StepFunctions.buffered`, in machine code."""
+    block, held = program.block, program.block.held
+    inputs = {
+        "time": program.functions.columns[0],
+        "held": stacked([each.symbol for each in held.values()]),
+        "parameters": block.parameters,
+        "noise": block.inputs["noise"],
+    }
+    none = np.zeros(block.inputs["noise"].numel())
 
-    while True:
-        at = float(problem.events[count]) if count < problem.events.size else np.inf
-        # A row has the values before the updates of its time.
-        while len(rows) < times.size and times[len(rows)] <= at:
-            moment = float(times[len(rows)])
-            (values,) = row.evaluate(moment, held, parameters, none)
-            if not row.is_valid:
-                return ended(RunEnding.INVALID)
-            rows.append(values.copy())
-        if len(rows) == times.size:
-            return ended(RunEnding.DONE)
-        if count % LOOKED == 0 and settings.look(lambda: np.array(rows)):
-            return ended(RunEnding.PAUSED)
-        moment = at
-        try:
-            (given,) = control.evaluate(moment, held, parameters, none)
-            is_valid = control.is_valid and update(True)
-            if is_valid and int(problem.due[count]) & bit:
-                drake.step(moment, given)
-                for part, port, local in reads:
-                    held[part] = port.Eval(local)
-            if not (is_valid and update(False)):
-                return ended(RunEnding.INVALID)
-        except SimulationError as failure:
-            return ended(RunEnding.STUCK, failure)
-        except RuntimeError as failure:  # Of Drake, as where its contact solver finds no step.
-            error = cannot_go_on(moment, held[program.drake_state], str(failure))
-            return ended(RunEnding.STUCK, error)
-        count += 1
+    def call(name: str, values: list[ca.SX]) -> Call:
+        function = TracedFunction(name, inputs, {"value": stacked(values)}, compiled=program.choice)
+        assert function.function is not None  # Made here: several threads may share expressions.
+
+        def called(
+            time: float,
+            state: FloatArray,
+            held: FloatArray,
+            parameters: FloatArray,
+            noise: FloatArray = none,
+        ) -> list[FloatArray]:
+            return list(function.evaluate(time, held, parameters, noise))
+
+        return called
+
+    groups = block.rates().values()
+    updates = [call("update", [held[name].next for name in names]) for names in groups]
+    return {
+        "row": call("row", [block.outputs[name] for name in program.signals]),
+        "control": call("control", [block.outputs[CONTROL]]),
+        **{f"update_{i}": update for i, update in enumerate(updates)},
+    }

@@ -10,11 +10,9 @@ from pydrake.systems.primitives import RandomSource
 
 from drake_dae.arrays import FloatArray
 
+# The seed of the noise of a run: one number, or name of a RandomSource -> number.
 Seed = int | Mapping[str, int]
-"""The seed of the noise of a run: one number, or name of a RandomSource -> number."""
-
-SAME = 1e-9
-"""Times that differ by less than this, in periods, are equal."""
+SAME = 1e-9  # Times that differ by less than this, in periods, are equal.
 
 
 def events_within(

@@ -7,11 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+# Ctrl-C, the signals of batch systems and `kill`, and a closed terminal.
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Ctrl-C, the signals of batch systems and `kill`, and a closed terminal."""
-
-AGAIN = 1e-3
-"""The delay in s after which a signal during a call of CasADi is raised again."""
+AGAIN = 1e-3  # The delay in s after which a signal during a call of CasADi is raised again.
 
 
 @contextmanager

@@ -3,31 +3,23 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import cast
 
 import numpy as np
 
-from drake_dae.analysis import LimitKind, SignalRange
+from drake_dae.analysis import LimitKind, SignalRange, count_of
 from drake_dae.arrays import FloatArray
 from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Record
 from drake_dae.systems.control.contract import PhaseChange
 
-SHARE = 0.01
-"""The default tolerance of an output, as a fraction of the range of references in its unit."""
-
-GRACE = 0.1
-"""The permitted delay relative to the prediction, as a fraction of the run."""
-
+SHARE = 0.01  # The default tolerance, as a share of the range of references in an output's unit.
+GRACE = 0.1  # The permitted delay relative to the prediction, as a share of the run.
+# The deviation from the prediction, as a share of an output's size, from which it needs a reason;
+# or so many times the accuracy of the integrator, if that is more.
 NEAR, STEPS = 1e-2, 10.0
-"""The deviation from the prediction, as a fraction of an output's size, from which it needs a
-reason; or so many times the accuracy of the integrator, if that is more."""
-
-ROUND_OFF = 1e-13
-"""A number below this, relative to the largest one in its unit, is round-off."""
-
-
-PURE = {"": 1.0, "rad": 1.0}
-"""The least size of numbers without a unit, and of angles."""
+ROUND_OFF = 1e-13  # A number below this, relative to the largest one in its unit, is round-off.
+PURE = {"": 1.0, "rad": 1.0}  # The least size of numbers without a unit, and of angles.
 
 
 class Outcome(StrEnum):
@@ -95,9 +87,8 @@ class Judgement:
     ranges: tuple[SignalRange, ...] = ()
 
     def __str__(self) -> str:
-        reason = "there is no output, and nothing is violated"
-        if self.findings:
-            reason = self.findings[0].text
+        reasons = [finding.text for finding in self.findings]
+        reason = reasons[0] if reasons else "there is no output, and nothing is violated"
         return f"{self.outcome.name}: {reason}"
 
 
@@ -119,7 +110,7 @@ def judge(
     from the time at which the predicted error is. If the predicted error exceeds the tolerance even
     at the end, and the run follows it, the run is undecided. With phases, the last one must end.
     """
-    outputs, found = qualities(record, predicted, tolerances or {}), list[RunFinding]()
+    outputs, found = _qualities(record, predicted, tolerances or {}), list[RunFinding]()
     if ended:
         end = float(record.time[-1])
         text = f"the run broke off at {end:.4g} s: {ended}"
@@ -161,9 +152,9 @@ def _of_task(changes: Sequence[PhaseChange]) -> Iterator[RunFinding]:
         text, failures = f"the task ended as chosen at {last.time:.4g} s: {last.reason}", []
     elif last.phase == "done":
         again = len(changes) - len({change.place for change in changes})
-        phases = f"{len(changes) - 1} phases" if len(changes) > 2 else "1 phase"
         repeated = f", {again} of them again" if again else ""
-        text = f"the task was done at {last.time:.4g} s, in {phases}{repeated}"
+        text = f"the task was done at {last.time:.4g} s, in {count_of(len(changes) - 1, 'phase')}"
+        text += repeated
     else:
         where = f"phase {last.place + 1}, {last.phase}, which began at {last.time:.4g} s"
         text, decides = f"the run ended during {where}", Outcome.UNDECIDED
@@ -177,22 +168,20 @@ def _of_contacts(record: Record, pushing: set[str]) -> Iterator[RunFinding]:
     """Lost contacts, which are problems in the second half of the run."""
     times, forces = record.time, record.signals["constraint_force"]
     for signal, values in zip(forces.signals, forces.values.T, strict=True):
-        if signal.name not in pushing:
+        touches, decides = np.flatnonzero(values > 0.0), cast(Outcome | None, Outcome.BAD)
+        if signal.name not in pushing or (not touches.size and (values.size < 2 or values.any())):
             continue
-        touches, first = np.flatnonzero(values > 0.0), float(times[0])
-        decides: Outcome | None = Outcome.BAD
-        text = f"{signal.name} is 0 all the time"
-        if touches.size:
+        if not touches.size:
+            text, first = f"{signal.name} is 0 all the time", times[0]
+        else:
             lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
             if not lost.size:
                 continue
-            first, lasted = float(times[lost[0]]), np.diff(times)[lost].sum()
+            first, lasted = times[lost[0]], np.diff(times)[lost].sum()
             text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
-            is_late = times[lost[-1]] >= 0.5 * (times[0] + times[-1])
-            decides = Outcome.BAD if is_late else None
-        elif values.size < 2 or values.any():
-            continue
-        yield RunFinding(FindingKind.CONTACT, text, decides, signal, 0.0, time=first)
+            if times[lost[-1]] < 0.5 * (times[0] + times[-1]):
+                decides = None
+        yield RunFinding(FindingKind.CONTACT, text, decides, signal, 0.0, time=float(first))
 
 
 def _of_outputs(
@@ -208,11 +197,10 @@ def _of_outputs(
     for i, output in enumerate(outputs):
         signal, since, tolerance = output.signal, output.within_since, output.tolerance
         name, unit = signal.name, f" {signal.unit}".rstrip()
-        wanted = within_since(times, predicted[:, i], tolerance)
+        wanted = _within_since(times, predicted[:, i], tolerance)
         due = None if wanted is None else max(middle, wanted + grace)
         if since is not None:
-            rest = late & (times >= since)
-            most = float(np.max(np.abs(error[rest, i]), initial=0.0))
+            most = float(np.max(np.abs(error[late & (times >= since), i]), initial=0.0))
             settled.append((most / tolerance, most, output))
             if due is None or since <= due:
                 continue
@@ -233,11 +221,10 @@ def _of_outputs(
         since = max(output.within_since or 0.0 for *_, output in settled)
         _, most, worst = max(settled, key=lambda each: each[0])
         which = "every output" if len(settled) == len(outputs) else "every other output"
-        unit = f" {worst.signal.unit}".rstrip()
         text = (
             f"{which} is at its reference from {since:.3g} s on; {worst.signal.name} comes closest "
-            f"to its tolerance, with {most:.2g} of {worst.tolerance:.2g}{unit}"
-        )
+            f"to its tolerance, with {most:.2g} of {worst.tolerance:.2g} {worst.signal.unit}"
+        ).rstrip()
         numbers = worst.signal, most, worst.tolerance, since
         yield RunFinding(FindingKind.REFERENCE, text, None, *numbers)
 
@@ -262,39 +249,32 @@ def _of_prediction(
         decides, text = Outcome.UNDECIDED, f"{text}, and nothing in the scenario explains it"
         finer = "smaller steps" if accuracy is None else f"an accuracy finer than {accuracy:g}"
         cause = f"if {finer} changes nothing, plant and law differ"
-    numbers = signal, largest, None, time
-    yield RunFinding(FindingKind.PREDICTION, text, decides, *numbers, cause)
+    yield RunFinding(FindingKind.PREDICTION, text, decides, signal, largest, None, time, cause)
 
 
-def qualities(
+def _qualities(
     record: Record, predicted: FloatArray, tolerances: Mapping[str, float]
 ) -> list[OutputQuality]:
     """How well each output of a record followed its reference; arguments as of `judge`."""
-    error, times = record["tracking_error"], record.time
+    error, times, found = record["tracking_error"], record.time, list[OutputQuality]()
     if not error.size:
-        return []
-    late, default, found = late_rms(times, error), SHARE * _ranges(record, predicted), []
-    for i, signal in enumerate(record.signals["tracking_error"].signals):
-        values, tolerance = error[:, i], tolerances.get(signal.name, float(default[i]))
+        return found
+    # By default 1 % of the range of the references in the unit of an output.
+    desired, signals = record["desired_output"], record.signals["tracking_error"].signals
+    sizes, late = output_sizes(record, predicted), late_rms(times, error)
+    spans, largest = np.ptp(desired, axis=0), np.abs(desired).max(axis=0)
+    spans[spans <= ROUND_OFF * sizes] = 0.0
+    units = np.array([signal.unit for signal in record.signals["desired_output"].signals])
+    for i, signal in enumerate(signals):
+        same = units == units[i]
+        size = spans[same].max() or largest[same].max() or sizes[i]
+        size = max(spans[same].max(), 1.0) if units[i] in PURE else size
+        values, tolerance = error[:, i], tolerances.get(signal.name, float(SHARE * size))
+        ends = float(values[0]), float(np.max(np.abs(values))), float(values[-1])
         off = float(np.max(np.abs(values - predicted[:, i])))
-        largest, since = float(np.max(np.abs(values))), within_since(times, values, tolerance)
-        ends = float(values[0]), largest, float(values[-1])
+        since = _within_since(times, values, tolerance)
         found.append(OutputQuality(signal, *ends, float(late[i]), off, tolerance, since))
     return found
-
-
-def _ranges(record: Record, predicted: FloatArray) -> FloatArray:
-    """The range of the references in the unit of each output, shape (p,), positive."""
-    desired, sizes = record["desired_output"], output_sizes(record, predicted)
-    ranges, largest = np.ptp(desired, axis=0), np.abs(desired).max(axis=0)
-    ranges[ranges <= ROUND_OFF * sizes] = 0.0
-    units = np.array([signal.unit for signal in record.signals["desired_output"].signals])
-    for i, unit in enumerate(units.tolist()):
-        span = ranges[units == unit].max()
-        sizes[i] = span or largest[units == unit].max() or sizes[i]
-        if unit in PURE:
-            sizes[i] = max(span, 1.0)
-    return sizes
 
 
 def unit_sizes(
@@ -331,7 +311,7 @@ def output_sizes(record: Record, predicted: FloatArray) -> FloatArray:
     return np.array([sizes[signal.unit] or 1.0 for signal in desired.signals])
 
 
-def within_since(times: FloatArray, error: FloatArray, tolerance: float) -> float | None:
+def _within_since(times: FloatArray, error: FloatArray, tolerance: float) -> float | None:
     """The first time from which |error| stays within the tolerance; None if the last is outside."""
     outside = np.flatnonzero(~(np.abs(error) <= tolerance))
     if not outside.size:

@@ -1,6 +1,5 @@
 """Rollouts: runs of a whole diagram without Drake's Simulator."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,7 +21,7 @@ from drake_dae.blocks.failures import (
 )
 from drake_dae.blocks.interpreted import run_interpreted
 from drake_dae.blocks.machine import run_alone, run_several
-from drake_dae.blocks.stepping import Run, RunEnding, RunProblem, StepSettings
+from drake_dae.blocks.stepping import Run, RunEnding, StepSettings
 from drake_dae.blocks.trials import PACE_STEPS
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.record import Record, RecordAfter
@@ -37,9 +36,8 @@ from drake_dae.running.diagnosis import (
     IN_ROLLOUT,
     MANY,
     explained,
-    fastest_rate,
-    stiffness,
     too_long,
+    warn_if_stiff,
 )
 from drake_dae.running.drake_stepped import run_stepped
 from drake_dae.running.events import Seed
@@ -48,17 +46,12 @@ from drake_dae.running.simulate import check_config
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.compiled import Compiled, check_choice
 
-SEVERAL = 8
-"""The least number of runs that go side by side; fewer give the bits of single runs."""
-
-STAGES_PER_SECOND = 500
-"""An estimate of the evaluations in a simulated second under error control."""
-
+SEVERAL = 8  # The least number of runs that go side by side; fewer give the bits of single runs.
+STAGES_PER_SECOND = 500  # An estimate of the evaluations in a simulated second under error control.
+# The time that runs side by side save per evaluation, over that of an interpreted one.
 FASTER = 0.05
-"""The time that runs side by side save per evaluation, over that of an interpreted one."""
-
+# The most failed runs of one call whose cause is looked for, which takes up to a second each.
 DIAGNOSED = 8
-"""The most failed runs of one call whose cause is looked for, which takes up to a second each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +206,7 @@ def run_loop(
             continue
         with MAKING:
             kind = program.shared if of else program
-            some = kind.reduced(problems, indices)
+            some = kind.some(problems, indices)
             settings = StepSettings.of(config, kind.functions, stop)
             calls: float = STAGES_PER_SECOND
             if settings.tableau is not None:
@@ -233,7 +226,12 @@ def run_loop(
             made = [run_interpreted(kind.functions, one, settings) for one in each]
         runs |= zip(indices.tolist(), made, strict=True)
     if settings.tableau is None:
-        _warn_of_stiffness(program, max(runs.values(), key=lambda run: run.steps), problems)
+        most = max(runs.values(), key=lambda run: run.steps)
+        if most.steps >= MANY and most.ending is RunEnding.DONE:  # A failure says its own cause.
+            context = program.context.Clone()
+            program.put(context, most.time, most.state, most.held, problems.run(0).parameters)
+            pace = (most.time - moments[0]) / most.steps
+            warn_if_stiff(program.diagram, context, pace, most.steps, IN_ROLLOUT)
     found = []
     for i in range(len(problems.state)):
         failure = None
@@ -244,21 +242,12 @@ def run_loop(
     return found
 
 
-def _warn_of_stiffness(program: RolloutProgram, run: Run, problems: RunProblem) -> None:
-    """Warns where the fastest rate, not the accuracy, has made the steps of a run short."""
-    if run.steps < MANY or run.ending is not RunEnding.DONE:  # A failure says its own cause.
-        return
-    context, pace = program.context.Clone(), (run.time - problems.times[0]) / run.steps
-    program.put(context, run.time, run.state, run.held, problems.run(0).parameters)
-    rate = fastest_rate(program.diagram, context, run.time, run.state[: program.num_states])
-    if rate * pace > 1.0:
-        warnings.warn(stiffness(rate, pace, run.steps, IN_ROLLOUT), stacklevel=4)
-
-
 def _failure(program: RolloutProgram, parameters: FloatArray, run: Run) -> SimulationError:
     """The exception that the same run raises in Drake's Simulator."""
     if isinstance(run.error, SimulationError):
         return run.error
+    if run.error is not None:
+        return cannot_go_on(run.time, run.held[program.drake_state], str(run.error))
     plants = [s for s in program.composed.states if isinstance(s, Plant)]
     state = run.state[program.composed.states[plants[0]] if plants else slice(program.num_states)]
     trial = None

@@ -6,7 +6,7 @@ from functools import lru_cache
 from itertools import pairwise, starmap
 from numbers import Integral
 from threading import RLock
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -18,16 +18,12 @@ from drake_dae.arguments import uncollected
 from drake_dae.arrays import FloatArray, brief, by_columns, numbers
 from drake_dae.blocks.block import Block, Held, stacked
 from drake_dae.blocks.compose import Leaves, compose, laws_of, leaf_inputs
-from drake_dae.blocks.machine import (
-    Stepper,
-    can_run_several,
-    load,
-)
+from drake_dae.blocks.machine import Stepper, can_run_several, load
 from drake_dae.blocks.stepping import RunProblem, StepFunctions
 from drake_dae.blocks.traced_system import TracedSystem, context_in
 from drake_dae.dae import Signal
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.diagrams.record import Record, computed_record, recorded_values
+from drake_dae.diagrams.record import Record, Recorded, computed_record
 from drake_dae.errors import ModelError
 from drake_dae.running.events import Seed, drawn_noise, events_within, source_period
 from drake_dae.systems.parameterized import ParameterizedSystem
@@ -35,23 +31,18 @@ from drake_dae.systems.plants.contract import plants_in
 from drake_dae.systems.plants.dae_plant import DaePlant
 from drake_dae.trace.compiled import Compiled, attempts
 
-CONTROL = "$control"
-"""The name of the control of Drake's plant among the outputs of the block."""
-
+CONTROL = "$control"  # The control of Drake's plant among the outputs of the block.
+# What is made once is made by one thread; expressions of CasADi cannot be shared by several.
 MAKING = RLock()
-"""What is made once is made by one thread; expressions of CasADi cannot be shared by several."""
 
 
 class RolloutProgram:
-    """A closed loop, or any diagram, as a rollout steps it.
+    """A closed loop, or any diagram, as one block, whose inputs became parameters and held values.
 
-    It is one block, whose inputs became parameters and held values.
-
-    Attributes:
-        functions: The functions of the block.
-        drake: The `ContactPlant` that Drake steps; None without one.
-        signals: The columns of a row: name of an output port -> names and units of its entries.
-        choice: Whether it becomes machine code by default.
+    `drake` is the `ContactPlant` that Drake steps, `signals` are the columns of a row, and `choice`
+    is whether it becomes machine code by default. The context has values of ports without a wire.
+    With `like`, each plant shares the parameters of its law, and `columns` are its parameters among
+    those of `like`.
     """
 
     @uncollected
@@ -61,28 +52,25 @@ class RolloutProgram:
         context: Context | None = None,
         like: "RolloutProgram | None" = None,
     ) -> None:
-        """`context` has values of ports without a wire; `like` has no shared parameters."""
-        signals = dict[str, Sequence[Signal]]()
-        self.choice: Compiled = "auto"
+        self.loop, self._made = loop, dict[str, Any]()
+        signals, self.choice = dict[str, Sequence[Signal]](), cast(Compiled, "auto")
         if isinstance(loop, ClosedLoop):
             self.diagram, self.name = loop.diagram, loop.plant.get_name()
             signals, self.choice = {**loop.signals}, loop.plant.dae.compiled
         else:
             self.diagram, self.name = loop, loop.get_name() or "the diagram"
-        diagram, self.loop = self.diagram, loop
-        self.context, leaves = context or diagram.CreateDefaultContext(), Leaves.of(diagram)
-        self.laws = laws_of(leaves.systems)
+        diagram, leaves = self.diagram, Leaves.of(self.diagram)
+        self.context, self.laws = context or diagram.CreateDefaultContext(), laws_of(leaves.systems)
         for plant, law in self.laws.items() if like is not None else ():
             own = plant.GetMyMutableContextFromRoot(self.context).get_mutable_numeric_parameter(0)
-            numbers = law.GetMyContextFromRoot(self.context).get_numeric_parameter(0)
-            own.SetFromVector(numbers.value()[: own.size()])
-        names = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]
-        names = [p for p in names if p.get_data_type() == PortDataType.kVectorValued]
-        self.ports = {p.get_name(): p for p in names if not signals or p.get_name() in signals}
+            values = law.GetMyContextFromRoot(self.context).get_numeric_parameter(0).value()
+            own.SetFromVector(values[: own.size()])
+        ports = [diagram.get_output_port(i) for i in range(diagram.num_output_ports())]
+        ports = [p for p in ports if p.get_data_type() == PortDataType.kVectorValued]
+        self.ports = {p.get_name(): p for p in ports if not signals or p.get_name() in signals}
         stepped = [plant for plant in plants_in(diagram) if plant.time_step]
-        self.is_discrete = bool(stepped)
+        self.is_discrete, wanted = bool(stepped), dict(self.ports)
         self.drake = next((p for p in stepped if not isinstance(p, TracedSystem)), None)
-        wanted = dict(self.ports)
         if self.drake is not None:
             (entry,) = leaf_inputs(self.drake, int(self.drake.GetInputPort("control").get_index()))
             system, index = leaves.sources[entry]
@@ -112,19 +100,20 @@ class RolloutProgram:
                 "the diagram has no output port with a vector, so that a rollout has nothing to "
                 "record: export one, builder.ExportOutput(system.GetOutputPort(...), name)"
             )
-        self.sources = {
-            name: source
-            for name, (source, _) in composed.cuts.items()
-            if isinstance(source, RandomSource)
-        }
-        sizes = [held.symbol.numel() for held in block.held.values()]
-        ends = np.cumsum([0, *sizes]).tolist()
+        cuts = {name: source for name, (source, _) in composed.cuts.items()}
+        self.sources = {n: source for n, source in cuts.items() if isinstance(source, RandomSource)}
+        ends = np.cumsum([0, *(held.symbol.numel() for held in block.held.values())]).tolist()
         self.held_places = dict(zip(block.held, starmap(slice, pairwise(ends)), strict=True))
         every = np.arange(ends[-1])
         drawn = [every[self.held_places[name]] for name in self.sources]
         self.drawn_places = np.concatenate([every[:0], *drawn])
         self.kept_places = np.setdiff1d(every, self.drawn_places)
-        self._like, self._made = like, dict[str, Any]()
+        self.columns: np.ndarray | None = None
+        if like is not None:
+            places, total = like.composed.parameters, like.functions.sizes[3]
+            own = [np.arange(total)[places[system]] for system in composed.parameters]
+            fixed = max((part.stop for part in places.values()), default=0)
+            self.columns = np.concatenate([*own, np.arange(fixed, total)])
 
     def kept(self, name: str, make: Callable[[], Any]) -> Any:
         with MAKING:
@@ -147,7 +136,7 @@ class RolloutProgram:
 
     def shares(self, parameters: FloatArray, count: int) -> np.ndarray:
         """In which runs each plant and its law have equal numbers, shape (count,)."""
-        parts, equal = self.composed.parameters, np.full(len(parameters), True)
+        parts, equal = self.composed.parameters, np.full(len(parameters), bool(self.laws))
         for plant, law in self.laws.items():
             if plant not in parts:
                 continue
@@ -158,28 +147,18 @@ class RolloutProgram:
                     plant.GetMyContextFromRoot(self.context)
                 )
             equal &= same.all(axis=1)
-        return np.broadcast_to(equal & bool(self.laws), count)
+        return np.broadcast_to(equal, count)
 
-    def reduced(self, problems: RunProblem, indices: np.ndarray) -> RunProblem:
+    def some(self, problems: RunProblem, indices: np.ndarray) -> RunProblem:
         """Some runs, with the parameters of this program."""
         parameters, noise = (
             table if len(table) == 1 else table[indices]
             for table in (problems.parameters, problems.noise)
         )
-        if self._like is not None:
-            whole = self._like.composed.parameters
-            own = [whole[system] for system in self.composed.parameters]
-            total = sum(part.stop - part.start for part in whole.values())
-            columns = [np.arange(part.start, part.stop) for part in own]
-            columns.append(np.arange(total, parameters.shape[1]))
-            parameters = np.ascontiguousarray(parameters[:, np.concatenate(columns)])
-        return replace(
-            problems,
-            state=problems.state[indices],
-            held=problems.held[indices],
-            parameters=parameters,
-            noise=noise,
-        )
+        if self.columns is not None:
+            parameters = np.ascontiguousarray(parameters[:, self.columns])
+        state, held = problems.state[indices], problems.held[indices]
+        return replace(problems, state=state, held=held, parameters=parameters, noise=noise)
 
     def machine_code(
         self, choice: Compiled, calls: float, is_all: bool, several: bool = False
@@ -375,7 +354,7 @@ class RolloutProgram:
         columns, stop, signals = by_columns(rows[first:]), 0, {}
         for name, entries in self.signals.items():
             start, stop = stop, stop + len(entries)
-            signals[name] = recorded_values(columns[start:stop].T, tuple(entries))
+            signals[name] = Recorded(columns[start:stop].T, tuple(entries))
         record = computed_record(times[first:], signals)
         return self.loop.with_errors(record) if isinstance(self.loop, ClosedLoop) else record
 

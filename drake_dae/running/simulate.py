@@ -28,8 +28,8 @@ from drake_dae.running.compiled_run import NO_EVENTS, CompiledRun
 from drake_dae.running.diagnosis import RunWatch
 from drake_dae.running.interruption import Interruption, ending_signals
 
+# The time between updates of the progress bar, or between lines without a terminal, in s.
 BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
-"""The time between updates of the progress bar, or between lines without a terminal, in s."""
 
 
 @dataclass(frozen=True)
@@ -127,10 +127,9 @@ def simulate(
         try:
             simulator.Initialize()
             began = time.perf_counter()
-            if not may_diverge:
-                watch.begin(context)
+            may_diverge = may_diverge or not watch.begin(context)
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
-            if progress or look is not None or watch.sees or ending.signal is not None:
+            if progress or look is not None or not may_diverge or ending.signal is not None:
                 simulator.set_monitor(monitor)
             if not config.target_realtime_rate:
                 composed = CompiledRun.of(diagram, context, config, duration)

@@ -16,26 +16,15 @@ from drake_dae.running.judgement import (
     FindingKind,
     Judgement,
     Outcome,
-    qualities,
+    late_rms,
     record_sizes,
 )
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.systems.control.contract import PhaseChange
 
-WIDTH = 100
-"""The width of a paragraph, in characters."""
-
-MOST = 6
-"""The most findings that the text tells beside the first."""
-
-EXPECTED = (FindingKind.PREDICTION,)
-"""What the table of outputs tells, unless it decides."""
-
-UNEXCITED = 0.5
-"""A parameter is not excited if its deviation stays above this share of that of its bounds."""
-
-SURE = 2.0
-"""The number of standard deviations from which an estimate differs from what the law believes."""
+WIDTH, MOST = 100, 6  # The width of a paragraph; the most findings that are told beside the first.
+UNEXCITED = 0.5  # A parameter is not excited whose deviation is above this share of that at first.
+SURE = 2.0  # The number of deviations from which an estimate differs from what the law believes.
 
 _FORCES = (LimitKind.FORCE, LimitKind.CONTROL, LimitKind.EFFORT)
 
@@ -106,27 +95,51 @@ class RunSummary:
     @property
     def text(self) -> str:
         """The summary in lines of at most 100 characters; the first says good, bad, undecided."""
-        head = [fill(str(self.judgement), WIDTH)]
-        told = [f for f in self.judgement.findings[1:] if f.kind not in EXPECTED or f.decides]
-        for finding in told[:MOST]:
-            head.append(fill(f"- {finding.text}", WIDTH, subsequent_indent="  "))
-        head += [f"- {len(told) - MOST} more, which --json names"] * (len(told) > MOST)
-        phases = [fill(str(change), WIDTH, subsequent_indent="  ") for change in self.changes]
-        parts = [head, self._outputs(), self._forces(), phases, [*self._ending()]]
-        return "\n\n".join("\n".join(part) for part in parts if part)
+        judgement, sizes = self.judgement, record_sizes(self.record)
 
-    def _outputs(self) -> list[str]:
-        sizes, rows = record_sizes(self.record), []
-        for q in self.judgement.outputs:
+        def number(value: float, signal: Signal, digits: int) -> str:
+            """A number, or 0 if it is round-off."""
+            size = sizes.get(signal.unit, 0.0)
+            return "0" if abs(value) <= ROUND_OFF * size else f"{value:.{digits}g}"
+
+        # Findings; the prediction is told below the table, unless it decides.
+        off = [f for f in judgement.findings if f.kind is FindingKind.PREDICTION and not f.decides]
+        told = [f for f in judgement.findings[1:] if f not in off]
+        head = [fill(str(judgement), WIDTH)]
+        head += [fill(f"- {f.text}", WIDTH, subsequent_indent="  ") for f in told[:MOST]]
+        head += [f"- {len(told) - MOST} more, which --json names"] * (len(told) > MOST)
+
+        # The table of outputs.
+        rows, outputs = list[list[str]](), list[str]()
+        for q in judgement.outputs:
             numbers = (q.start, 3), (q.largest, 3), (q.late_rms, 2), (q.off_prediction, 2)
-            texts = [_number(value, sizes[q.signal.unit], digits) for value, digits in numbers]
+            texts = [number(value, q.signal, digits) for value, digits in numbers]
             rows.append([q.signal.name, q.signal.unit or "1", *texts, f"{q.tolerance:.2g}"])
-        off = [f.cause for f in self.judgement.findings if f.kind is FindingKind.PREDICTION]
-        why = f"; as {off[0]}" if off and not self.missed else ""
-        note = "late: in the second half; off prediction: from the error that the gains alone leave"
-        head = ["tracking error", "unit", "start", "largest", "late rms", "off prediction"]
-        table = str(Table([*head, "tolerated"], rows, left=2)).splitlines()
-        return [*table, fill(f"{note}{why}", WIDTH, subsequent_indent="  ")] if rows else []
+        if rows:
+            names = ["tracking error", "unit", "start", "largest", "late rms", "off prediction"]
+            note = "late: in the second half; off prediction: from the error that the gains alone "
+            note += f"leave; as {off[0].cause}" if off and not self.missed else "leave"
+            table = str(Table([*names, "tolerated"], rows, left=2))
+            outputs = [table, fill(note, WIDTH, subsequent_indent="  ")]
+
+        # The table of forces and controls.
+        rows = []
+        for r in self._limited:
+            limit = "none" if r.high == np.inf else f"{r.high:.4g}"
+            limit, cut = "pushes only" if r.low == 0.0 else limit, self._cut_off(r)
+            texts = [number(value, r.signal, 4) for value in (r.least, r.largest)]
+            remark = f"cut off for {cut:.3g} s" if cut else ""
+            rows.append([r.signal.name, r.signal.unit or "1", *texts, limit, remark])
+        names = ["force or control", "unit", "least", "largest", "limit", ""]
+        forces = [str(Table(names, rows, left=2))] if rows else []
+
+        phases = [fill(str(change), WIDTH, subsequent_indent="  ") for change in self.changes]
+        ending = [
+            fill(f"{title:21}{text}", WIDTH, subsequent_indent=" " * 21)
+            for title, text in self._ending()
+        ]
+        parts = filter(None, [head, outputs, forces, phases, ending])
+        return "\n\n".join("\n".join(part) for part in parts)
 
     @property
     def _limited(self) -> list[SignalRange]:
@@ -134,57 +147,41 @@ class RunSummary:
         found = [r for r in self.judgement.ranges if r.kind in _FORCES]
         return sorted(found, key=lambda r: _FORCES.index(r.kind))
 
-    def _forces(self) -> list[str]:
-        sizes, rows = record_sizes(self.record), []
-        for r in self._limited:
-            size = sizes.get(r.signal.unit, 0.0)
-            texts = [_number(value, size, 4) for value in (r.least, r.largest)]
-            limit = "none" if r.high == np.inf else f"{r.high:.4g}"
-            limit = "pushes only" if r.low == 0.0 else limit
-            cut = self._cut_off(r)
-            remark = f"cut off for {cut:.3g} s" if cut else ""
-            rows.append([r.signal.name, r.signal.unit or "1", *texts, limit, remark])
-        head = ["force or control", "unit", "least", "largest", "limit", ""]
-        return str(Table(head, rows, left=2)).splitlines() if rows else []
-
     def _cut_off(self, limited: SignalRange) -> float:
         """The time for which a control was cut off at its limit, in s."""
         if limited.kind is not LimitKind.CONTROL or "excess" not in self.record:
             return 0.0
-        recorded, times = self.record.signals["excess"], self.record.time
+        times, excess = self.record.time, self.record["excess"]
         column = [s.name for s in self.record.signals["control"].signals].index(limited.signal.name)
         # A sample describes the step before it.
-        return float(np.diff(times, prepend=times[:1]) @ (recorded.values[:, column] != 0.0))
+        return float(np.diff(times, prepend=times[:1]) @ (excess[:, column] != 0.0))
 
-    def _ending(self) -> Iterator[str]:
+    def _ending(self) -> Iterator[tuple[str, str]]:
         """Residual and speed, what is identified and approximate, and what to look at next."""
         if any(self.residual.values()):
             numbers = ", ".join(f"{v:.2g} {unit}".rstrip() for unit, v in self.residual.items())
             # In compliant contact the state is not projected.
             when = "" if "contact_force" in self.record else ", before the projection of each step"
-            yield f"constraint residual  {numbers} at most{when}"
+            yield "constraint residual", f"{numbers} at most{when}"
         if (ran := self.statistics) is not None:
             yield (
-                f"simulated            {ran.simulated_time:g} s in {ran.steps} steps, "
-                f"{ran.wall_time:.2f} s, {ran.times_real_time:.1f} times real time"
+                "simulated",
+                f"{ran.simulated_time:g} s in {ran.steps} steps, {ran.wall_time:.2f} s, "
+                f"{ran.times_real_time:.1f} times real time",
             )
-        if nearest := _nearest(self.judgement.ranges):
-            yield f"nearest to a limit   {nearest}"
-        lines = [*_identified(self.record, self.named), *(("note", note) for note in self.notes)]
-        for title, text in (*lines, *(("look next", text) for text in self.look_next)):
-            yield fill(f"{title:21}{text}", WIDTH, subsequent_indent=" " * 21)
-
-
-def _nearest(ranges: Sequence[SignalRange]) -> str:
-    """The drive and the joint that come closest to their limits."""
-    texts = []
-    for kinds in ((LimitKind.CONTROL, LimitKind.EFFORT), (LimitKind.POSITION,)):
-        if limited := [r for r in ranges if r.kind in kinds and isfinite(r.share)]:
-            r = max(limited, key=lambda r: r.share)
-            left, unit = f"{r.share:.0%} of {r.high:.4g}", f" {r.signal.unit}".rstrip()
-            left = f"{r.room:.3g}{unit} left" if r.kind is LimitKind.POSITION else f"{left}{unit}"
-            texts.append(f"{r.signal.name}, {left}")
-    return "; ".join(texts)
+        nearest = list[str]()
+        for kinds in ((LimitKind.CONTROL, LimitKind.EFFORT), (LimitKind.POSITION,)):
+            ranges = [r for r in self.judgement.ranges if r.kind in kinds and isfinite(r.share)]
+            for r in sorted(ranges, key=lambda r: -r.share)[:1]:
+                unit = f" {r.signal.unit}".rstrip()
+                left = f"{r.share:.0%} of {r.high:.4g}{unit}"
+                left = f"{r.room:.3g}{unit} left" if r.kind is LimitKind.POSITION else left
+                nearest.append(f"{r.signal.name}, {left}")
+        if nearest:
+            yield "nearest to a limit", "; ".join(nearest)
+        yield from _identified(self.record, self.named)
+        yield from (("note", note) for note in self.notes)
+        yield from (("look next", text) for text in self.look_next)
 
 
 def _identified(record: Record, named: Collection[str]) -> Iterator[tuple[str, str]]:
@@ -223,11 +220,6 @@ def _named(values: dict[str, Any]) -> dict[str, Any]:
     return {k: None if is_number[k] and not isfinite(v) else v for k, v in values.items()}
 
 
-def _number(value: float, size: float, digits: int) -> str:
-    """A number, or 0 if it is round-off of numbers of a given size."""
-    return "0" if abs(value) <= ROUND_OFF * size else f"{value:.{digits}g}"
-
-
 def figures_of(record: Record, ranges: Sequence[SignalRange]) -> dict[str, float]:
     """The figures of a run: name with unit, such as "largest error of tool.z [m]" -> number.
 
@@ -237,28 +229,29 @@ def figures_of(record: Record, ranges: Sequence[SignalRange]) -> dict[str, float
     distance from its limits, which is negative beyond them; the largest constraint residual before
     a projection, and the time at which the record ends. An empty record has none.
     """
-    if not record.time.size:
-        return {}
     figures = dict[str, float]()
-    for q in qualities(record, np.zeros_like(record["tracking_error"]), {}):
-        figures[_label("largest error of", q.signal)] = q.largest
-        figures[_label("final error of", q.signal)] = q.final
-        figures[_label("late error of", q.signal)] = q.late_rms
-    for name, what in (("constraint_force", "least"), ("control", "")):
-        recorded = record.signals[name]
-        for signal, values in zip(recorded.signals, recorded.values.T, strict=True):
-            if what:
-                figures[_label(what, signal)] = float(np.min(values))
-            figures[_label("largest", signal)] = float(np.max(values if what else np.abs(values)))
+
+    def add(what: str, signal: Signal, value: float) -> None:
+        figures[f"{what} {signal.name}" + (f" [{signal.unit}]" if signal.unit else "")] = value
+
+    if not record.time.size:
+        return figures
+    errors = record.signals["tracking_error"]
+    late = late_rms(record.time, errors.values) if errors.signals else ()
+    for signal, column, rms in zip(errors.signals, errors.values.T, late, strict=True):
+        add("largest error of", signal, float(np.max(np.abs(column))))
+        add("final error of", signal, float(column[-1]))
+        add("late error of", signal, float(rms))
+    forces, controls = (record.signals[name] for name in ("constraint_force", "control"))
+    for signal, column in zip(forces.signals, forces.values.T, strict=True):
+        add("least", signal, float(np.min(column)))
+        add("largest", signal, float(np.max(column)))
+    for signal, column in zip(controls.signals, controls.values.T, strict=True):
+        add("largest", signal, float(np.max(np.abs(column))))
     for r in ranges:
         # The margin of a force that may not pull is its least value.
         if isfinite(r.room) and r.kind is not LimitKind.FORCE:
-            figures[_label("margin of", r.signal)] = r.room
-    residuals = np.abs(record["constraint_residual"])
-    figures["largest residual"] = float(np.max(residuals, initial=0.0))
+            add("margin of", r.signal, r.room)
+    figures["largest residual"] = float(np.abs(record["constraint_residual"]).max(initial=0.0))
     figures["end [s]"] = float(record.time[-1])
     return figures
-
-
-def _label(what: str, signal: Signal) -> str:
-    return f"{what} {signal.name} [{signal.unit}]" if signal.unit else f"{what} {signal.name}"

@@ -7,7 +7,6 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked, uncollected
@@ -29,7 +28,7 @@ from drake_dae.dae.beyond.disturbance import estimated_within
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.diagrams.parts import LoopSettings, hold_before, make_sensor
 from drake_dae.diagrams.wiring import make_closed_loop, wire_loop
-from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError, ScenarioError
+from drake_dae.errors import AssumptionError, ModelError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, ScaledForce
 from drake_dae.scenario.completion import Completed
@@ -47,11 +46,12 @@ from drake_dae.scenario.model import (
     scenario_structure,
 )
 from drake_dae.scenario.parts import Poles, ScenarioTask
-from drake_dae.scenario.robot_file.reading import RobotLinks, read_robot
+from drake_dae.scenario.robot_file.reading import RobotLinks
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import opening_contact, start_scenario
 from drake_dae.systems.control.contract import Controller, Derived
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.task.contacts import open_contact
 from drake_dae.systems.task.controller import TaskController
 
@@ -143,7 +143,10 @@ def build_completed(
     sensor, limits = None, None
     if sensors.force is not None:
         with at("sensors.force"):
-            sensor = sensors.force.sensor(model.dae.num_constraints)
+            force = sensors.force
+            errors = force.bias, force.noise_deviation, force.drift
+            lags = force.time_constant, force.sample_period
+            sensor = ForceSensor(model.dae.num_constraints, *lags, *errors)
     if scenario.saturation:
         limits = model.control_limits
         if not np.any(np.isfinite(limits)):
@@ -184,16 +187,10 @@ def build_completed(
     return Completed(scenario, (*completed.notes, *chosen.notes)), loop
 
 
+@at("start.positions")
 def make_plant(scenario: Scenario, model: RobotModel, structure: ConstraintStructure) -> Plant:
-    """The plant of a scenario, for a robot with payloads if the plant does not add them itself."""
-
-    def add(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-        read_robot(scenario.robot, plant, scene_graph, scenario.plant.payloads)
-
-    try:
-        return scenario.plant.plant(model, structure, add)
-    except InconsistentStateError as error:  # Its default state is projected.
-        raise ScenarioError(("start.positions", str(error))) from error
+    """The plant of a scenario; its default state is projected near the start."""
+    return scenario.plant.plant(model, structure, scenario.robot)
 
 
 def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) -> TrackingLaw:
@@ -215,11 +212,12 @@ def tracking_law(scenario: Scenario, model: RobotModel, structure: Structure) ->
             text = "not beside exogenous signals, whose port it feeds"
             raise ScenarioError(("estimator", text))
         known, names = [p.name for p in model.dae.parameters], estimator.parameters or []
-        for name in names:
-            if name not in known:
-                text = f"parameters: {unknown_name('parameter', name, known)}"
-                hint = "; give the constraint friction: 0.0 if it is unknown"
-                raise ScenarioError(("estimator", text + hint * name.endswith(".friction")))
+        for name in {*names} - {*known}:
+            hint = "; give the constraint friction: 0.0 if it is unknown" * name.endswith(
+                ".friction"
+            )
+            text = f"parameters: {unknown_name('parameter', name, known)}{hint}"
+            raise ScenarioError(("estimator", text))
         with at("estimator.parameters"):
             velocities = [signal.name for signal in model.links.velocity_signals]
             observed = with_disturbance(model.dae, velocities, names)
@@ -280,7 +278,7 @@ def _task_controller(
             free_system, gains.design(), structure=structure, latency=law.latency
         )
     # The noise of the sum over the points.
-    noise = float(np.max(scenario.sensors.force_noise)) * len(points) ** 0.5
+    noise = scenario.sensors.force_noise * len(points) ** 0.5
     return TaskController(task.make(noise), law, free_law, sample_period=period or 1e-3)
 
 
@@ -325,7 +323,7 @@ class _NoController(TracedSystem, Controller):
 class _NoLaw:
     """Has of a law what records ask for, its system; all else of a law is an error."""
 
-    structure = None
+    structure = measured_force = None
 
     def __init__(self, system: DaeSystem) -> None:
         self.system = system

@@ -17,7 +17,6 @@ from types import NoneType, UnionType
 from typing import (
     Annotated,
     Any,
-    Generic,
     Literal,
     NotRequired,
     TypeVar,
@@ -29,12 +28,16 @@ from typing import (
 
 import numpy as np
 import pydantic
-from pydantic_core import ErrorDetails, core_schema
+from casadi import SX
+from numpy.typing import ArrayLike
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError, core_schema
 from typing_extensions import TypedDict
 
 from drake_dae.arrays import brief
 from drake_dae.errors import DrakeDaeError, ScenarioError
+from drake_dae.robots import Pair, Vector
 from drake_dae.scenario.typed_yaml import TAG, first_name
+from drake_dae.trace.compiled import Compiled
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -67,11 +70,20 @@ class Family:
     members: Mapping[str, type]
     plain: type | None = None
 
-    def tag_of(self, data: Any) -> str | None:
+    def tag_of(self, data: Any) -> str:
+        """The tag of data, "!" of plain data, and what is no tag of any other."""
         if isinstance(data, dict):
             return str(data.get(TAG, next(iter(self.members))))
         kinds = (int, float) if self.plain is float else (self.plain or (),)
-        return "plain" if isinstance(data, kinds) and not isinstance(data, bool) else None
+        return "!" if isinstance(data, kinds) and not isinstance(data, bool) else ""
+
+    def check(self, data: Any) -> Any:
+        """Refuses what has no tag of a member and is not plain."""
+        if self.tag_of(data) not in (*self.members, "!"):
+            also = {str: "text, or ", float: "a number, or "}.get(self.plain or list, "")
+            tags = ", ".join(self.members)
+            raise ValueError(f"expected {also}one of {tags}, got {_shown(data)}")
+        return data
 
 
 @dataclass(frozen=True)
@@ -95,7 +107,7 @@ class Expected:
         self, source: Any, handler: pydantic.GetCoreSchemaHandler
     ) -> core_schema.CoreSchema:
         more = pydantic.AfterValidator(self.convert), pydantic.WrapValidator(self._read)
-        return handler.generate_schema(_annotated(self.hint, *more))
+        return handler.generate_schema(Annotated[self.hint, *more])
 
     def _read(self, value: Any, inner: pydantic.ValidatorFunctionWrapHandler) -> Any:
         try:
@@ -122,22 +134,27 @@ def in_folder(name: str, info: pydantic.ValidationInfo) -> str:
 
 
 _TWO, _THREE = (pydantic.Field(min_length=size, max_length=size) for size in (2, 3))
-PAIR = Expected("2 numbers", Annotated[list[float], _TWO], tuple)
-TRIPLE = Expected("3 numbers", Annotated[list[float], _THREE], tuple)
-NUMBERS = Expected(
-    "a number, a list of numbers, or a matrix as a list of rows of one length",
-    float | list[float] | list[list[float]],
-    _rectangular,
-)
-NUMBER_OR_LIST = Expected("a number or a list of numbers", float | list[float])
+FILE = Expected("the name of a file", str, in_folder)
 INTERVAL = Expected(
     "a lowest and a highest value, each a number or a list of numbers",
     Annotated[list[float | list[float]], _TWO],
     tuple,
 )
-COMPILED = Expected("true, false or auto", bool | Literal["auto"])
-FILE = Expected("the name of a file", str, in_folder)
-NAMES = Expected("a name or a list of names", str | list[str])
+VALUES: dict[Any, Any] = {
+    Callable[..., SX] | str: str,
+    str | Path: FILE,
+    str | Sequence[str]: Expected("a name or a list of names", str | list[str]),
+    Compiled: Expected("true, false or auto", bool | Literal["auto"]),
+    float | list[float]: Expected("a number or a list of numbers", float | list[float]),
+    ArrayLike: Expected(
+        "a number, a list of numbers, or a matrix as a list of rows of one length",
+        float | list[float] | list[list[float]],
+        _rectangular,
+    ),
+    Vector: Expected("3 numbers", Annotated[list[float], _THREE], tuple),
+    Pair: Expected("2 numbers", Annotated[list[float], _TWO], tuple),
+}
+"""What stands in data for the types of values in annotations."""
 
 
 def _shown(data: Any) -> str:
@@ -152,6 +169,7 @@ _WORDS = {
     "float_type": "a number",
     "finite_number": "a finite number",
     "greater_than": "a positive number",
+    "greater_than_equal": "0 or more",
     "int_type": "a whole number",
     "bool_type": "true or false",
     "string_type": "text",
@@ -161,25 +179,54 @@ _WORDS = {
 """What is expected, by pydantic's name of the problem."""
 
 
-class Reader(Generic[T]):
+def _told(error: ErrorDetails, tag: str, names: Sequence[str], no_tag: str) -> InitErrorDetails:
+    """A problem inside a form in our words; its context has the wrong key, if it is about one."""
+    kind, loc, value, wrong = error["type"], error["loc"], error["input"], ""
+    keys = f"keys: {', '.join(names) or 'none'}"
+    if kind == "told":
+        text, wrong = error["ctx"]["text"], error["ctx"]["wrong"]
+    elif kind == "value_error":
+        text = str(error["ctx"]["error"])
+    elif kind == "missing":
+        loc, text = loc[:-1], f"{tag}needs the key '{loc[-1]}'; {keys}{no_tag}"
+    elif kind == "extra_forbidden" and loc[-1] == TAG:
+        loc, text = loc[:-1], f"takes no tag, got {value}"
+    elif kind == "extra_forbidden":
+        loc, wrong = loc[:-1], str(loc[-1])
+        near = get_close_matches(wrong, names, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"{keys}{no_tag}"
+        text = f"{tag}has no key '{wrong}'; {hint}"
+    else:
+        words = _WORDS.get(kind, error["msg"].removeprefix("Input should be "))
+        text = f"expected {words if loc else keys}, got {_shown(value)}"
+        if kind == "string_type" and isinstance(value, (bool, int, float)):
+            text += "; text that reads as something else goes in quotes"
+    return {"type": _problem(text, wrong), "loc": loc, "input": value}
+
+
+def _problem(text: str, wrong: str = "") -> PydanticCustomError:
+    """A problem that is told, with the wrong key if it is about one."""
+    return PydanticCustomError("told", "{text}", {"text": text, "wrong": wrong})
+
+
+class Reader:
     """Makes a dataclass of plain data, and plain data of it.
 
-    `families` and `values` stand in data for types in annotations; `keys` are those of classes that
-    are no dataclasses, or have other defaults.
+    `families` stand in data for types in annotations, as `VALUES` do; `keys` are those of classes
+    that are no dataclasses, or have other defaults.
     """
 
     def __init__(
         self,
-        form: type[T],
+        form: type,
         families: Mapping[Any, Family],
-        values: Mapping[Any, Any],
         keys: Mapping[type, Mapping[str, Key]],
     ) -> None:
-        self._form, self._families, self._values, self._keys = form, families, values, keys
-        self._types = dict[Any, Any]()
+        self._families, self._keys = families, keys
+        self._types, self._free = dict[Any, Any](), set[str]()  # Keys whose names are free.
         self._tags = {c: t for f in families.values() for t, c in f.members.items()}
         self.tags = list(dict.fromkeys(self._tags.values()))
-        self._adapter: pydantic.TypeAdapter[T] = pydantic.TypeAdapter(self._type(form))
+        self._adapter = pydantic.TypeAdapter[Any](self._type(form))
 
     @cached_property
     def schema(self) -> dict[str, Any]:
@@ -193,13 +240,17 @@ class Reader(Generic[T]):
         data: Any,
         folder: Path | None = None,
         place_of: Callable[[str], str] = lambda key: "",
-    ) -> T:
+    ) -> Any:
         """Makes the dataclass; files are in `folder`, and `place_of` tells where a key stands."""
         try:
             return self._adapter.validate_python(data, context=folder)
         except pydantic.ValidationError as error:
-            problems = [self._problem(details, data) for details in error.errors()]
-            raise ScenarioError(*((k, f"{t} {place_of(at)}") for k, t, at in problems)) from None
+            problems = []
+            for one in error.errors():
+                path = [str(part) for part in one["loc"] if str(part)[:1] != "!"]  # A tag.
+                place = place_of(".".join([*path, one["ctx"]["wrong"]]).rstrip("."))
+                problems.append((".".join(path) or "scenario", f"{one['ctx']['text']} {place}"))
+            raise ScenarioError(*problems) from None
 
     def write(self, value: Any) -> Any:
         """Plain data that read as this value: of a form the keys that differ from the defaults."""
@@ -218,39 +269,30 @@ class Reader(Generic[T]):
             return value.tolist()
         return str(value) if isinstance(value, Path) else value
 
-    def put(self, data: Any, key: str, value: Any) -> None:
+    def put(self, data: Any, key: str, value: Any, path: str = "") -> None:
         """Sets an entry of plain data at a dotted key, in place; chosen names may have dots too."""
         if not all(key.split(".")):
             raise ScenarioError((brief(key), "expected a dotted key, for example start.errors"))
-        path, rest, hint = "", key, self._form
-        while rest:
-            slot: Any = rest.partition(".")[0]
-            if isinstance(data, list):
-                if not (slot.isascii() and slot.isdecimal() and int(slot) < len(data)):
-                    indices = ", ".join(map(str, range(len(data)))) or "none"
-                    raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
-            elif not isinstance(data, dict):
-                raise ScenarioError((path, f"{brief(data)} has no entry '{slot}'"))
-            elif get_origin(_only(hint)) in (dict, Mapping):
-                inner = [name for name in data if isinstance(data[name], (dict, list))]
-                slot = first_name(inner, rest) or rest
-            rest, path = rest[len(slot) + 1 :], f"{path}.{slot}".lstrip(".")
-            if (family := self._family(hint)) is not None:
-                hint = family.members.get(family.tag_of(data) or "")  # type: ignore[assignment]
-            hint = self._inside(hint, slot)
-            slot = int(slot) if isinstance(data, list) else slot
-            if not rest:
-                data[slot] = value
-            elif isinstance(data, dict) and data.get(slot) is None:
-                data[slot] = {}
-            data = data[slot]
+        slot: Any = key.partition(".")[0]
+        if isinstance(data, list):
+            if not (slot.isascii() and slot.isdecimal() and int(slot) < len(data)):
+                indices = ", ".join(map(str, range(len(data)))) or "none"
+                raise ScenarioError((path, f"no entry '{slot}'; entries: {indices}"))
+        elif not isinstance(data, dict):
+            raise ScenarioError((path, f"{brief(data)} has no entry '{slot}'"))
+        elif path.rpartition(".")[2] in self._free:
+            slot = first_name([n for n in data if isinstance(data[n], (dict, list))], key) or key
+        rest, path = key[len(slot) + 1 :], f"{path}.{slot}".lstrip(".")
+        slot = int(slot) if isinstance(data, list) else slot
+        if not rest:
+            data[slot] = value
+            return
+        if isinstance(data, dict) and data.get(slot) is None:
+            data[slot] = {}
+        self.put(data[slot], rest, value, path)
 
     def _keys_of(self, form: type) -> Mapping[str, Key]:
         return self._keys.get(form) or keys_of(form)
-
-    def _family(self, hint: Any) -> Family | None:
-        members = _members(hint)
-        return next((f for base, f in self._families.items() if base in members), None)
 
     def _is_form(self, hint: Any) -> bool:
         return isinstance(hint, type) and (hint in self._keys or is_dataclass(hint))
@@ -259,9 +301,11 @@ class Reader(Generic[T]):
         """The pydantic type of data for an annotation."""
         origin, parts, members = get_origin(hint), get_args(hint), _members(hint)
         if origin is Annotated:
-            return _annotated(self._type(parts[0]), *parts[1:])
-        value = next((v for base, v in self._values.items() if _members(base) <= members), None)
-        if value is None and (family := self._family(hint)) is not None:
+            return Annotated[self._type(parts[0]), *parts[1:]]
+        value = next((v for base, v in VALUES.items() if _members(base) <= members), None)
+        value = Annotated[Any, value] if isinstance(value, Expected) else value
+        family = next((f for base, f in self._families.items() if base in members), None)
+        if value is None and family is not None:
             if id(family) not in self._types:
                 self._types[id(family)] = self._choice(family)
             value = self._types[id(family)]
@@ -272,20 +316,22 @@ class Reader(Generic[T]):
                 self._types[hint] = self._data(hint)
             return self._types[hint]
         if origin in (Union, UnionType):
-            return Union[tuple(self._type(part) for part in parts)]  # noqa: UP007
+            return Union[tuple(map(self._type, parts))]  # noqa: UP007
         if origin in (list, Sequence):
             return list[self._type(parts[0])]  # type: ignore[misc]
         if origin in (dict, Mapping):
             return dict[str, self._type(parts[1])]  # type: ignore[misc]
         return hint
 
-    def _data(self, form: type) -> Any:
+    def _data(self, form: type, family: Family | None = None) -> Any:
         """The type of the data of a form."""
-        entries: dict[str, Any] = {}
-        for name, key in self._keys_of(form).items():
+        entries, keys = dict[str, Any](), self._keys_of(form)
+        for name, key in keys.items():
+            if any(get_origin(one) in (dict, Mapping) for one in _members(key.hint)):
+                self._free.add(name)
             more = {} if key.default is MISSING else {"default": self.write(key.default)}
             about = pydantic.Field(description=key.text or None, json_schema_extra=more)
-            entry = _annotated(self._type(key.hint), about)
+            entry: Any = Annotated[self._type(key.hint), about]
             entries[name] = entry if key.default is MISSING else NotRequired[entry]
         make_type: Any = TypedDict
         data = make_type(self._tags.get(form, form.__name__), entries)
@@ -293,89 +339,42 @@ class Reader(Generic[T]):
         data.__pydantic_config__ = pydantic.ConfigDict(
             extra="forbid", strict=True, allow_inf_nan=False
         )
-        own = self._keys.get(form, {}).items()
-        defaults = {name: key.default for name, key in own if key.default is not MISSING}
-        return Annotated[data, pydantic.AfterValidator(lambda given: form(**{**defaults, **given}))]
+        own = {
+            n: k.default for n, k in self._keys.get(form, {}).items() if k.default is not MISSING
+        }
+        tag = "" if family is None else f"{self._tags[form]} "
+        tags = "" if family is None else f". No tag is given; there are {', '.join(family.members)}"
+
+        def read(given: Any, inner: pydantic.ValidatorFunctionWrapHandler) -> Any:
+            is_tagged = isinstance(given, dict) and TAG in given
+            if is_tagged and family is not None:
+                given = {name: given[name] for name in given if name != TAG}
+            try:
+                return form(**{**own, **inner(given)})
+            except pydantic.ValidationError as error:
+                rest = "" if is_tagged else tags
+                problems = [_told(one, tag, [*keys], rest) for one in error.errors()]
+            except ValueError as error:
+                raise _problem(str(error)) from None
+            raise pydantic.ValidationError.from_exception_data(form.__name__, problems)
+
+        return Annotated[data, pydantic.WrapValidator(read)]
 
     def _choice(self, family: Family) -> Any:
         """The type of the data of a family."""
-        untagged = pydantic.BeforeValidator(lambda data: {k: data[k] for k in data if k != TAG})
         members = [
-            _annotated(self._data(cls), untagged, pydantic.Tag(tag))
-            for tag, cls in family.members.items()
+            Annotated[self._data(form, family), pydantic.Tag(tag)]
+            for tag, form in family.members.items()
         ]
         if family.plain is not None:
-            members.append(_annotated(family.plain, pydantic.Tag("plain")))
-        return Annotated[Union[tuple(members)], pydantic.Discriminator(family.tag_of)]  # noqa: UP007
-
-    def _inside(self, hint: Any, part: str | int) -> Any:
-        """The annotation of a part of data: of a key, an entry of a list, a member by its tag."""
-        if (family := self._family(hint)) is not None:
-            return family.members.get(str(part))
-        hint = _only(hint)
-        if self._is_form(hint):
-            key = self._keys_of(hint).get(str(part))
-            return None if key is None else key.hint
-        return (get_args(hint) or [None])[-1]
-
-    def _problem(self, error: ErrorDetails, data: Any) -> tuple[str, str, str]:
-        """The dotted key of a problem, its text, and the key at whose place it is."""
-        loc, kind, value = error["loc"], error["type"], error["input"]
-        is_key = kind in ("missing", "extra_forbidden")
-        count = loc.index(TAG) if TAG in loc else len(loc) - is_key
-        hint, keys, tag, tags = self._form, list[str](), "", ""
-        for part in loc[:count]:
-            family, hint = self._family(hint), self._inside(hint, part)
-            if family is None:
-                keys, data, tag, tags = [*keys, str(part)], data[part], "", ""
-            else:
-                tag, tags = f"{part} ", ", ".join(family.members)
-        key, place, form = ".".join(keys), ".".join(keys), _only(hint)
-        names = list(self._keys_of(form)) if self._is_form(form) else []
-        listed = f"keys: {', '.join(names) or 'none'}"
-        if tag and isinstance(data, dict) and TAG not in data:
-            listed += f". No tag is given; there are {tags}"
-        if TAG in loc:
-            text = f"takes no tag, got {data[TAG]}"
-        elif kind == "missing":
-            text = f"{tag}needs the key '{loc[-1]}'; {listed}"
-        elif kind == "extra_forbidden":
-            near = get_close_matches(str(loc[-1]), names, n=1)
-            listed = f"did you mean '{near[0]}'?" if near else listed
-            text, place = f"{tag}has no key '{loc[-1]}'; {listed}", ".".join([*keys, str(loc[-1])])
-        elif kind == "value_error":
-            text = str(error["ctx"]["error"])
-        elif (family := self._family(hint)) is not None:
-            also = {str: "text, or ", float: "a number, or "}.get(family.plain or list, "")
-            text = f"expected {also}one of {', '.join(family.members)}, got {_shown(value)}"
-        else:
-            words = _WORDS.get(kind, error["msg"].removeprefix("Input should be "))
-            words = listed if kind == "dict_type" and names else words
-            text = f"expected {words}, got {_shown(value)}"
-            if kind == "string_type" and isinstance(value, (bool, int, float)):
-                text += "; text that reads as something else goes in quotes"
-        return key or "scenario", text, place
-
-
-def _annotated(hint: Any, *more: Any) -> Any:
-    for part in more:
-        hint = Annotated[hint, part]
-    return hint
+            members.append(Annotated[family.plain, pydantic.Tag("!")])
+        choose = pydantic.Discriminator(family.tag_of), pydantic.BeforeValidator(family.check)
+        return Annotated[Union[tuple(members)], *choose]  # noqa: UP007
 
 
 def _members(hint: Any) -> set[Any]:
     """The members of a Union; any other annotation is its own only member."""
     return set(get_args(hint)) if get_origin(hint) in (Union, UnionType) else {hint}
-
-
-def _only(hint: Any) -> Any:
-    """An annotation without None and without what is said about it; None for several types."""
-    while get_origin(hint) is Annotated:
-        hint = get_args(hint)[0]
-    if NoneType not in (members := _members(hint)):
-        return hint
-    rest = [*(members - {NoneType})]
-    return _only(rest[0]) if len(rest) == 1 else None
 
 
 @cache

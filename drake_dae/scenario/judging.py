@@ -17,6 +17,7 @@ from drake_dae.analysis import (
     along,
     analyze,
     digits,
+    examine,
     limits_along,
     robot_limits,
     to_text,
@@ -38,8 +39,8 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import (
     completed_model,
-    examine_scenario,
     exogenous_references,
+    of_steered,
     reference_and_start,
     references_of,
     scenario_structure,
@@ -148,7 +149,7 @@ def find_feasibility(scenario: Scenario) -> Feasibility:
     completed, model, _ = completed_model(scenario)
     scenario, gains = completed.scenario, ""
     try:
-        examined = examine_scenario(model) if scenario.task is None else None
+        examined = of_steered(model, examine) if scenario.task is None else None
         structure = None if examined is None or examined.problems else examined.structure
         structure = structure or scenario_structure(model)
     except AssumptionError:
@@ -214,14 +215,10 @@ def sample_times(
         # At a jump of the derivative no division suffices.
         is_long = np.diff(times) > SHORTEST * (end - begin)
         new = np.flatnonzero(np.any(off > allowed, axis=1) & is_long)
-        room = MOST_SAMPLES - times.size
-        is_resolved = new.size <= room
-        if not is_resolved:
-            new = np.sort(random.choice(new, room, replace=False))
+        if not new.size or times.size + new.size > MOST_SAMPLES:
+            return times, not new.size
         times = np.insert(times, new + 1, tried[new])
         values = np.insert(values, new + 1, new_values[new], axis=0)
-        if not (new.size and is_resolved):
-            return times, is_resolved
 
 
 def judge_run(
@@ -235,8 +232,9 @@ def judge_run(
     """Judges a run by its record."""
     # What exceeds its limits, and which links are behind surfaces. The last numbers of a run that
     # broke off are not those of its motion.
+    wanted = scenario.judgement
     model, changes, stop = loop.plant.robot("a scenario"), loop.changes(record), record.time.size
-    limits = robot_limits(model, scenario.judgement.friction_cones)
+    limits = robot_limits(model, wanted.friction_cones)
     if failure:
         first, last = record.time[[0, -1]]
         stop = max(1, int(np.searchsorted(record.time, last - BREAK * (last - first))))
@@ -248,16 +246,18 @@ def judge_run(
         behind.append(RunFinding(FindingKind.BEHIND, str(link), Outcome.BAD, *numbers, WRONG_SIDE))
 
     # How much slower the references must be to keep the limits.
-    remedies, dae, law = list[str](), model.dae, loop.controller.law
+    remedies, dae, law, goal = list[str](), model.dae, loop.controller.law, loop.generator
     is_paced = not failure and any(r.excess and r.kind is not LimitKind.POSITION for r in ranges)
-    if is_paced and loop.generator is not None and not dae.exogenous.moving:
+    if is_paced and goal is not None and not dae.exogenous.moving:
         structure = law.structure if law.system is dae else find_structure(dae)
-        degrees = structure.layout.reference_degrees  # The law's own may be higher.
-        stacked = stack_references(loop.generator.references, degrees)
-        times, start = record.time[:: record.time.size // MOST_TIMES + 1], record["state"][0]
-        zero_dynamics = ZeroDynamics(dae, structure=structure)
-        motion = zero_dynamics.motion(lambda time: stacked(time).copy(), times, start)
-        found = limits_along(structure, limits, lambda time: stacked(time).copy(), motion)
+        # The law's own degrees may be higher.
+        stacked = stack_references(goal.references, structure.layout.reference_degrees)
+        reference, times = (
+            lambda t: stacked(t).copy(),
+            record.time[:: record.time.size // MOST_TIMES + 1],
+        )
+        motion = ZeroDynamics(dae, structure=structure).motion(reference, times, record["state"][0])
+        found = limits_along(structure, limits, reference, motion)
         remedies.append("the references alone keep all limits" if found is None else found.remedy)
 
     # Approximations, and places beyond the data of surfaces.
@@ -276,21 +276,19 @@ def judge_run(
         left = scenario.duration - statistics.simulated_time
         early = left > 1e-9 * scenario.duration and not ended
         notes += [f"the task stopped the run {left:.4g} s early"] * early
-    config = scenario.integrator
-    fixed = loop.plant.time_step or not config.use_error_control
-    accuracy = None if fixed else config.accuracy
+    is_fixed = loop.plant.time_step or not scenario.integrator.use_error_control
+    accuracy = None if is_fixed else scenario.integrator.accuracy
     # Friction of the plant's material alone, at a contact for which the law has none.
     material = scenario.plant.material
-    frictionless = any(
-        any(c.is_unilateral) and c.friction_parameter is None for c in model.constraints
-    )
+    touching = [c for c in model.constraints if any(c.is_unilateral)]
+    is_unknown = any(contact.friction_parameter is None for contact in touching)
     reasons = {
         "the drives were saturated": "excess" in record and bool(record["excess"].any()),
         "parameters of the plant differ from those of the law": scenario.plant.parameters,
         "the plant carries payloads that the law does not know": scenario.plant.payloads,
         "disturbances act on the plant, unknown to the law": scenario.plant.disturbances,
         "the contact has friction that the law does not know": (
-            material is not None and material.friction and frictionless
+            material is not None and material.friction and is_unknown
         ),
         "the contact is compliant": not loop.plant.is_ideal,
         "the force is measured by a sensor": scenario.sensors.force is not None,
@@ -301,7 +299,7 @@ def judge_run(
         record,
         loop.predicted_error(record),
         ranges,
-        tolerances=scenario.judgement.tolerated,
+        tolerances={n: np.inf if e is None else e for n, e in wanted.tolerances.items()},
         changes=changes,
         ended=ended,
         accuracy=accuracy,

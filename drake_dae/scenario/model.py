@@ -1,19 +1,17 @@
 """The robot model of a scenario, completed, and what its references demand of it."""
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from pydrake.geometry import SceneGraph
-from pydrake.multibody.tree import BodyIndex
 
-from drake_dae.analysis import Analysis, examine, robot_limits
+from drake_dae.analysis import robot_limits
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.arrays import FloatArray, unknown_name
 from drake_dae.dae import DaeSystem, Structure, ZeroDynamics, find_structure
 from drake_dae.errors import (
     AssumptionError,
@@ -47,17 +45,14 @@ from drake_dae.scenario.robot_file.robot import Payload
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_guess, start_state
 
+T = TypeVar("T")
+
 NOTHING_FOUND = "no start was found"
 """How the note begins if no outputs and start are good along the references."""
 
-_TIMES = 201
-"""The number of times at which a completed scenario is examined."""
-
-_SLACK = 1e-6
-"""The excess over a limit that counts, in its unit."""
-
-_LARGE = 30.0
-"""The size of a surface in that of the robot above which its unit is doubtful."""
+_TIMES, _SLACK, _LARGE = 201, 1e-6, 10.0
+"""At how many times a completed scenario is examined; the excess over a limit that counts, in its
+unit; and the size of a surface in m above which its unit is doubtful."""
 
 
 def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) -> RobotModel:
@@ -67,7 +62,7 @@ def scenario_model(scenario: Scenario, scene_graph: SceneGraph | None = None) ->
 
 @checked(lambda text: ScenarioError(("", text)))
 def complete_scenario(scenario: Scenario) -> Completed:
-    """Adds missing outputs and a start to a scenario.
+    """Adds missing outputs and a start to a scenario, with the choices in words.
 
     Outputs are missing if there are fewer than actuators minus force outputs. They are added by
     this rule, as long as some are missing, each if it is independent of those before it:
@@ -86,12 +81,6 @@ def complete_scenario(scenario: Scenario) -> Completed:
     along the whole reference, within the limits of joints. It is examined along the reference by
     inverse dynamics, as `analyze` does; if that exceeds a limit, the next one is tried. If there is
     none, a note says what is in the way.
-
-    Args:
-        scenario: What `load_scenario` returns.
-
-    Returns:
-        The scenario, unchanged if nothing is missing, and the choices in words.
 
     Raises:
         ScenarioError: The scenario is not valid, the robot cannot reach the start, or no outputs
@@ -149,7 +138,13 @@ def _checked_constraints(
             text = f"each constraint needs a name of its own, got '{constraint.name}'"
             raise ScenarioError((f"constraints.{index}.name", text))
         names.append(constraint.name)
-        _compare_sizes(constraint, links)
+        extent = getattr(getattr(constraint, "surface", None), "extent", None)
+        if extent is not None and (size := np.max(extent[1] - extent[0])) > _LARGE:
+            text = (
+                f"the surface of '{constraint.name}' is {size:.3g} m long: if a unit of its file "
+                "is a millimetre, write scale: 0.001"
+            )
+            warnings.warn(text, GeometryWarning, stacklevel=2)
     constraints += loops
     bound = ConstraintSet([*constraints, *plant_constraints(links)])
     actuators = (*links.actuator_signals, *bound.motors)
@@ -169,10 +164,9 @@ def _checked_constraints(
     each("forces", forces or (), lambda f: force_rows(as_force_outputs([f], bound), bound, links))
     with at("forces"):
         as_force_outputs(forces, bound)
-    for force, value in (scenario.compliances or {}).items():
+    for force in scenario.compliances or {}:
         with at(f"compliances.{force}"):
             bound.place(force)
-            positive("a compliance", value)
     each("robot.known_forces", robot.known_forces, lambda f: f.reaction(links.kinematics()))
     with at("law.control_weights"):
         choice = control_choice(robot.title, scenario.law.control_weights or None, actuators)
@@ -212,19 +206,11 @@ def _model(
 
 def scenario_structure(model: RobotModel) -> Structure:
     """The structure of a scenario's robot."""
-    with _examining(model):
-        return find_structure(model.dae)
+    return of_steered(model, find_structure)
 
 
-def examine_scenario(model: RobotModel) -> Analysis:
-    """What `analyze` finds of a scenario's robot, without its motion."""
-    with _examining(model):
-        return examine(model.dae)
-
-
-@contextmanager
-def _examining(model: RobotModel) -> Iterator[None]:
-    """Refuses a robot that nothing is to control, and names the keys of a start off constraints."""
+def of_steered(model: RobotModel, find: Callable[[DaeSystem], T]) -> T:
+    """What is found of the system of a scenario's robot, which has controls and outputs."""
     if not model.dae.num_controls:
         raise ScenarioError(("robot.actuators", "nothing is driven, and a law has nothing to do"))
     if not model.dae.num_outputs:
@@ -234,26 +220,9 @@ def _examining(model: RobotModel) -> Iterator[None]:
         )
         raise ScenarioError(("outputs", text))
     try:
-        yield
+        return find(model.dae)
     except InconsistentStateError as error:
         raise ScenarioError(("constraints or start.positions", str(error))) from error
-
-
-def _compare_sizes(constraint: Constraint, links: MultibodyExpressions) -> None:
-    """Warns of a surface much larger than the robot: its file may be in millimetres."""
-    extent = getattr(getattr(constraint, "surface", None), "extent", None)
-    if extent is None:
-        return
-    plant, size = links.plant, float(np.max(extent[1] - extent[0]))
-    context, bodies = plant.CreateDefaultContext(), map(BodyIndex, range(plant.num_bodies()))
-    poses = [plant.EvalBodyPoseInWorld(context, plant.get_body(index)) for index in bodies]
-    robot = float(np.linalg.norm(np.ptp([pose.translation() for pose in poses], axis=0)))
-    if size > _LARGE * robot > 0.0:
-        text = (
-            f"the surface of '{constraint.name}' is {size:.3g} m long, and the robot "
-            f"{robot:.2g} m: if a unit of its file is a millimetre, write scale: 0.001"
-        )
-        warnings.warn(text, GeometryWarning, stacklevel=2)
 
 
 def _outputs(

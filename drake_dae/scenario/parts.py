@@ -1,15 +1,15 @@
 """Parts of a scenario without a class in the library, or written otherwise than that has it."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar, cast
+from typing import Annotated, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from drake_dae.arrays import FloatArray, positive, unknown_name
+from drake_dae.arrays import unknown_name
 from drake_dae.dae import GainDesign, gain_coefficients, gain_matrices, poles
 from drake_dae.errors import GainError, ModelError
 from drake_dae.references import Reference
@@ -24,11 +24,11 @@ from drake_dae.robots import (
 from drake_dae.scenario.robot_file.robot import Pose
 from drake_dae.systems.observing.observing import Observing
 from drake_dae.systems.sensing.encoders import Encoders
-from drake_dae.systems.sensing.force_sensor import ForceSensor
 from drake_dae.systems.task.phases import Phase
 from drake_dae.systems.task.task import Task
 
 T = TypeVar("T", Constraint, PositionOutput)
+Positive = Annotated[float, Field(gt=0.0)]
 
 
 @dataclass(frozen=True)
@@ -128,16 +128,7 @@ class MeasuredForce:
     bias: ArrayLike = 0.0
     noise_deviation: ArrayLike = 0.0
     drift: ArrayLike = 0.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**32:
-            raise ModelError(f"seed: a whole number from 0 to 2^32 - 1 is needed, got {self.seed}")
-
-    def sensor(self, size: int) -> ForceSensor:
-        """The sensor of m = `size` forces."""
-        lags = self.time_constant, self.sample_period
-        return ForceSensor(size, *lags, self.bias, self.noise_deviation, self.drift)
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
 
 @dataclass(frozen=True)
@@ -153,9 +144,9 @@ class Sensors:
     force: MeasuredForce | None = None
 
     @property
-    def force_noise(self) -> FloatArray:
-        """The standard deviation of the noise of the measured force, in N or N m."""
-        return np.asarray(0.0 if self.force is None else self.force.noise_deviation)
+    def force_noise(self) -> float:
+        """The largest standard deviation of the noise of the measured force, in N or N m."""
+        return 0.0 if self.force is None else float(np.max(self.force.noise_deviation))
 
 
 @dataclass(frozen=True)
@@ -167,13 +158,8 @@ class LargestErrors:
         force: Of a contact force, in N; no bound if left out.
     """
 
-    position: float | None = None
-    force: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, most in vars(self).items():
-            if most is not None:
-                positive(f"largest {name} error", most)
+    position: Positive | None = None
+    force: Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -202,14 +188,6 @@ class Estimator(Observing):
             super().__post_init__()
 
 
-class Gains(ABC):
-    """Gains of the tracking law, as they are written."""
-
-    @abstractmethod
-    def design(self) -> GainDesign:
-        """The design of the gains."""
-
-
 @dataclass(frozen=True)
 class PerOutput:
     """Numbers for all outputs, or for each output.
@@ -228,7 +206,7 @@ class PerOutput:
 
 
 @dataclass(frozen=True)
-class Poles(PerOutput, Gains):
+class Poles(PerOutput):
     """Real poles of the errors in 1/s, one number or mu_i per output; see also Coefficients."""
 
     def design(self) -> GainDesign:
@@ -236,7 +214,7 @@ class Poles(PerOutput, Gains):
 
 
 @dataclass(frozen=True)
-class Coefficients(PerOutput, Gains):
+class Coefficients(PerOutput):
     """Gains K_i1, ..., K_i mu_i of (32), lowest derivative first; in 1/s^mu_i, ..., 1/s."""
 
     def design(self) -> GainDesign:
@@ -244,7 +222,7 @@ class Coefficients(PerOutput, Gains):
 
 
 @dataclass(frozen=True)
-class Matrices(Gains):
+class Matrices:
     """Gains that couple outputs of equal degree; see `gain_matrices`.
 
     Attributes:
@@ -254,13 +232,11 @@ class Matrices(Gains):
 
     groups: list[list[list[list[float]]]]
 
-    def __post_init__(self) -> None:
-        for matrix in (matrix for group in self.groups for matrix in group):
-            if len({len(row) for row in matrix}) != 1:
-                raise GainError(f"groups: the rows of {matrix} have different lengths")
-
     def design(self) -> GainDesign:
         return gain_matrices(*self.groups)
+
+
+Gains = Poles | Coefficients | Matrices
 
 
 @dataclass(frozen=True)
@@ -364,19 +340,9 @@ class Judgement:
             with the reason.
     """
 
-    tolerances: dict[str, float | None] = field(default_factory=dict)
+    tolerances: dict[str, Positive | None] = field(default_factory=dict)
     friction_cones: list[FrictionCone] = field(default_factory=list)
     may_diverge: bool = False
-
-    def __post_init__(self) -> None:
-        for name, tolerated in self.tolerances.items():
-            if tolerated is not None:
-                positive(f"tolerances: {name}", tolerated)
-
-    @property
-    def tolerated(self) -> dict[str, float]:
-        """Output name -> the tolerated error; infinite if it does not count."""
-        return {name: np.inf if e is None else e for name, e in self.tolerances.items()}
 
 
 @dataclass(frozen=True)

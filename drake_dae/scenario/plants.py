@@ -1,21 +1,21 @@
 """The plants of a scenario: each member of this family makes a plant."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from importlib import import_module
-from typing import ClassVar, cast
+from typing import Annotated, ClassVar, cast
 
+from pydantic import Field
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import MultibodyPlant as DrakePlant
 from pydrake.systems.framework import Context
 
-from drake_dae.arrays import brief
 from drake_dae.dae import ConstraintStructure
 from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.robots import RobotModel
-from drake_dae.scenario.form import at
-from drake_dae.scenario.robot_file.robot import Payload
+from drake_dae.scenario.form import Expected, at
+from drake_dae.scenario.robot_file.reading import read_robot
+from drake_dae.scenario.robot_file.robot import Payload, Robot
 from drake_dae.systems.plants.contact.compliant_plant import CompliantPlant
 from drake_dae.systems.plants.contact.contact_material import ContactMaterial, PointMaterial
 from drake_dae.systems.plants.contact.contact_plant import ContactPlant
@@ -23,22 +23,10 @@ from drake_dae.systems.plants.contact.disturbance_forces import DisturbanceForce
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.systems.plants.robot_plant import RobotPlant
 
-AddRobot = Callable[[DrakePlant, SceneGraph], None]
-"""Adds a robot with its payloads to a MultibodyPlant."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioPlant(ABC):
-    """What a scenario simulates; the contract of the key `plant`.
-
-    1. `plant` makes the plant of a robot, which follows the contract of `Plant`.
-    2. With `carries`, this plant includes payloads, disturbances and changed parameters. Otherwise
-       the scenario makes a model with these payloads and disturbances, and sets the parameters in
-       the context.
-    3. `material` is the material of compliant contacts, and None for ideal contacts.
-    4. `rolled` is the member that a rollout runs instead: this member, or one with a traced plant.
-    5. `in_context` are the keys of numbers that `begin` sets in a context, even if the plant was
-       made with other numbers. Without `adjusts` the plant is made anew for each payload and force.
+    """What a scenario simulates.
 
     Attributes:
         parameters: Parameter name -> the plant's value, unknown to the law's model; one number for
@@ -50,31 +38,37 @@ class ScenarioPlant(ABC):
     parameters: dict[str, float | list[float]] = field(default_factory=dict)
     payloads: list[Payload] = field(default_factory=list)
     disturbances: list[DisturbanceForce] = field(default_factory=list)
+
     carries: ClassVar[bool] = False
+    """Whether the plant has these itself. Else a model has the payloads and disturbances, and
+    numbers are set in a context, or, if it does not adjust, the plant is made anew for each."""
     adjusts: ClassVar[bool] = True
     in_context: ClassVar[frozenset[str]] = frozenset()
+    """The keys of numbers that `begin` sets in a context."""
 
     @property
     def material(self) -> PointMaterial | None:
+        """The material of contacts that give way."""
         return None
 
     @property
     def rolled(self) -> "ScenarioPlant":
+        """What a rollout runs: this, or what has a traced plant."""
         return self
 
     def begin(self, plant: Plant, context: Context) -> None:  # noqa: B027 - Nothing by default.
         """Sets the numbers of `in_context` in a context of the plant."""
 
     @abstractmethod
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
-        """Makes the plant of a robot, with the structure of its system."""
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        """The plant of a robot, with the structure of its system."""
 
 
 @dataclass(frozen=True)
 class IdealConstraints(ScenarioPlant):
     """The plant is a `RobotPlant`: its constraints hold exactly, and pull where they must."""
 
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         return RobotPlant(model, structure=structure)
 
 
@@ -101,7 +95,10 @@ class MultibodyPlant(ContactMaterial, ScenarioPlant):
         names = [f.name for f in (*fields(PointMaterial), *fields(ScenarioPlant))]
         return CompliantContact(**{name: getattr(self, name) for name in names})
 
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
+        def add(plant: DrakePlant, scene_graph: SceneGraph) -> None:
+            read_robot(robot, plant, scene_graph, self.payloads)
+
         with at("plant or plant.parameters"):
             return ContactPlant(
                 model,
@@ -132,9 +129,15 @@ class CompliantContact(PointMaterial, ScenarioPlant):
     def begin(self, plant: Plant, context: Context) -> None:
         cast(CompliantPlant, plant).set_contact(context, self)
 
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         with at("plant or plant.parameters"):  # Whose numbers are set in a context.
             return CompliantPlant(model, self, structure=structure)
+
+
+MAKER = Expected(
+    "a module and a class in it, as my_plants:SpringyPlant",
+    Annotated[str, Field(pattern=r"^[^:]+:[^\W\d]\w*$")],
+)
 
 
 @dataclass(frozen=True)
@@ -149,18 +152,10 @@ class OwnPlant(ScenarioPlant):
         maker: The module and the class in it, as "my_plants:SpringyPlant".
     """
 
-    maker: str
+    maker: Annotated[str, MAKER]
     adjusts: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
-        module, _, name = self.maker.partition(":")
-        if not (module and name.isidentifier()):
-            raise ModelError(
-                "maker: a module and a class in it are needed, as my_plants:SpringyPlant, got "
-                f"'{brief(self.maker)}'"
-            )
-
-    def plant(self, model: RobotModel, structure: ConstraintStructure, add: AddRobot) -> Plant:
+    def plant(self, model: RobotModel, structure: ConstraintStructure, robot: Robot) -> Plant:
         module, _, name = self.maker.partition(":")
         with at("plant.maker"):
             try:

@@ -114,8 +114,12 @@ def _at_rest(
     """The state at rest at start.positions, or next to them on the constraints."""
     structure, guess = loop.controller.start_structure, start_guess(scenario, model.links)
     of_law = structure.system.parameters_of(loop.plant.dae, parameters)
-    near = structure.manifold.settle(model.rest_state(guess, forces, parameters), of_law)
-    q = near[: guess.size]
+
+    def settled(near: FloatArray) -> FloatArray:
+        rest = model.rest_state(near, forces, parameters)
+        return structure.manifold.settle(rest, of_law)[: near.size]
+
+    q = _unwound(model, settled, guess)
     _check_limits(model, q, "Give")
     state = model.rest_state(q, forces, parameters)
     if scenario.exogenous and not structure.manifold.is_consistent(state, of_law):

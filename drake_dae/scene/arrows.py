@@ -23,15 +23,11 @@ FORCE_COLOR = Rgba(0.85, 0.15, 0.1, 1.0)
 MOMENT_COLOR = Rgba(0.55, 0.2, 0.75, 1.0)
 PATH_COLOR = Rgba(0.1, 0.2, 0.8, 1.0)
 
-_PIECE = 32
-"""The number of points in a piece of a growing path."""
+_PIECE = 32  # points in a piece of a growing path
 
-_NEGLIGIBLE = 1e-6
-"""A moment is negligible below this fraction of the largest force times the length of the longest
-arrow."""
+_NEGLIGIBLE = 1e-6  # of a moment, relative to the largest force times the longest arrow's length
 
-LEAST_SCALE = 1e-3
-"""The scale of an arrow without force; Meshcat cannot draw a scale of 0."""
+LEAST_SCALE = 1e-3  # of an arrow without force; Meshcat cannot draw a scale of 0
 
 
 class ForceArrows:
@@ -78,10 +74,8 @@ class ForceArrows:
     def measure(self, motion: Sequence[Wrenches]) -> None:
         """Enlarges the scale so that these wrenches fit."""
         for wrenches in motion:
-            force, moment = (
-                float(np.max(np.linalg.norm(rows, axis=1), initial=0.0))
-                for rows in (wrenches.forces, wrenches.moments)
-            )
+            both = wrenches.forces, wrenches.moments
+            force, moment = (float(np.linalg.norm(r, axis=1).max(initial=0.0)) for r in both)
             self.largest_force = max(self.largest_force, force)
             negligible = _NEGLIGIBLE * self._length * self.largest_force
             self.has_moment = self.has_moment or moment > negligible
@@ -149,18 +143,19 @@ def _add_arrow(meshcat: Meshcat, path: str, length: float, heads: int, color: Rg
     """Adds an arrow along z whose tip is at the origin, with one or two heads in a row."""
     # A MeshcatCone opens along +z from its tip at the origin: turned, it points along +z.
     half_turn = RotationMatrix(AngleAxis(np.pi, np.array([1.0, 0.0, 0.0])))
-    head, names = 0.2 * length, ["head", "second_head"][:heads]
-    for number, name in enumerate(names):
-        cone = f"{path}/arrow/{name}"
-        meshcat.SetObject(cone, MeshcatCone(head, 0.4 * head, 0.4 * head), color)
-        meshcat.SetTransform(cone, RigidTransform(half_turn, [0.0, 0.0, -number * head]))
+    head = 0.2 * length
     shaft = length - heads * head
-    meshcat.SetObject(f"{path}/arrow/shaft", Cylinder(0.16 * head, shaft), color)
-    middle = np.array([0.0, 0.0, shaft / 2 - length])
-    meshcat.SetTransform(f"{path}/arrow/shaft", RigidTransform(middle))
-    # The arrow is drawn over everything, since a force in a joint acts inside bodies.
-    for part in (*names, "shaft"):
-        mesh = f"{path}/arrow/{part}/<object>"
+    parts = {
+        "shaft": (Cylinder(0.16 * head, shaft), RigidTransform([0.0, 0.0, shaft / 2 - length]))
+    }
+    for number, name in enumerate(["head", "second_head"][:heads]):
+        pose = RigidTransform(half_turn, [0.0, 0.0, -number * head])
+        parts[name] = MeshcatCone(head, 0.4 * head, 0.4 * head), pose
+    for name, (form, pose) in parts.items():
+        meshcat.SetObject(f"{path}/arrow/{name}", form, color)
+        meshcat.SetTransform(f"{path}/arrow/{name}", pose)
+        # It is drawn over everything, since a force in a joint acts inside bodies.
+        mesh = f"{path}/arrow/{name}/<object>"
         meshcat.SetProperty(mesh, "material.depthTest", False)
         meshcat.SetProperty(mesh, "material.transparent", True)
         meshcat.SetProperty(mesh, "renderOrder", 1.0)

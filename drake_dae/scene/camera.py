@@ -4,8 +4,7 @@ import numpy as np
 
 from drake_dae.arrays import FloatArray
 
-_FLAT = 0.35
-"""The camera is higher if the height of a scene is below this fraction of its largest extent."""
+_FLAT = 0.35  # The camera is higher if a scene's height is below this share of its largest extent.
 
 _TURNS = np.deg2rad([0, -30, 30, -60, 60, -90, 90, 120, 150, 180])
 """The tried angles of the camera about the vertical, in order of preference, in rad."""
@@ -13,8 +12,7 @@ _TURNS = np.deg2rad([0, -30, 30, -60, 60, -90, 90, 120, 150, 180])
 _FROM, _FROM_ABOVE = np.array([-0.6, -0.85, 0.4]), np.array([-0.6, -0.85, 1.3])
 """The preferred directions to the camera, of usual and of flat scenes."""
 
-_MARGIN = 0.06
-"""The fraction of a picture's height that is free at each side."""
+_MARGIN = 0.06  # the fraction of a picture's height that is free at each side
 
 
 def view_angles(angle: float, aspect: float, top: float = 0.0) -> tuple[float, float, float]:

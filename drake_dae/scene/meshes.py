@@ -7,11 +7,11 @@ import numpy as np
 from pydrake.common import MemoryFile
 from pydrake.geometry import InMemoryMesh, Mesh, Role, SceneGraph, SourceId
 
+from drake_dae.arrays import listed
 from drake_dae.errors import GeometryWarning, ModelError
 from drake_dae.files import read_mesh
 
-MOST_BYTES = 2 << 20
-"""The largest size of all meshes of a page."""
+MOST_BYTES = 2 << 20  # of all meshes of a page
 
 _CELLS = (128, 96, 64, 48, 32, 24, 16, 12, 8, 6, 4)
 
@@ -41,10 +41,9 @@ def shrink_meshes(scene: SceneGraph, source: SourceId) -> None:
                 size = len(text)
             changed[file.name] = None
         left -= size
-    more = f" and {len(changed) - 8} more" if len(changed) > 8 else ""
     warnings.warn(
         f"meshes of {total / 2**20:.3g} MB are drawn coarser in the page, with "
-        f"{(MOST_BYTES - left) / 2**20:.2g} MB: {', '.join([*changed][:8])}{more}",
+        f"{(MOST_BYTES - left) / 2**20:.2g} MB: {listed(changed)[1:-1]}",
         GeometryWarning,
         stacklevel=2,
     )

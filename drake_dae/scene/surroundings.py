@@ -12,12 +12,9 @@ from drake_dae.arrays import FloatArray
 from drake_dae.robots import Constraint, ConstraintWrenches, PosedShape, RobotModel, own_values
 from drake_dae.trace.functions import TracedFunction
 
-_CELLS = 8.0
-"""The approximate number of grid cells along the diagonal of a scene."""
+_CELLS = 8.0  # the approximate number of grid cells along the diagonal of a scene
 
-_NEAR = 0.1
-"""The grid is on a horizontal surface that is nearer to the lowest point than this fraction of the
-scene's diagonal."""
+_NEAR = 0.1  # of the diagonal: so near to the lowest point, the grid is on a horizontal surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,12 +50,12 @@ def surroundings(
 
     def piece(row: int, contacts: FloatArray) -> DrawnSurface | None:
         values = own_values(constraints[row], model.dae, parameters)
-        low, high = contacts.min(axis=0), contacts.max(axis=0)
-        nearest = np.argmin(np.linalg.norm(contacts - (low + high) / 2, axis=1))
-        extent = max(size, 1.4 * float(np.linalg.norm(high - low)))
         surface, pose = constraints[row].surface_at(values), constraints[row].placement(values)
         if surface is None:
             return None
+        low, high = contacts.min(axis=0), contacts.max(axis=0)
+        nearest = np.argmin(np.linalg.norm(contacts - (low + high) / 2, axis=1))
+        extent = max(size, 1.4 * float(np.linalg.norm(high - low)))
         picture = surface.picture(pose.inverse() @ contacts[nearest], extent)
         return None if picture is None else DrawnSurface(constraints[row], pose, picture)
 
@@ -82,13 +79,13 @@ def surroundings(
 def _coincide(first: DrawnSurface | None, second: DrawnSurface | None) -> bool:
     if first is None or second is None:
         return False
-    poses = [surface.pose @ surface.picture.pose for surface in (first, second)]
+    pose, other_pose = (each.pose @ each.picture.pose for each in (first, second))
     form, other = first.picture.form, second.picture.form
-    if not poses[0].IsNearlyEqualTo(poses[1], 1e-9):
-        return False
     if isinstance(form, Shape) or isinstance(other, Shape):
-        return repr(form) == repr(other)
-    return np.array_equal(form.vertices(), other.vertices())
+        is_same = repr(form) == repr(other)
+    else:
+        is_same = np.array_equal(form.vertices(), other.vertices())
+    return is_same and pose.IsNearlyEqualTo(other_pose, 1e-9)
 
 
 def floor_below(points: FloatArray, surfaces: Sequence[DrawnSurface] = ()) -> Floor:

@@ -36,21 +36,15 @@ from drake_dae.systems.plants.contract import Plant
 FRAME_RATE = 32.0
 """Frames per second of the live view and of the recording."""
 
-_ON_REQUEST = 1e9
-"""A publish period, in s, so long that only a forced publish draws."""
+_ON_REQUEST = 1e9  # a publish period in s, so long that only a forced publish draws
 
-CAMERA_ANGLE = 0.7
-"""The vertical angle of view, in rad."""
+CAMERA_ANGLE, ASPECT = 0.7, 4.0 / 3.0
+"""The vertical angle of view in rad, and the width of a window divided by its height, from which
+the camera's position is computed; a wider window shows more."""
 
-ASPECT = 4.0 / 3.0
-"""The width of a window divided by its height, from which the camera's position is computed; a
-wider window shows more."""
-
-PIECE = 0.6
-"""The side of a drawn piece of an unbounded surface, as a fraction of the scene's size."""
-
-ARROW = 0.2
-"""The length of the longest arrow, as a fraction of the scene's size."""
+PIECE, ARROW = 0.6, 0.2
+"""The side of a drawn piece of an unbounded surface, and the length of the longest arrow, as
+fractions of the scene's size."""
 
 _FLOOR_COLOR = Rgba(0.8, 0.8, 0.8, 1.0)
 _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
@@ -58,13 +52,9 @@ _SURFACE_COLOR = Rgba(0.55, 0.65, 0.75, 0.45)
 
 @checked(ModelError)
 def start_meshcat(host: str = "localhost") -> Meshcat:
-    """Starts a Meshcat server, which by default only this computer can reach.
+    """Starts a Meshcat server on a network interface, "localhost" or "*" for all of them.
 
-    Args:
-        host: The network interface that the server listens on, as "localhost" or "*" for all.
-
-    Raises:
-        OSError: There is no free port.
+    By default only this computer can reach it. An OSError says that there is no free port.
     """
     try:
         meshcat = Meshcat(MeshcatParams(host=host))

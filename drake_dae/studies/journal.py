@@ -18,8 +18,8 @@ CREATE TABLE IF NOT EXISTS runs (
 );
 """
 
+# The outcomes of runs that are tried again, in SQL.
 _AGAIN = f"({', '.join(repr(str(each)) for each in Outcome if not each.is_final)})"
-"""The outcomes of runs that are tried again, in SQL."""
 
 
 class Journal:

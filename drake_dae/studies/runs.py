@@ -10,7 +10,6 @@ from functools import lru_cache
 from threading import Lock
 from typing import Any
 
-import numpy as np
 from pydrake.systems.framework import Context
 
 from drake_dae.analysis import SignalLimits, robot_limits
@@ -40,16 +39,11 @@ class Outcome(StrEnum):
     """How a run of a sweep ended."""
 
     FINISHED = "finished"
-    FAILED = "failed"
-    """The run failed before its end. Its figures are those up to the failure."""
-    NO_START = "no start"
-    """There is no consistent initial state."""
-    REFUSED = "refused"
-    """The scenario contradicts itself, or violates an assumption."""
-    CRASHED = "crashed"
-    """The process ended, or raised an unexpected error."""
+    FAILED = "failed"  # Before its end; the figures are those up to the failure.
+    NO_START = "no start"  # There is no consistent initial state.
+    REFUSED = "refused"  # The scenario contradicts itself, or violates an assumption.
+    CRASHED = "crashed"  # The process ended, or raised an unexpected error.
     TIMED_OUT = "timed out"
-    """The run exceeded its time limit."""
 
     @property
     def is_final(self) -> bool:
@@ -67,11 +61,11 @@ class RunResult:
     exceeded: tuple[str, ...] = ()
 
 
+# Keys whose values are set in a context, for any scenario.
 _OF_A_RUN = (
     r"description|duration|judgement\.may_diverge|(integrator|write)(\..+)?|start\.errors(\..+)?|"
     r"sensors\.(encoders\.seed|force\.(seed|bias|drift))"
 )
-"""Keys whose values are set in a context, for any scenario."""
 
 
 def structure_of(variation: Variation, base: Scenario) -> Variation:
@@ -92,7 +86,7 @@ def structure_of(variation: Variation, base: Scenario) -> Variation:
         patterns.append(r"plant\.(payloads\.\d+\.mass|disturbances\.\d+\.force(\.\d)?)")
     if not (isinstance(base.law.gains, Matrices) or base.is_advised or base.task is not None):
         patterns.append(r"law\.gains\..+")
-        if np.any(base.sensors.force_noise):
+        if base.sensors.force_noise:
             patterns.append(r"sensors\.force\.noise_deviation")
     in_context = re.compile("|".join(patterns))
     own = {key: value for key, value in variation.items() if not in_context.fullmatch(key)}
@@ -109,11 +103,10 @@ class Runner:
     """
 
     def __init__(self, base: Mapping[str, Any], lasting: float | None = None) -> None:
-        self._base, self._lasting = base, lasting
+        self._base, self._lasting, self.builds = base, lasting, 0
         self._scenario = self._read({})
         self._structure: Variation | None = None
         self._loop: ClosedLoop | DrakeDaeError | None = None
-        self.builds = 0
 
     def run(self, variation: Variation) -> RunResult:
         """The result of a run, whatever happens in it."""
@@ -148,11 +141,9 @@ class Runner:
             start_scenario(scenario, loop)
         except ModelError as error:
             raise ScenarioError(("", str(error))) from error
-        except ScenarioError as error:
-            if not _is_about_states(error):
+        except DrakeDaeError as error:
+            if isinstance(error, ScenarioError) and not _is_about_states(error):
                 raise
-        except DrakeDaeError:
-            pass
 
     def _read(self, variation: Variation) -> Scenario:
         scenario = read_scenario(varied_data(self._base, variation))
@@ -161,7 +152,7 @@ class Runner:
     def _built(self, variation: Variation) -> tuple[Scenario, ClosedLoop]:
         """The scenario of a run and its closed loop, which is built if the structure changed."""
         scenario, structure = self._read(variation), structure_of(variation, self._scenario)
-        if structure != self._structure:
+        if structure != self._structure or self._loop is None:
             self._structure, self._loop = structure, None
             self.builds += 1
             try:
@@ -170,7 +161,6 @@ class Runner:
                 self._loop = error
         if isinstance(self._loop, DrakeDaeError):
             raise self._loop
-        assert self._loop is not None
         return scenario, self._loop
 
     def _simulated(
@@ -180,15 +170,10 @@ class Runner:
         if self._lasting is not None:
             rollout = roll_scenario(scenario, loop, context, self._lasting)
             return rollout.record, rollout.steps, rollout.failure
-        steps, failure = 0, None
+        steps, failure, may = 0, None, scenario.judgement.may_diverge
+        given = scenario.duration, scenario.integrator
         try:
-            run = simulate(
-                loop.diagram,
-                context,
-                scenario.duration,
-                scenario.integrator,
-                may_diverge=scenario.judgement.may_diverge,
-            )
+            run = simulate(loop.diagram, context, *given, may_diverge=may)
             steps = run.steps
             if run.interrupted:
                 raise KeyboardInterrupt(run.interrupted)

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,9 @@ from drake_dae.errors import ModelError
 from drake_dae.studies.runs import Outcome, RunResult
 from drake_dae.studies.variations import Variation
 
-FILES = ("runs.csv", "runs.png")
-"""The names of the files that `Study.save` writes."""
-
-MOST_REASONS = 5
-"""The largest number of unfinished runs that are listed with their reasons."""
-
-MOST_AXES = 24
-"""The largest number of figures in the plot."""
+FILES = ("runs.csv", "runs.png")  # The files that `Study.save` writes.
+MOST_REASONS = 5  # The most unfinished runs that are listed with their reasons.
+MOST_AXES = 24  # The most figures in the plot.
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,24 +39,19 @@ class Study:
             if result.outcome is not Outcome.FINISHED:
                 name = ", ".join(f"{key}={_cell(value)}" for key, value in changes.items())
                 others.append(f"run {run}, {name}: {result.outcome}: {result.reason}")
-        if len(others) > MOST_REASONS:
-            others = [*others[:MOST_REASONS], f"and {len(others) - MOST_REASONS} more"]
-        if others:
-            parts.append(others)
-        beyond = Counter(name for result in self.results for name in result.exceeded)
-        if beyond:
+        more = [f"and {len(others) - MOST_REASONS} more"] * (len(others) > MOST_REASONS)
+        parts += [[*others[:MOST_REASONS], *more]] if others else []
+        if beyond := Counter(name for result in self.results for name in result.exceeded):
             counted = (f"{name} in {count_of(n, 'run')}" for name, n in beyond.most_common())
             parts.append([f"beyond their limits: {', '.join(counted)}"])
-        if self.figures:
-            rows = []
-            for figure, extent in self.extent().items():
-                values = self.values(figure)
-                at = str(np.nanargmin(values)), str(np.nanargmax(values))
-                low, median, high = (f"{number:.4g}" for number in extent.values())
-                rows.append([figure, low, at[0], median, high, at[1]])
-            head = ["figure", "least", "at run", "median", "largest", "at run"]
-            parts.append(Table(head, rows))
-        return to_text(parts)
+        rows = []
+        for figure, extent in self.extent().items():
+            values = self.values(figure)
+            least, largest = str(np.nanargmin(values)), str(np.nanargmax(values))
+            low, median, high = (f"{number:.4g}" for number in extent.values())
+            rows.append([figure, low, least, median, high, largest])
+        head = ["figure", "least", "at run", "median", "largest", "at run"]
+        return to_text([*parts, Table(head, rows)] if rows else parts)
 
     def _outcomes(self) -> str:
         counts = Counter(result.outcome for result in self.results)
@@ -100,14 +90,12 @@ class Study:
 
     def extent(self) -> dict[str, dict[str, float]]:
         """Name of a figure -> its least, median and largest value over the runs that have it."""
-        found = {}
-        for name in self.figures:
-            values = self.values(name)
-            numbers = np.nanmin(values), np.nanmedian(values), np.nanmax(values)
-            found[name] = dict(
-                zip(("least", "median", "largest"), map(float, numbers), strict=True)
-            )
-        return found
+        of: dict[str, Callable[[FloatArray], Any]]
+        of = {"least": np.nanmin, "median": np.nanmedian, "largest": np.nanmax}
+        return {
+            figure: {name: float(function(self.values(figure))) for name, function in of.items()}
+            for figure in self.figures
+        }
 
     def plot(self) -> Figure:
         """Each figure that varies over the first key with numbers that vary, or over the runs.

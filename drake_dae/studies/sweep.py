@@ -37,15 +37,12 @@ from drake_dae.studies.runs import Outcome, Runner, RunResult, run_one, structur
 from drake_dae.studies.study import Study
 from drake_dae.studies.variations import Variation, plain
 
+# The largest number of variations whose keys and values are checked before the first run.
 CHECKED = 20
-"""The largest number of variations whose keys and values are checked before the first run."""
-
+# The number of runs after which a process is replaced if each has a loop of its own, since Drake
+# does not free all memory.
 BUILDS = 200
-"""The number of runs after which a process is replaced if each has a loop of its own, since Drake
-does not free all memory."""
-
-AHEAD = 1000
-"""The largest number of runs that an executor has at a time."""
+AHEAD = 1000  # The largest number of runs that an executor has at a time.
 
 Submit = Callable[[str, Variation], "Future[RunResult]"]
 

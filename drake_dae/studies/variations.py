@@ -16,11 +16,8 @@ from drake_dae.arrays import FloatArray, brief, check_whole_number
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.typed_yaml import load_yaml
 
-MOST_RUNS = 1_000_000
-"""The largest number of runs of a sweep; more would take weeks."""
-
-Variation = dict[str, Any]
-"""Dotted key of a scenario -> its value in one run, as plain data."""
+MOST_RUNS = 1_000_000  # The largest number of runs of a sweep; more would take weeks.
+Variation = dict[str, Any]  # Dotted key of a scenario -> its value in one run, as plain data.
 
 _NUMBER = r"([-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)"
 _INTERVAL = re.compile(rf"\s*{_NUMBER}\.\.{_NUMBER}(?::([0-9]{{1,9}}))?\s*")

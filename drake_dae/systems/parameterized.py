@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,9 +20,9 @@ from drake_dae.robots import RobotModel
 class ParameterizedSystem(TracedSystem):
     """A block whose numeric parameter 0 begins with all parameters of a DaeSystem.
 
-    Varying ones, the exogenous signals w, come through an input port `exogenous` with as many
-    derivatives, `degrees`, as the block needs, stacked like references; without a wire they keep
-    the values of the parameters, at `exogenous_places`.
+    Exogenous signals w come through an input port `exogenous` with as many derivatives, `degrees`,
+    as the block needs, stacked like references; without a wire they keep the values of the
+    parameters, at `exogenous_places`.
     """
 
     __slots__ = TracedSystem.__slots__
@@ -89,10 +90,8 @@ def with_exogenous(block: Block, places: Sequence[int]) -> Block:
 def changed_parameters(model: RobotModel, parameters: Mapping[str, ArrayLike]) -> FloatArray:
     """All parameters of a robot, some of surfaces, masses and loads changed for its plant."""
     values = model.dae.parameter_values
-    known = [p.name for p in model.links.parameters]
-    known += [p.name for constraint in model.constraints for p in constraint.parameters]
-    known += [p.name for stage in model.stages for p in stage.parameters]
-    known += [p.name for load in model.known_forces for p in load.parameters]
+    parts: list[Any] = [model.links, *model.constraints, *model.stages, *model.known_forces]
+    known = [parameter.name for part in parts for parameter in part.parameters]
     for name, value in parameters.items():
         if name not in known:
             raise ModelError(

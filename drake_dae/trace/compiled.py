@@ -44,13 +44,10 @@ def attempts(compiled: Compiled, operations: int) -> list[tuple[int, bool]]:
     """Returns after how many calls each to look for machine code, and whether to compile then."""
     if compiled != "auto":
         return [(1, True)] if compiled else []
-    if not operations:
-        return []
-    result = [(LOOK, False)]
-    if level := _level(compiled, operations):
-        seconds = STARTING + COMPILING[level] * operations
-        result.append((int(seconds / (INTERPRETED * operations)), True))
-    return result
+    if not operations or not (level := _level(compiled, operations)):
+        return [(LOOK, False)] if operations else []
+    seconds = STARTING + COMPILING[level] * operations
+    return [(LOOK, False), (int(seconds / (INTERPRETED * operations)), True)]
 
 
 def check_choice(owner: str, compiled: Any) -> None:
@@ -76,10 +73,10 @@ def library(
     """Returns a shared library in the cache, compiled from C; None, with a warning, if not."""
     try:
         return _library(source, operations, compiled, make, tuple(options))
-    except MachineCodeError as error:
-        reason = str(error)
-    except OSError as error:
+    except (MachineCodeError, OSError) as error:
         reason = f"the cache of compiled code cannot be used: {error}"
+        if isinstance(error, MachineCodeError):
+            reason = str(error)
     if make:
         # One text at one place: Python shows it once.
         warnings.warn(
@@ -94,18 +91,17 @@ def library(
 def _library(
     source: str, operations: int, compiled: Compiled, make: bool, options: tuple[str, ...]
 ) -> Path | None:
-    compiler, folder = find_compiler(), cache_folder()
+    compiler, folder, level = find_compiler(), cache_folder(), _level(compiled, operations)
 
     def stored(level: str) -> Path:
         build = (*FLAGS, *compiler.target, level, *options)
         parts = "\0".join((source, *compiler.command, compiler.identity, *build))
         return folder / f"{hashlib.sha256(parts.encode()).hexdigest()[:32]}.so"
 
-    for level in ("-O1", "-O0") if compiled == "auto" else ("-O1",):
-        if stored(level).exists():
+    for each in ("-O1", "-O0") if compiled == "auto" else ("-O1",):
+        if stored(each).exists():
             _check_trusted(folder)
-            return stored(level)
-    level = _level(compiled, operations)
+            return stored(each)
     if not (make and level):
         return None
     folder.mkdir(0o700, parents=True, exist_ok=True)
@@ -120,14 +116,12 @@ def _library(
 
 
 def cache_folder() -> Path:
-    """Returns the path of the cache, also if it does not exist: DRAKE_DAE_CACHE if it is set.
+    """Returns the path of the cache, also if it does not exist; DRAKE_DAE_CACHE if it is set.
 
-    Otherwise drake_dae in the user's folder for caches: $XDG_CACHE_HOME, or ~/Library/Caches on
-    macOS and ~/.cache elsewhere. Files are put there by one `os.replace` and never change, so that
-    processes share it without locks.
+    Files are put there by one `os.replace` and never change: processes share it without locks.
     """
-    if os.environ.get("DRAKE_DAE_CACHE"):
-        return Path(os.environ["DRAKE_DAE_CACHE"]).absolute()
+    if named := os.environ.get("DRAKE_DAE_CACHE"):
+        return Path(named).absolute()
     folder = Path(os.environ.get("XDG_CACHE_HOME", ""))
     if folder.is_absolute():  # Its specification says to ignore other paths.
         return folder / "drake_dae"
@@ -170,22 +164,20 @@ def generate(*functions: ca.Function) -> str:
         generator.add(function)
     source = str(generator.dump())
     for function in functions:
-        source = _with_memory(source, function) if function.sz_w() or function.sz_iw() else source
-    return source
-
-
-def _with_memory(source: str, function: ca.Function) -> str:
-    """Adds the memory of a function that calls others, as lookups in tables, to its C source."""
-    begin = source.index(f"int {function.name()}(const casadi_real** arg")
-    body = source.index("{", begin) + 1
-    own = f"""
+        if not (function.sz_w() or function.sz_iw()):
+            continue
+        # It calls others, as lookups in tables, and has its memory on the stack.
+        begin = source.index(f"int {function.name()}(const casadi_real** arg")
+        body = source.index("{", begin) + 1
+        own = f"""
   const casadi_real *arguments[{function.sz_arg()}];
   casadi_real *results[{function.sz_res()}], reals[{function.sz_w() + 1}];
   casadi_int i, integers[{function.sz_iw() + 1}];
   for (i = 0; i < {function.n_in()}; i++) arguments[i] = arg[i];
   for (i = 0; i < {function.n_out()}; i++) results[i] = res[i];
   arg = arguments, res = results, iw = integers, w = reals;"""
-    return f"{source[:body]}{own}{source[body:]}"
+        source = f"{source[:body]}{own}{source[body:]}"
+    return source
 
 
 def renamed(function: ca.Function, name: str) -> ca.Function:

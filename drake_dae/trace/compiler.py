@@ -11,7 +11,7 @@ from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from drake_dae.errors import MachineCodeError
 
@@ -103,7 +103,7 @@ def _find_compiler(named: str, path: str) -> Compiler | str:
     if not command:
         has_own = shutil.which("cc") or find_spec("ziglang") is None
         command = ["cc"] if has_own else [sys.executable, *ZIG]
-    if shutil.which(command[0]) is None:
+    if (found := shutil.which(command[0])) is None:
         where = f"CC names '{command[0]}', which is" if named.strip() else "'cc' is"
         return (
             f"no C compiler: {where} not found; install gcc or clang, name "
@@ -111,8 +111,7 @@ def _find_compiler(named: str, path: str) -> Compiler | str:
         )
     # The option for this processor, and the target that the compiler derives from it. The target is
     # part of the identity, so that machines with a shared cache each have their own code.
-    target: tuple[str, ...] = ()
-    processor = ""
+    target, processor = tuple[str, ...](), ""
     try:
         version = _run([*command, "--version"], ANSWERS)
         if not any(word.startswith(("-march", "-mcpu")) for word in command):
@@ -122,9 +121,8 @@ def _find_compiler(named: str, path: str) -> Compiler | str:
     except MachineCodeError as error:
         return str(error)
     library = "CS_GNU_LIBC_VERSION" in os.confstr_names and os.confstr("CS_GNU_LIBC_VERSION")
-    machine = (library, platform.system(), platform.machine(), processor)
-    words = (shutil.which(command[0]), version.stdout, version.stderr, *machine)
-    return Compiler(tuple(command), repr(words), target)
+    said = (version.stdout, version.stderr, library, platform.system(), platform.machine())
+    return Compiler(tuple(command), repr((found, *said, processor)), target)
 
 
 def compile_webassembly(source: Path, file: Path) -> None:
@@ -148,17 +146,10 @@ def _compile(command: list[str], file: Path, seconds: float) -> None:
 
 def _run(command: list[str], seconds: float) -> "subprocess.CompletedProcess[str]":
     """Runs a command to its end. After a timeout it also ends the child processes."""
-    pipe = subprocess.PIPE
+    options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    options |= {"stdin": subprocess.DEVNULL, "errors": "replace", "process_group": 0}
     try:
-        with subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=pipe,
-            stderr=pipe,
-            text=True,
-            errors="replace",
-            process_group=0,
-        ) as process:
+        with subprocess.Popen(command, **options) as process:
             try:
                 said = process.communicate(timeout=seconds)
             except BaseException:

@@ -1,15 +1,17 @@
-"""Expressions: whether they are smooth, since the theory differentiates, and functions of users."""
+"""Expressions: whether they are smooth, functions of users, and formulas as text."""
 
-from collections.abc import Callable
+import ast
+import operator
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import brief
+from drake_dae.arrays import brief, number_in, unknown_name
 from drake_dae.errors import DrakeDaeError, ModelError
 
-# Operations of CasADi that are not smooth.
+# Operations of CasADi that are not smooth; the theory differentiates.
 KINKS = {
     ca.OP_FABS: "fabs",
     ca.OP_SIGN: "sign",
@@ -24,6 +26,22 @@ KINKS = {
     **dict.fromkeys((ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE), "a comparison"),
 }
 LARGE = 2.0**200
+SMOOTH = "write the one side that is needed, or a smooth function such as sqrt(x**2 + 1e-6) for |x|"
+MOST_LETTERS = 10_000  # Of a formula.
+OPERATORS: dict[type[ast.AST], Callable[..., ca.SX]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
+}
+# The functions of formulas; atan2 takes two numbers, the others one.
+FUNCTIONS = (
+    *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh"),
+    *("atanh", "exp", "log", "sqrt", "erf", "atan2"),
+)
 
 
 def length_of(vector: ca.SX) -> ca.SX:
@@ -58,8 +76,7 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX, name: str = "a v
     for i, operation in enumerate(instructions):
         if operation == ca.OP_OUTPUT:
             continue
-        inputs = function.instruction_input(i)
-        moves = False
+        inputs, moves = function.instruction_input(i), False
         if operation == ca.OP_CONST:
             value = function.instruction_constant(i)
             if not np.isfinite(value):
@@ -69,12 +86,12 @@ def find_flaw(expression: ca.SX, variable: ca.SX, other: ca.SX, name: str = "a v
             moves = inputs[0] == 0
         else:
             moves = any(moving[i] for i in inputs)
-            if moves and operation in KINKS:
-                return (
-                    f"is not smooth: it takes {KINKS[operation]} of {name}. Derivatives would be "
-                    "those of one side without notice; write the one side that is needed, or a "
-                    "smooth function such as tanh(x / e) or sqrt(x**2 + e**2)"
-                )
+        if moves and operation in KINKS:
+            return (
+                f"is not smooth: it takes {KINKS[operation]} of {name}. Derivatives would be those "
+                "of one side without notice; write the one side that is needed, or a smooth "
+                "function such as tanh(x / e) or sqrt(x**2 + e**2)"
+            )
         moving.update(dict.fromkeys(function.instruction_output(i), moves))
     return ""
 
@@ -93,3 +110,69 @@ def result_of(
     except Exception as failure:
         text = f"{what} failed: {type(failure).__name__}: {brief(str(failure))}"
         raise error(text) from failure
+
+
+def parse_formula(text: str, symbols: Mapping[str, ca.SX]) -> ca.SX:
+    """Parses a text such as "z - 0.1*sin(x)**2", never executed as Python, to an expression.
+
+    It may have numbers, the symbols, pi, + - * / **, brackets, and sin, cos, tan, asin, acos, atan,
+    atan2, sinh, cosh, tanh, asinh, acosh, atanh, exp, log, sqrt, erf.
+    """
+    if len(text) > MOST_LETTERS:
+        raise ModelError(f"a formula has at most {MOST_LETTERS} letters, this one {len(text)}")
+    text, names = " ".join(text.split()), {"pi": ca.SX(ca.pi), **symbols}
+    if not text:
+        raise ModelError("the formula is empty; write one such as z - 0.1*sin(x)")
+
+    def wrong(place: int, what: str) -> ModelError:
+        return ModelError(f"formula '{_short(text)}', column {place + 1}: {what}")
+
+    def value(node: ast.expr) -> ca.SX:
+        piece = ast.get_source_segment(text, node) or ""
+        match node:
+            # Python also accepts 1_000 and 0x10, and makes numbers that are too large infinite.
+            case ast.Constant() if (number := number_in(piece)) is not None:
+                return ca.SX(number)
+            case ast.Name(id=name) if name in names:
+                return ca.SX(names[name])
+            case ast.BinOp(left, op, right) if type(op) in OPERATORS:
+                return OPERATORS[type(op)](value(left), value(right))
+            case ast.UnaryOp(op, operand) if type(op) in OPERATORS:
+                return OPERATORS[type(op)](value(operand))
+            case ast.Call(ast.Name(id=name), arguments, []) if name in FUNCTIONS:
+                if len(arguments) == 1 + (name == "atan2"):
+                    return getattr(ca, name)(*map(value, arguments))
+                why = f"'{_short(piece)}' has another number of values than {name} takes"
+            case ast.Name(id=name):
+                why = unknown_name("name", name, names)
+            case ast.Call(ast.Name(id=name)):
+                why = f"'{_short(piece)}': {unknown_name('function', name, FUNCTIONS)}; {SMOOTH}"
+            case _:
+                why = (
+                    f"'{_short(piece)}' is not allowed; a formula has finite numbers, names, "
+                    f"+ - * / **, brackets and functions; {SMOOTH}"
+                )
+        raise wrong(len(text.encode()[: node.col_offset].decode()), why)
+
+    try:
+        return value(ast.parse(text, mode="eval").body)
+    except ModelError:
+        raise
+    except SyntaxError as error:
+        place = (error.offset or 1) - 1
+        raise wrong(place, f"it cannot be read at '{_short(text[place:], 20)}'") from None
+    except (ValueError, RecursionError, MemoryError):
+        raise ModelError("the formula holds a null letter, or too many brackets") from None
+
+
+def check_names(names: Mapping[str, object], taken: tuple[str, ...]) -> None:
+    """Checks that a formula can use names of parameters."""
+    for name in names:
+        if not name.isidentifier():
+            raise ModelError(f"parameter '{name}': a name is a word such as r_1")
+        if name in (*taken, "pi", *FUNCTIONS):
+            raise ModelError(f"parameter '{name}': in a formula this means something else")
+
+
+def _short(text: str, letters: int = 60) -> str:
+    return text if len(text) <= letters else f"{text[: letters - 3]}..."

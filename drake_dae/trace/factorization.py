@@ -24,9 +24,8 @@ class Factorization:
 
     def __init__(self, matrix: ca.SX) -> None:
         size = matrix.shape[1]
-        self._triangle = ca.SX(size, size)
+        self._triangle, self.pivot = ca.SX(size, size), ca.SX(1)
         self._directions: list[ca.SX] = []
-        self.pivot = ca.SX(1)
         if matrix.shape == (1, 1):
             # Exact, and without a square root.
             self._directions, self._triangle = [ca.SX(1)], matrix

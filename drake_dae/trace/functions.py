@@ -70,10 +70,8 @@ class TracedFunction:
         often: bool = True,
         compiled: Compiled = False,
     ) -> None:
-        self.name = name
-        self._regular = regular
-        self.input_names = tuple(inputs)
-        self.output_names = tuple(outputs)
+        self.name, self._regular, self._often, self._compiled = name, regular, often, compiled
+        self.input_names, self.output_names = tuple(inputs), tuple(outputs)
         dense = [ca.densify(expression) for expression in outputs.values()]
         # Two numbers show whether the values are valid: the first is finite exactly if all outputs
         # are, the last if also the pivot is large enough.
@@ -82,25 +80,19 @@ class TracedFunction:
         if pivot is not None:
             regularity = pivot
             checks.append(finite + ca.if_else(pivot >= SINGULAR_PIVOT, 0, np.nan))
-        expressions = [*dense, regularity, *checks]
-        self._expressions, self._symbols = expressions, list(inputs.values())
-        self._often = often
+        self._expressions, self._symbols = [*dense, regularity, *checks], list(inputs.values())
         self.sizes = tuple(symbol.numel() for symbol in self._symbols)
         self._num_inputs, self._num_outputs = len(self.sizes), len(dense)
         self._local, self._lock = local(), RLock()
         self._current: ca.Function | None = None  # What calls evaluate; None before the first.
-        self._compiled = compiled
         self._attempts: list[tuple[int, bool]] | None = None  # None before the first call.
-        self._calls_left = 0
-        self.is_machine_code = False
+        self._calls_left, self.is_machine_code = 0, False
 
     @cached_property
     @uncollected
     def function(self) -> ca.Function:
         """The CasADi function: outputs, pivot, and numbers that are finite if they are valid."""
-        expressions = self._expressions
-        if self._often:
-            expressions = ca.cse(expressions)
+        expressions = ca.cse(self._expressions) if self._often else self._expressions
         name = re.sub("[^A-Za-z0-9]+", "_", f"f_{self.name}")  # As CasADi accepts them.
         return ca.Function(name, self._symbols, expressions, {"cse": False})
 
@@ -113,20 +105,18 @@ class TracedFunction:
         """Makes the function before the first call, and machine code after some more."""
         with self._lock:
             if self._attempts is None:
-                self._attempts = attempts(self._compiled, self.num_operations)[: 9 * self._often]
+                self._current, self._attempts = self.function, []
+                if self._often:
+                    self._attempts = attempts(self._compiled, self.num_operations)
                 self._calls_left = self._attempts[0][0] if self._attempts else 0
-                self._current = self.function
-            if not self._attempts:
-                return
             self._calls_left -= 1
-            if self._calls_left > 0:
+            if not self._attempts or self._calls_left > 0:
                 return
             _, make = self._attempts.pop(0)
             self._calls_left = self._attempts[0][0] if self._attempts else 0
             code = machine_code(self.function, self._compiled, make)
             if code is not None:
-                self._attempts.clear()
-                self._current, self.is_machine_code = code, True
+                self._attempts, self._current, self.is_machine_code = [], code, True
 
     @property
     def _arrays(self) -> "_Arrays":
@@ -198,33 +188,30 @@ class TracedFunction:
 
     def derivative(self, output: int, inputs: Sequence[int]) -> "TracedFunction":
         """Returns the function of the derivatives of an output by some inputs, side by side."""
-        names = self.input_names
-        symbols = [ca.SX.sym(name, size) for name, size in zip(names, self.sizes, strict=True)]
-        value = ca.vec(self.function(*symbols)[output])
-        slope = ca.jacobian(value, ca.vertcat(*[symbols[i] for i in inputs]))
-        return TracedFunction(
-            f"{self.output_names[output]} of {self.name}, differentiated by "
-            + " and ".join(names[i] for i in inputs),
-            dict(zip(names, symbols, strict=True)),
-            {"slope": slope},
-            often=False,
-        )
+        symbols = dict(zip(self.input_names, self._symbols, strict=True))
+        by = [self.input_names[i] for i in inputs]
+        value = ca.vec(self._expressions[output])
+        slope = ca.jacobian(ca.cse(value), ca.vertcat(*[symbols[name] for name in by]))
+        name = f"{self.output_names[output]} of {self.name}, differentiated by {' and '.join(by)}"
+        return TracedFunction(name, symbols, {"slope": slope}, often=False)
 
     def __call__(self, *arguments: ArrayLike) -> tuple[FloatArray, ...]:
         """Evaluates the function and returns new arrays."""
-        if len(arguments) == self._num_inputs and all(map(_fits, arguments, self.sizes)):
-            return tuple(output.copy() for output in self.evaluate(*arguments))  # type: ignore
         if len(arguments) != self._num_inputs:
             raise ModelError(
                 f"{self.name} takes {self._num_inputs} arguments "
                 f"({', '.join(self.input_names)}), got {len(arguments)}"
             )
-        arrays = []
-        for label, size, argument in zip(self.input_names, self.sizes, arguments, strict=True):
-            array = numbers(f"{self.name}: '{label}'", argument)
+        arrays: list[Any] = list(arguments)
+        for i, (argument, size) in enumerate(zip(arrays, self.sizes, strict=True)):
+            is_array = type(argument) is np.ndarray and argument.dtype == np.float64
+            if is_array and argument.shape == (size,):  # As most are.
+                continue
+            what = f"{self.name}: '{self.input_names[i]}'"
+            array = numbers(what, argument)
             if array.size != size or (array.ndim > 1 and array.shape != (size, 1)):
-                raise ModelError(f"{self.name}: '{label}' has shape {array.shape}, not {(size,)}")
-            arrays.append(array.reshape(-1))
+                raise ModelError(f"{what} has shape {array.shape}, not {(size,)}")
+            arrays[i] = array.reshape(-1)
         return tuple(output.copy() for output in self.evaluate(*arrays))
 
 
@@ -250,9 +237,3 @@ class _Arrays:
             self._buffer.set_arg(index, array.data)
         for index, result in enumerate(self._results):
             self._buffer.set_res(index, result.reshape(-1, order="F").data)
-
-
-def _fits(argument: Any, size: int) -> bool:
-    """Whether an argument is an array of floats of the shape of an input, as most are."""
-    is_array = type(argument) is np.ndarray
-    return is_array and argument.dtype == np.float64 and argument.shape == (size,)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from math import sqrt
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -40,9 +40,8 @@ def newton(
     """Solves equations by damped Newton's method.
 
     A step is shortened until the step after it, by the same matrix, is shorter. This test does not
-    depend on the units of the equations (Deuflhard, 2004, section 3.3). Steps
-    are measured relative to the start, or to 1 if that is larger. A solution is then improved as
-    long as steps decrease, which does not depend on units.
+    depend on the units of the equations (Deuflhard, 2004, section 3.3). Steps are measured relative
+    to the start, or to 1 if that is larger. A solution is improved as long as steps decrease.
     """
     x, unit = start, np.maximum(1.0, np.abs(start))
 
@@ -81,15 +80,12 @@ def newton(
 
 def once(function: Callable[[FloatArray], T]) -> Callable[[FloatArray], T]:
     """Returns a function with a memory of its last value, since `newton` calls it repeatedly."""
-    at: FloatArray | None = None
-    value: Any = None
+    last: list[tuple[FloatArray, T]] = []
 
     def evaluated(x: FloatArray) -> T:
-        nonlocal at, value
-        if x is not at:
-            at, value = x, function(x)
-        result: T = value
-        return result
+        if not last or x is not last[0][0]:
+            last[:] = [(x, function(x))]
+        return last[0][1]
 
     return evaluated
 

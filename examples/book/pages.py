@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_dae.cli import main
-from drake_dae.commands.parser import program
+from drake_dae.commands.writing import program
 
 BOOK = Path(__file__).parent
 

@@ -1,5 +1,7 @@
 """`drake-dae sweep`: what it prints and leaves, and what it refuses."""
 
+import json
+
 import pytest
 
 from drake_dae.cli import main
@@ -10,18 +12,24 @@ VARY = ["--vary", "start.errors.tool.z=0..0.05:3"]
 
 
 @pytest.mark.slow
-def test_it_leaves_its_files_and_prints_the_summary(tmp_path, monkeypatch, capsys):
+def test_it_leaves_its_files_and_tells_programs_and_people(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    for _ in range(2):  # The second time it has all runs already.
-        assert main(["sweep", "two_link_wall", *VARY, *SHORT, "--workers=1"]) == 0
-        printed = capsys.readouterr()
-        folder = tmp_path / "runs" / "two_link_wall-sweep"
-        assert printed.out.startswith("3 runs: 3 finished\n")
-        assert printed.out.endswith(f"/: {', '.join(['runs.db', *FILES])}\n")
-        assert printed.err == ""
-        assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, "runs.db"])
-    other = ["sweep", "two_link_wall", *VARY, *SHORT[2:], "--set", "duration=0.3"]
-    assert main(other) == 1
+    folder = tmp_path / "runs" / "two_link_wall-sweep"
+    words = ["sweep", "two_link_wall", "--workers=1", "--vary=start.errors.tool.z=[0, 0.01, 9]"]
+    assert main([*words, *SHORT, "--json", "--check"]) == 2
+    found = json.loads(capsys.readouterr().out)
+    assert found["outcomes"] == {"finished": 2, "no start": 1}
+    assert [run["run"] for run in found["not_finished"]] == [2]
+    extent = found["figures"]["largest error of tool.z [m]"]
+    assert 0.0 <= extent["least"] <= extent["median"] <= extent["largest"] < 0.1
+    assert found["files"] == ["runs.db", *FILES]
+    assert {path.name for path in folder.iterdir()} == {*found["files"]}
+    # It has all runs already.
+    assert main([*words, *SHORT]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("3 runs: 2 finished")
+    assert printed.out.endswith(f"/: {', '.join(['runs.db', *FILES])}\n")
+    assert main([*words, *SHORT[2:], "--set", "duration=0.3"]) == 1
     said = capsys.readouterr().err
     assert "duration" in said
     assert "runs/two_link_wall-sweep/runs.db" in said

@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from drake_dae.commands.parser import complete
+from drake_dae.commands.writing import complete
 from drake_dae.running.interruption import end_at_once, ending_signals
 
 

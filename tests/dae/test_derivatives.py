@@ -110,10 +110,7 @@ def test_the_inverse_reports_where_constraint_inputs_that_no_control_moves_are_n
         state=x,
         f=ca.vertcat(x[3], x[4], 0, 0, 0, 0),
         g=ca.vertcat(
-            ca.horzcat(1, ca.cos(x[2])),
-            ca.horzcat(0, ca.sin(x[2])),
-            ca.SX(3, 2),
-            ca.SX([[1, 2]]),
+            ca.horzcat(1, ca.cos(x[2])), ca.horzcat(0, ca.sin(x[2])), ca.SX(3, 2), ca.SX([[1, 2]])
         ),
         h=ca.vertcat(ca.SX(5, 1), 1),
         k=x[:2],

@@ -4,9 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from actuated import OFFSET, actuated, at_rest, start_position
-from problems import (
-    PROBLEMS,
-)
+from problems import PROBLEMS
 from problems.zero_systems import (
     HOLES,
     MINIMUM_PHASE,
@@ -20,9 +18,7 @@ from problems.zero_systems import (
 )
 
 from drake_dae.dae import DaeSystem, Verdict, ZeroDynamics
-from drake_dae.errors import (
-    InconsistentStateError,
-)
+from drake_dae.errors import InconsistentStateError
 
 
 def tanks_at_rest(pumps, valves, levels) -> tuple[Array, Array]:

@@ -3,12 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import (
-    integrated,
-)
-from problems.extensions import (
-    wheels,
-)
+from problems import integrated
+from problems.extensions import wheels
 
 from drake_dae.dae import Extension, TrackingLaw, dynamic_extension, poles
 

@@ -3,15 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import (
-    changed,
-    hidden_normal_form,
-)
-from problems.extensions import (
-    REGULAR,
-    evaluated,
-    extension_of,
-)
+from problems import changed, hidden_normal_form
+from problems.extensions import REGULAR, evaluated, extension_of
 from runs import some
 
 from drake_dae.dae import DaeSystem, dynamic_extension, find_structure

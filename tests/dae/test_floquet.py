@@ -107,14 +107,7 @@ def test_multipliers_with_a_constraint():
 
     system = DaeSystem.from_functions(
         ["h", "x", "y", "h'", "x'", "y'"],
-        f=lambda s: [
-            s[3],
-            s[4],
-            s[5],
-            0,
-            -damping * s[4],
-            -damping * (s[5] - s[3]) - gravity,
-        ],
+        f=lambda s: [s[3], s[4], s[5], 0, -damping * s[4], -damping * (s[5] - s[3]) - gravity],
         g=lambda s: [0, 0, 0, -(s[2] - s[0]), s[1], s[2] - s[0]],
         h=lambda s: [0, 0, 0, 1, 0, 0],
         k=lambda s: (s[1] ** 2 + (s[2] - s[0]) ** 2 - length**2) / 2,

@@ -13,12 +13,7 @@ def sorted_poles(values) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "chosen",
-    [
-        [-1.0, -2.0, -5.0],
-        [-1.0, -2.0 + 3.0j, -2.0 - 3.0j],
-        np.array([-0.5, -0.5, -0.5]),
-    ],
+    "chosen", [[-1.0, -2.0, -5.0], [-1.0, -2.0 + 3.0j, -2.0 - 3.0j], np.array([-0.5, -0.5, -0.5])]
 )
 @pytest.mark.equation(32)
 def test_the_error_dynamics_have_the_chosen_poles(chosen):

@@ -3,13 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import (
-    changed,
-)
-from problems.extensions import (
-    GRAVITY,
-    vtol,
-)
+from problems import changed
+from problems.extensions import GRAVITY, vtol
 
 from drake_dae.dae import DaeSystem, dynamic_extension
 from drake_dae.errors import AssumptionError
@@ -34,11 +29,7 @@ def pair(outputs) -> DaeSystem:
 
 
 @pytest.mark.parametrize(
-    "outputs",
-    [
-        lambda x: [x[0], ca.sin(x[0])],
-        lambda x: [x[0], x[0] * x[1] + x[1]],
-    ],
+    "outputs", [lambda x: [x[0], ca.sin(x[0])], lambda x: [x[0], x[0] * x[1] + x[1]]]
 )
 def test_outputs_that_depend_on_each_other(outputs):
     """One is a function of the other, of its derivative, or of both."""

@@ -4,19 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 from actuated import OFFSET, actuated, at_rest, drive, rates, start_position
-from problems import (
-    PROBLEMS,
-    Problem,
-    reference_at,
-    wanted_outputs,
-)
-from problems.zero_systems import (
-    GRAVITY,
-    Array,
-    cart_pendulum,
-    derivatives,
-    zero_dynamics,
-)
+from problems import PROBLEMS, Problem, reference_at, wanted_outputs
+from problems.zero_systems import GRAVITY, Array, cart_pendulum, derivatives, zero_dynamics
 from runs import some
 from scipy.integrate import solve_ivp
 

@@ -4,11 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems import (
-    changed,
-    double_integrator,
-    system_of,
-)
+from problems import changed, double_integrator, system_of
 from problems.found import violation
 
 from drake_dae.analysis import analyze

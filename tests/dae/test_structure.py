@@ -3,11 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import (
-    PROBLEMS,
-    changed,
-    hidden_normal_form,
-)
+from problems import PROBLEMS, changed, hidden_normal_form
 from problems.found import degrees, untidy_one, violation
 from runs import some
 

@@ -1,20 +1,10 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import (
-    PROBLEMS,
-    closed_loop_outputs,
-    reference_at,
-    wanted_outputs,
-)
+from problems import PROBLEMS, closed_loop_outputs, reference_at, wanted_outputs
 from runs import some
 
-from drake_dae.dae import (
-    TrackingLaw,
-    gain_coefficients,
-    gain_matrices,
-    poles,
-)
+from drake_dae.dae import TrackingLaw, gain_coefficients, gain_matrices, poles
 
 
 @pytest.mark.slow

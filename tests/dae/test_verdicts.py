@@ -27,11 +27,7 @@ def test_an_equilibrium_inside_a_limit_cycle_is_unstable_and_the_cycle_is_not_ju
     """
     system = DaeSystem.from_functions(
         ["z", "v", "w"],
-        f=lambda x: [
-            0,
-            x[1] - x[1] ** 3 / 3 - x[2] + 0.5,
-            (x[1] + 0.7 - 0.8 * x[2]) / 12.5,
-        ],
+        f=lambda x: [0, x[1] - x[1] ** 3 / 3 - x[2] + 0.5, (x[1] + 0.7 - 0.8 * x[2]) / 12.5],
         h=lambda x: [1, 0, 0],
         l=lambda x: x[0],
         nominal_state=[0.0, 1.0, 0.5],

@@ -3,14 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import (
-    PROBLEMS,
-    changed,
-    double_integrator,
-    early_control,
-    redundant,
-    system_of,
-)
+from problems import PROBLEMS, changed, double_integrator, early_control, redundant, system_of
 from problems.found import degrees, untidy_one, violation
 
 from drake_dae.dae import ViolationKind

@@ -19,7 +19,7 @@ def test_first_contact(capsys):
     assert "<title>A two-link arm on a wall</title>" in page
     shown = page._repr_html_()
     assert shown.startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
-    assert "from 0 to 3 s" in found["record"]._repr_html_()
+    assert "from 0 to 3 s" in repr(found["record"])
     assert "errors are off the predicted ones by" in capsys.readouterr().out
 
 

@@ -1,24 +1,13 @@
 """What a scenario refuses: the key, the value and what would be right, all problems at once."""
 
 import pytest
-from runs import scenario
-from scenario_texts import two_link
+from scenario_texts import two_link, written
 
 from drake_dae import build_scenario, load_scenario
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario.shipped import find_scenario
 
 TWO_LINK = find_scenario("two_link_wall").read_text()
-
-
-def refusal(*settings):
-    """The message about a changed two_link_wall."""
-    with pytest.raises(ScenarioError) as caught:
-        build_scenario(two_link(*settings))
-    message = str(caught.value)
-    lines = [f"{key}: {text}" for key, text in caught.value.problems]
-    assert message.splitlines() == lines
-    return message
 
 
 @pytest.mark.parametrize(
@@ -37,10 +26,7 @@ def refusal(*settings):
         ("!Foo\n" + TWO_LINK, ["scenario: ", "!Foo"]),
         (TWO_LINK.replace("start:", "start: !Foo"), ["start: ", "!Foo"]),
         (TWO_LINK.replace("duration: 10.0", "duration: !Foo 1"), ["s.yaml: ", "line 29: ", "!Foo"]),
-        (
-            TWO_LINK + "x: !!python/object/apply:os.getcwd []",
-            ["line 34: ", "os.getcwd"],
-        ),
+        (TWO_LINK + "x: !!python/object/apply:os.getcwd []", ["line 34: ", "os.getcwd"]),
         (TWO_LINK.replace("gains: {", "gains: !Pole {"), ["gains: ", "!Poles", "!Pole"]),
         (TWO_LINK.replace("!Plane", ""), None),
         ("\ufeff" + TWO_LINK, None),
@@ -64,91 +50,149 @@ def test_texts(text, words, tmp_path):
     assert [word for word in words if word not in message] == [], message
 
 
-SINES = "references.wall.force=!Sinusoids"
-MOVE = "references.tool.z=!PointToPoint"
-WELD = "constraints.0=!WeldedFrames {frame_a: world,"
 PIN = "constraints.0=!CoincidentPoints {frame_a: world, point_a: [1.2, 0, 0], frame_b: link2,"
-ALONG = "outputs.0=!SurfaceCoordinates"
-SPRINGS = "actuation=[!FlexibleJoints {inertia: 1, stiffness:"
-WALL = "{name: wall, frame: tool, surface: !Plane {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"
+PIN = f"{PIN} point_b: [1, 0, 0], axes:"
+WALL = "{name: wall, frame: tool, surface: {point: [1.2, 0, 0], normal: [-1, 0, 0]}}"
+TWO_WALLS = f"constraints=[{WALL}, {WALL.replace('name: wall', 'name: b')}]"
+LINE, GENTLE = (
+    "references.tool.z=!Line {start: [0.2], end:",
+    "limits: {speed: 0.2, acceleration: 1}",
+)
+DWELL = "!Dwell {name: away, until: [{of: signal, name: go, above: 0.5}]}"
+ENCODERS = "sensors.encoders={position_noise: 1.0e-5}", "estimator={rate: 60, state_rate: 200}"
+DOME = "constraints.0.surface=!Ellipsoid {center: [0, 0, -2], semi_axes: [1, 2, 2]}"
+# Scenario -> its settings -> parts of the message, between which "|" stands.
+REFUSED = {
+    "two_link_wall": {
+        # Settings and the run.
+        "duration": "--set duration: ",
+        "duration=[1": "duration: |line 1: ",
+        "duration=1\nfoo: 2": "duration: |line 2: ",
+        "description=": "description: ",
+        "duration=0": "duration: |0",
+        "integrator.integration_scheme=runge_kuta5": "integrator: |'runge_kutta5'",
+        # The robot's file and parameters.
+        "robot.file=no.urdf": "robot.file: |/no.urdf",
+        f"robot.file={find_scenario('two_link_wall')}": "robot.file: |two_link_wall.yaml|.urdf",
+        "plant.parameters={link9.mass: [1]}": "plant.parameters: |link9.mass|link2.mass",
+        "bounds={link2.mass: [12, 6]}": "bounds: |'link2.mass'",
+        "bounds={link2.mass: [8, 9]}": "bounds: |'link2.mass'",
+        "bounds={link2.mas: [6, 9]}": "bounds: |'link2.mas'",
+        "bounds={link2.mass: [6]}": "bounds.link2.mass: |[6]",
+        # Constraints.
+        "constraints.0.name=''": "constraints.0.name: ",
+        f"constraints=[{WALL}, {WALL}]": "constraints.1.name: |'wall'",
+        ("outputs=[]", TWO_WALLS): "constraints: |(2)",
+        "constraints.0.surface.point=[3, 0, 0]": "start.positions: |wall.distance",
+        "constraints.0=!WeldedFrames {frame_a: world, frame_b: tool}": "outputs: |6|2",
+        ("outputs=[]", f"{PIN} yz}}"): "constraints: |'pin.y'",
+        (f"{PIN} x}}", "outputs.0=!SurfaceCoordinates {constraint: pin}"): "outputs.0: |'pin'",
+        # Outputs, gains, actuation and force.
+        "outputs.0.axes=xz": "outputs: |1|2|(tool.x, tool.z)",
+        "judgement.tolerances={tool.z: -1}": "judgement.tolerances.tool.z: |-1",
+        "judgement.tolerances={tool.q: 1}": "judgement.tolerances: |'tool.q'",
+        "law.gains.all=[1]": "gains: |Hurwitz",
+        "law.gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}": "gains: |(1, 2)|tool.z",
+        "actuation=[!FlexibleJoints {stiffness: [1, 2, 3], inertia: [1]}]": (
+            "actuation.0: |stiffness"
+        ),
+        "actuation=[!FlexibleJoints {inertia: 1, stiffness: [[1, 0, 0], [0, 1, 0]]}]": (
+            "actuation.0: |(2,)|(2, 2)"
+        ),
+        "sensors.force={time_constant: 1, seed: -1}": "sensors.force.seed: |-1",
+        # References.
+        "references={}": "references: |tool.z|wall.force",
+        "references.tool.z=!Constant {values: [1, 2, 3]}": "references.tool.z: |3|1|tool.z",
+        "references={'wall.force, tool.z': !Constant {values: [1]}}": (
+            "references.wall.force, tool.z: |1|2"
+        ),
+        "references.wall.force=!Sinusoids {offset: 1, amplitudes: [], frequencies: []}": (
+            "references.wall.force.amplitudes: "
+        ),
+        "references.tool.z=!PointToPoint {start: [1], end: [2], end_time: 1, order: 1}": (
+            "tool.z: |order=2"
+        ),
+        f"{LINE} [0.3], limits: {{speed: 1}}}}": "references.tool.z.limits: ",
+        f"{LINE} [0.3], limits: {{speed: 1, acceleration: 0}}}}": (
+            "references.tool.z.limits: acceleration"
+        ),
+        f"{LINE} [[1]], {GENTLE}}}": "references.tool.z: end",
+        f"{LINE} [0.2], {GENTLE}}}": "references.tool.z: start and end",
+        "references.tool.z=!Circle {center: [0, 0], radius: 1, period: 2}": "references.tool.z: 2",
+        f"references.tool.z=!Polyline {{points: [0, 1], corner: 1, {GENTLE}}}": (
+            "references.tool.z.points.0: "
+        ),
+        f"references.tool.z=!Polyline {{points: [[0], [0]], corner: 0.1, {GENTLE}}}": (
+            "references.tool.z: points 0 and 1"
+        ),
+        "references.tool.z=!Waypoints {points: [[0], [1]], times: [0, 0]}": (
+            "references.tool.z: |times"
+        ),
+        "references.tool.z=!Csv {file: none.csv, columns: [z]}": "references.tool.z|/none.csv'",
+        "references.tool.z=!Csv {file: 'a\0b', columns: [z]}": "references.tool.z",
+        f"references.tool.z=!Csv {{file: {find_scenario('biped')}, columns: [z]}}": (
+            "references.tool.z|'time'"
+        ),
+        # The start.
+        "start.positions.joint1=9": "start.positions: |9|-3.1416|3.1416",
+        "start.errors.tool.x=1": "start.errors: |'tool.x'|tool.z",
+        "start.errors.tool.z=5": "start: |tool.z|5.3",
+        # A stretched arm that touches the wall.
+        "start={positions: {joint1: 0.927295218, joint2: 0}}": (
+            "outputs: Assumption (4)|start.positions"
+        ),
+    },
+    "seven_joint_wall": {
+        "start={positions: {joint1: 0}}": "outputs: Assumption (5)|start.positions",
+    },
+    "seven_joint_pipe": {
+        "outputs.0=!PointCoordinates {frame: tool, axes: yz}": "pipe.a|!SurfaceCoordinates",
+    },
+    "rod": {
+        "constraints.0.length=0": "constraints.0: |'rod.length'",
+        "constraints.0.frame_b=tol": "constraints.0: |'tool'",
+    },
+    "ball": {
+        "forces=null": "outputs: |3",
+        "forces=[dome]": "forces.0: |'dome'|dome.force",
+        DOME: "constraints.0: |Ellipsoid",
+    },
+    "task": {
+        "task.phases=[]": "task: ",
+        "task.phases.0.speed=-1": "task.phases.0: |speed|-1",
+        "task.phases.1.if_lost=wait": "Press: if_lost: |'wait'",
+        "task.phases.2.references={tool.x: 1}": "Move: |'tool.x'",
+        "task.contact=floor": "task.contact: 'floor'",
+        "task.gains={all: [5]}": "task.gains: |Hurwitz",
+        "references={tool.z: 0.3}": "references: ",
+        "start.errors={tool.z: 0.1}": "start.errors: ",
+        "law.integral=[wall.force]": "integral: |wall.force",
+        "task.phases.0={name: feel, on_failure: park}": "task: |feel: on_failure: |'park'",
+        f"task.phases.2={DWELL}": "task.signals.go",
+        "task.signals={go: 1}": "'go'",
+        "plant=!IdealConstraints {}": "task|CompliantContact",
+    },
+    "observed_task": {
+        ("sensors.force=null", *ENCODERS): "observer",
+        "task.contact_force=0.1": "contact_force: |0.3|0.1",
+        "task.tare_time=0.01": "task: tare_time: |0.01",
+        "task.phases.0.behind=0": "task.phases.0: |behind",
+    },
+}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        # Settings.
-        ("duration", ["--set duration: "]),
-        ("duration=[1", ["duration: ", "line 1: "]),
-        ("duration=1\nfoo: 2", ["duration: ", "line 2: "]),
-        # The robot's file.
-        ("robot.file=no.urdf", ["robot.file: ", "/no.urdf"]),
-        (
-            f"robot.file={find_scenario('two_link_wall')}",
-            ["robot.file: ", "two_link_wall.yaml", ".urdf"],
-        ),
-        # Constraints.
-        ("constraints.0.name=''", ["constraints.0.name: "]),
-        (f"constraints=[{WALL}, {WALL}]", ["constraints.1.name: ", "'wall'"]),
-        (
-            ("outputs=[]", f"constraints=[{WALL}, {WALL.replace('name: wall', 'name: b')}]"),
-            ["constraints: ", "(2)"],
-        ),
-        ("constraints.0.surface.point=[3, 0, 0]", ["start.positions: ", "wall.distance"]),
-        # Welds and pins.
-        (f"{WELD} frame_b: tool}}", ["outputs: ", "6", "2"]),
-        (
-            ("outputs=[]", f"{PIN} point_b: [1, 0, 0], axes: yz}}"),
-            ["constraints: ", "'pin.y'"],
-        ),
-        (
-            (f"{PIN} point_b: [1, 0, 0], axes: x}}", f"{ALONG} {{constraint: pin}}"),
-            ["outputs.0: ", "'pin'"],
-        ),
-        # Outputs.
-        ("outputs.0.axes=xz", ["outputs: ", "1", "2", "(tool.x, tool.z)"]),
-        ("judgement.tolerances={tool.z: -1}", ["judgement: ", "tool.z", "-1"]),
-        ("judgement.tolerances={tool.q: 1}", ["judgement.tolerances: ", "'tool.q'"]),
-        # Gains.
-        ("law.gains.all=[1]", ["gains: ", "Hurwitz"]),
-        ("law.gains=!Matrices {groups: [[[[1, 0]], [[1]]]]}", ["gains: ", "(1, 2)", "tool.z"]),
-        # References.
-        ("references={}", ["references: ", "tool.z", "wall.force"]),
-        (
-            "references.tool.z=!Constant {values: [1, 2, 3]}",
-            ["references.tool.z: ", "3", "1", "tool.z"],
-        ),
-        (
-            "references={'wall.force, tool.z': !Constant {values: [1]}}",
-            ["references.wall.force, tool.z: ", "1", "2", "wall.force", "tool.z"],
-        ),
-        (
-            f"{SINES} {{offset: 1, amplitudes: [], frequencies: []}}",
-            ["wall.force.amplitudes: "],
-        ),
-        (f"{MOVE} {{start: [1], end: [2], end_time: 1, order: 1}}", ["tool.z: ", "order=2"]),
-        # Actuation and force.
-        (
-            "actuation=[!FlexibleJoints {stiffness: [1, 2, 3], inertia: [1]}]",
-            ["actuation.0: ", "stiffness"],
-        ),
-        (f"{SPRINGS} [[1, 0, 0], [0, 1, 0]]}}]", ["actuation.0: ", "(2,)", "(2, 2)"]),
-        ("sensors.force={time_constant: 1, seed: -1}", ["sensors.force: seed: ", "-1"]),
-        ("plant.parameters={link9.mass: [1]}", ["plant.parameters: ", "link9.mass", "link2.mass"]),
-        # The start.
-        (
-            "start.positions.joint1=9",
-            ["start.positions: ", "9", "-3.1416", "3.1416"],
-        ),
-        ("start.errors.tool.x=1", ["start.errors: ", "'tool.x'", "tool.z"]),
-        ("start.errors.tool.z=5", ["start: ", "tool.z", "5.3"]),
-        # The run.
-        ("duration=0", ["duration: ", "0"]),
-        ("integrator.integration_scheme=runge_kuta5", ["integrator: ", "'runge_kutta5'"]),
-    ],
+    ("name", "settings"),
+    [(name, settings) for name, cases in REFUSED.items() for settings in cases],
 )
-def test_refused_with_key_value_and_remedy(settings, words):
-    message = refusal(*([settings] if isinstance(settings, str) else settings))
+def test_refused_with_key_value_and_remedy(name, settings, tmp_path):
+    path = written(name, tmp_path)
+    with pytest.raises(ScenarioError) as caught:
+        build_scenario(load_scenario(path, [settings] if isinstance(settings, str) else settings))
+    message, problems = str(caught.value), caught.value.problems
+    assert message.splitlines() == [f"{key}: {text}" for key, text in problems]
+    words = REFUSED[name][settings].split("|")
     assert [word for word in words if word not in message] == [], message
 
 
@@ -159,25 +203,3 @@ def test_a_file_that_is_not_there(tmp_path):
         find_scenario(str(tmp_path))
     with pytest.raises(ScenarioError, match=r"gone\.yaml"):
         load_scenario(tmp_path / "gone.yaml")
-
-
-@pytest.mark.parametrize(
-    ("name", "setting", "words"),
-    [
-        (
-            "two_link_wall",  # A stretched arm that touches the wall.
-            "start={positions: {joint1: 0.927295218, joint2: 0}}",
-            ["outputs: Assumption (4)", "start.positions"],
-        ),
-        (
-            "seven_joint_wall",
-            "start={positions: {joint1: 0}}",
-            ["outputs: Assumption (5)", "start.positions"],
-        ),
-    ],
-)
-def test_a_robot_that_cannot_start_is_sent_to_its_keys(name, setting, words):
-    with pytest.raises(ScenarioError) as caught:
-        build_scenario(scenario(name, setting))
-    message = str(caught.value)
-    assert [word for word in words if word not in message] == [], message

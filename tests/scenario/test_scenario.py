@@ -10,82 +10,59 @@ from pydrake.systems.analysis import SimulatorConfig
 from scenario_texts import lever, run, two_link
 from two_arms import GRASP
 
-from drake_dae import (
-    AxisCoordinates,
-    AxisNormalToSurface,
-    CoincidentPoints,
-    ConstantReference,
-    Cylinder,
-    DcMotors,
-    ElectrohydraulicServos,
-    Ellipsoid,
-    FixedDistance,
-    FlexibleJoints,
-    ForceCombination,
-    JointCoupler,
-    JointPositions,
-    Plane,
-    PointCoordinates,
-    PointOnSurface,
-    PointToPointReference,
-    RollingWheel,
-    SinusoidReference,
-    Sphere,
-    Squeeze,
-    Torus,
-    build_scenario,
-    load_scenario,
-    shipped_model,
-)
+import drake_dae as dd
 from drake_dae.errors import ModelError, ScenarioError
+from drake_dae.references import PathLimits
 from drake_dae.robots import Blade, RollingBall
 from drake_dae.scenario import parts as forms
 from drake_dae.scenario.robot_file.robot import Pose, Robot
 from drake_dae.scenario.scenario import Scenario, save_scenario
 from drake_dae.scenario.shipped import find_scenario
 
+LIMITS = PathLimits(0.2, 1.0)
+
 
 def test_every_form_reads_back_equal(tmp_path):
     surfaces = [
-        Plane((1, 2, 3), (0.2, 0.3, 0.7)),
-        Sphere((1, 2, 3), 0.1, (1, 0, 0), True),
-        Cylinder((1, 2, 3), (0, 1, 0), 1 / 3),
-        Ellipsoid((1, 2, 3), (0.1, 0.2, 0.3)),
-        Torus((1, 2, 3), (0, 0, 1), 0.5, 0.1),
+        dd.Plane((1, 2, 3), (0.2, 0.3, 0.7)),
+        dd.Sphere((1, 2, 3), 0.1, (1, 0, 0), True),
+        dd.Cylinder((1, 2, 3), (0, 1, 0), 1 / 3),
+        dd.Ellipsoid((1, 2, 3), (0.1, 0.2, 0.3)),
+        dd.Torus((1, 2, 3), (0, 0, 1), 0.5, 0.1),
     ]
     scenario = Scenario(
         description="on: ä # 'quoted'\nsecond line",
         robot=Robot("/some/where.urdf", {"other": "/else/where"}),
         constraints=[
             *[
-                PointOnSurface("a", surface, (0.1, 1e-17, -0.0), f"c{i}")
+                dd.PointOnSurface("a", surface, (0.1, 1e-17, -0.0), f"c{i}")
                 for i, surface in enumerate(surfaces)
             ],
             forms.WeldedFramesForm("a", "b::c", Pose((0.1, 0.2, 0.3), (90.0, 0.0, -45.0)), "w"),
-            CoincidentPoints("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), "zx", "p"),
-            FixedDistance("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), 1 / 3, "r"),
-            JointCoupler("a", "b", -1 / 3, 0.1, "m", "j"),
-            AxisNormalToSurface("a", surfaces[3], (0.0, 0.6, -0.8), (0.1, 0.2, 0.3), "n"),
+            dd.CoincidentPoints("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), "zx", "p"),
+            dd.FixedDistance("a", (1.0, 2.0, 3.0), "b", (4.0, 5.0, 6.0), 1 / 3, "r"),
+            dd.JointCoupler("a", "b", -1 / 3, 0.1, "m", "j"),
+            dd.AxisNormalToSurface("a", surfaces[3], (0.0, 0.6, -0.8), (0.1, 0.2, 0.3), "n"),
             Blade("a", (0.0, 0.6, 0.8), (0.1, 0.2, 0.3), "e"),
-            RollingWheel("a", 0.1, (1, 0, 0), (0.1, 0.2, 0.3), (0, 1, 0), False, "l"),
+            dd.RollingWheel("a", 0.1, (1, 0, 0), (0.1, 0.2, 0.3), (0, 1, 0), False, "l"),
             RollingBall("a", surfaces[1], 0.1, (0.1, 0.2, 0.3), (0, 1, 0), "o"),
         ],
         outputs=[
-            PointCoordinates("yes", "xy"),
-            AxisCoordinates("b", "z", "xy"),
+            dd.PointCoordinates("yes", "xy"),
+            dd.AxisCoordinates("b", "z", "xy"),
             forms.SurfaceCoordinatesForm("c0"),
-            JointPositions(["joint1", "2"]),
+            dd.JointPositions(["joint1", "2"]),
         ],
         forces=[
             "l.traction",
             "c0.force",
-            Squeeze("a", "w", "p"),
-            ForceCombination({"c1.force": 1 / 3, "c2.force": -1.0}, "d"),
+            dd.Squeeze("a", "w", "p"),
+            dd.ForceCombination({"c1.force": 1 / 3, "c2.force": -1.0}, "d"),
         ],
         actuation=[
-            FlexibleJoints([[8e3, 5e2], [5e2, 6e3]], [1.0, 1 / 3], 2.0),
-            DcMotors(0.1, np.array([1e-3, 2e-3]), 0.5),
-            ElectrohydraulicServos(1e6, np.diag([1e-6, 2e-6]), np.eye(2)),
+            dd.FlexibleJoints([[8e3, 5e2], [5e2, 6e3]], [1.0, 1 / 3], 2.0),
+            dd.DcMotors(0.1, np.array([1e-3, 2e-3]), 0.5),
+            dd.ElectrohydraulicServos(1e6, np.diag([1e-6, 2e-6]), np.eye(2)),
         ],
         sensors=forms.Sensors(force=forms.MeasuredForce(0.005, 0.001, [1.0, -1.0])),
         law=forms.Law(
@@ -93,10 +70,16 @@ def test_every_form_reads_back_equal(tmp_path):
             force_gain=np.eye(2),
         ),
         references={
-            "a": ConstantReference([1.0]),
-            "b": SinusoidReference(1.0, [2.0], [3.0], [4.0]),
-            "c.d, e": PointToPointReference([0.0], [1.0], 0.5, 2.0, 4),
+            "a": dd.ConstantReference([1.0]),
+            "b": dd.SinusoidReference(1.0, [2.0], [3.0], [4.0]),
+            "c.d, e": dd.PointToPointReference([0.0], [1.0], 0.5, 2.0, 4),
             "f": 2.0,
+            "g": dd.LineReference([0, 1], [1, 2], LIMITS),
+            "h": dd.CircleReference([0, 1], 0.1, limits=LIMITS, turns=-2.0, phase=0.5),
+            "i": dd.PolylineReference([[0, 0], [1, 0], [1, 1]], LIMITS, 0.1, order=3),
+            "j": dd.WaypointsReference([[0, 0], [1, 0]], [0, 2], order=2),
+            "k": dd.WaypointsReference([[0, 0], [1, 0], [0, 1]], limits=LIMITS),
+            "l": dd.CsvReference("/a.csv", ["y", "z"], smoothing=0.1, start_time=2.0),
         },
         start=forms.Start({"joint1": 1e-9}, {"a.b": -1e300}),
         duration=1e-3,
@@ -104,7 +87,7 @@ def test_every_form_reads_back_equal(tmp_path):
         write=forms.Write(False, True, False),
     )
     save_scenario(scenario, tmp_path / "all.yaml")
-    copy = load_scenario(tmp_path / "all.yaml")
+    copy = dd.load_scenario(tmp_path / "all.yaml")
     assert copy == scenario
     # Not only equal as data: the objects are of their classes.
     assert copy.constraints == scenario.constraints
@@ -112,7 +95,7 @@ def test_every_form_reads_back_equal(tmp_path):
     assert copy.forces == scenario.forces
     assert copy.references == scenario.references
     assert copy.law.gains == scenario.law.gains
-    assert copy.sensors.force.sensor(2).sample_period == 0.001
+    assert copy.sensors.force.sample_period == 0.001
     pairs = list(zip(copy.actuation, scenario.actuation, strict=True))
     for one, other in [*pairs, (copy.sensors.force, scenario.sensors.force)]:
         assert type(one) is type(other)
@@ -122,13 +105,22 @@ def test_every_form_reads_back_equal(tmp_path):
         assert getattr(copy.integrator, key) == getattr(scenario.integrator, key)
 
 
+def test_files_in_settings_of_a_shipped_scenario_are_in_the_working_directory(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "path.csv").write_text("time,y\n0,0\n1,0.1\n2,0\n")
+    monkeypatch.chdir(tmp_path)
+    chosen = two_link("references={tool.y: !Csv {file: path.csv, columns: [y]}}")
+    assert chosen.references["tool.y"].table.shape == (3, 2)
+
+
 def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
     path = lever(tmp_path / "robots")
     (tmp_path / "scenarios").mkdir()
     away = tmp_path / "scenarios" / "away.yaml"
     away.write_text(path.read_text().replace("lever.urdf", "../robots/lever.urdf"))
     monkeypatch.chdir("/")
-    scenario = load_scenario(away)
+    scenario = dd.load_scenario(away)
     assert scenario.robot.file == str((tmp_path / "robots" / "lever.urdf").resolve())
     assert run(scenario)[1].time[-1] == 0.1
 
@@ -150,15 +142,10 @@ def test_a_robot_file_is_relative_to_its_scenario(tmp_path, monkeypatch):
         ("law.gains={outputs: {tool.z: [-3]}}", lambda s: s.law.gains.outputs == {"tool.z": [-3]}),
         ("plant.parameters.link2.mass=[5]", lambda s: s.plant.parameters == {"link2.mass": [5]}),
         ("description=a b", lambda s: s.description == "a b"),
-        ("description=", None),
     ],
 )
 def test_settings(setting, read):
-    if read is None:
-        with pytest.raises(ScenarioError, match="description: "):
-            two_link(setting)
-    else:
-        assert read(two_link(setting))
+    assert read(two_link(setting))
 
 
 def test_settings_reach_names_with_dots_in_lists():
@@ -175,7 +162,7 @@ def test_outputs():
         "references={wall: !Constant {values: [0, 0.6]}, tool.z_axis: 0, 'joint3, joint7': 0, "
         "wall.force: 20}",
     ]
-    loop, context = build_scenario(load_scenario(find_scenario("seven_joint_wall"), settings))
+    loop, context = dd.build_scenario(dd.load_scenario(find_scenario("seven_joint_wall"), settings))
     names = [signal.name for signal in loop.plant.dae.output_signals]
     assert names[:3] == ["wall.along", "wall.across", "tool.z_axis.y"]
     assert names[3:] == ["tool.z_axis.z", "joint3", "joint7", "wall.force"]
@@ -196,13 +183,13 @@ def test_a_run_begins_at_its_start_time_with_the_errors_there():
 
 def test_weld():
     """The shipped scenario has the weld of tests/support/two_arms.py."""
-    weld = load_scenario(find_scenario("two_arms")).constraints[0].make(())
+    weld = dd.load_scenario(find_scenario("two_arms")).constraints[0].make(())
     assert (weld.frame_a, weld.frame_b, weld.name) == (GRASP.frame_a, GRASP.frame_b, "grasp")
     np.testing.assert_allclose(
         weld.pose.GetAsMatrix4(), GRASP.pose.GetAsMatrix4(), rtol=0, atol=1e-15
     )
     # A pose that is left out is that of frames that coincide.
-    plain = load_scenario(
+    plain = dd.load_scenario(
         find_scenario("two_arms"),
         ["constraints.0=!WeldedFrames {frame_a: left::tool, frame_b: right::tool}"],
     )
@@ -217,33 +204,19 @@ TILTED = (
 
 def test_bounds_of_parameters_are_those_at_which_the_structure_is_looked_at():
     """At a = 0 the wall is y = 0, along which the whole arm moves: A(x) is zero."""
-    loop, _ = build_scenario(two_link(TILTED, "bounds={wall.a: [0.5, 2]}"))
+    loop, _ = dd.build_scenario(two_link(TILTED, "bounds={wall.a: [0.5, 2]}"))
     for system in (loop.plant.dae, loop.controller.law.system):
         assert {p.name: p.bounds for p in system.parameters if p.bounds} == {"wall.a": (0.5, 2.0)}
     with pytest.raises(ScenarioError, match=r"A\(x\).*'wall\.a'"):
-        build_scenario(two_link(TILTED, "bounds={wall.a: [0, 2]}"))
-
-
-@pytest.mark.parametrize(
-    ("bounds", "words"),
-    [
-        ("{link2.mass: [12, 6]}", r"bounds: .*'link2\.mass'"),
-        ("{link2.mass: [8, 9]}", r"bounds: .*'link2\.mass'"),
-        ("{link2.mas: [6, 9]}", r"bounds: .*'link2\.mas'"),
-        ("{link2.mass: [6]}", r"bounds\.link2\.mass: .*\[6\]"),
-    ],
-)
-def test_bounds_that_make_no_sense_are_refused(bounds, words):
-    with pytest.raises(ScenarioError, match=words):
-        build_scenario(two_link(f"bounds={bounds}"))
+        dd.build_scenario(two_link(TILTED, "bounds={wall.a: [0, 2]}"))
 
 
 def test_a_model_is_found_by_its_name():
     plant = MultibodyPlant(0.0)
-    (arm,) = Parser(plant).AddModels(str(shipped_model("two_link_arm.urdf")))
+    (arm,) = Parser(plant).AddModels(str(dd.shipped_model("two_link_arm.urdf")))
     assert plant.GetModelInstanceName(arm) == "two_link_arm"
 
 
 def test_a_name_that_is_none_is_reported_with_those_that_are():
     with pytest.raises(ModelError, match=r"two_link_arm\.urdf"):
-        shipped_model("two_link_arm")
+        dd.shipped_model("two_link_arm")

@@ -70,8 +70,7 @@ PAPER = (
     "linearization",
     "beyond",
     "pinned_motion",
-    "equilibria",
-    "floquet",
+    "stability",
     "zero_dynamics",
     "extension",
 )

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, unknown_name
+from drake_dae.arrays import FloatArray
 from drake_dae.dae.signals import DerivativeLayout, Parameter, Signal
 from drake_dae.dae.structure import Structure
 from drake_dae.dae.system import DaeSystem
@@ -35,11 +35,7 @@ def with_disturbance(
     `frictions` are the names of parameters that are observed as well: coefficients of friction,
     such as "wall.friction", and others with bounds or `ranges` of `Observing`.
     """
-    names = [signal.name for signal in system.state_signals]
-    for name in states:
-        if name not in names:
-            raise ModelError(f"{system.name}: {unknown_name('state', name, names)}")
-    rows = [names.index(name) for name in states]
+    rows = system.states_named(states)
     if not rows or len(set(rows)) != len(rows):
         raise ModelError(
             f"{system.name}: with_disturbance needs names of states, each once, got "

@@ -16,14 +16,10 @@ from drake_dae.systems.control.commanded import CommandedReferences
 from drake_dae.systems.control.contract import SIGNAL, Controller
 from drake_dae.systems.plants.contract import Plant
 
+# The largest speed, in m/s, of a surface whose motion is not in the law's model.
 MAX_SURFACE_SPEED = 0.05
-"""The largest speed, in m/s, of a surface whose motion is not in the law's model."""
-
-PUSH = "push."
-"""The prefix of the names of the wrenches that push links."""
-
-_ORDER = ("N", "m")
-"""The units of the first sliders of references; all others follow."""
+PUSH = "push."  # The prefix of the names of the wrenches that push links.
+_ORDER = ("N", "m")  # The units of the first sliders of references; all others follow.
 
 
 @dataclass(frozen=True)

@@ -35,27 +35,22 @@ from drake_dae.running.export.loop import check_traced, write_loop
 
 WEB = Path(__file__).with_name("web")
 
+# The scripts, in the order in which the page contains them.
 SCRIPTS = ("engine.js", "prediction.js", "view.js", "drag.js", "plots.js", "panel.js", "bench.js")
-"""The scripts, in the order in which the page contains them."""
-
+# The output ports of a loop that the page reads as they are.
 SHOWN = ("controlled_output", "reference", "desired_output", "change")
-"""The output ports of a loop that the page reads as they are."""
-
+# The distance by which the strongest push moves a robot, as a fraction of the robot's size.
 PUSHED_FRACTION = 0.15
-"""The distance by which the strongest push moves a robot, as a fraction of the robot's size."""
-
+# The assumed rate of decay of the errors where there is no law with poles, in 1/s.
 USUAL_POLE = 4.0
-"""The assumed rate of decay of the errors where there is no law with poles, in 1/s."""
-
+# Commands take effect at multiples of this time after the start, in s, or of the steps near it.
 TICK = 1.0 / 120.0
-"""Commands take effect at multiples of this time after the start, in s, or of the steps near it."""
-
+# The Content-Security-Policy of the page, which loads nothing from the network.
 _CONTENT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; "
     "style-src 'unsafe-inline'; img-src data: blob:; worker-src data: blob:; "
     "connect-src data: blob:"
 )
-"""The Content-Security-Policy of the page, which loads nothing from the network."""
 
 
 @checked(ModelError)

@@ -25,9 +25,9 @@ def compiled_loop(source: Path) -> bytes:
     return target.read_bytes()
 
 
+# The largest number of assignments in a function. For 60,000 assignments, clang needs 180 s of CPU
+# in one function, and 9 s in pieces of 2,000, whose code is 40 % larger.
 LONGEST = 2000
-"""The largest number of assignments in a function. For 60,000 assignments, clang needs 180 s of CPU
-in one function, and 9 s in pieces of 2,000, whose code is 40 % larger."""
 
 _NAME = re.compile(r"\ba\d+\b")
 _FUNCTION = re.compile(

@@ -24,8 +24,7 @@ from drake_dae.robots.surfaces.surface import (
     normalized,
     tangents,
 )
-from drake_dae.trace.expressions import length_of, result_of
-from drake_dae.trace.formula import check_names, parse_formula
+from drake_dae.trace.expressions import check_names, length_of, parse_formula, result_of
 
 _SOLID_LENGTH = 100.0
 """The length of the solid of a cylinder, in m: its ends are out of the reach of a robot."""

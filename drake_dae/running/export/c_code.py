@@ -23,11 +23,8 @@ from drake_dae.trace.compiled import generate, renamed, without_branches
 
 TEMPLATES = Path(__file__).with_name("c99")
 
-MOST = 2000
-"""The largest number of steps of a run that is played to exported code."""
-
-Vectors = Mapping[str, Sequence[Signal]]
-"""Name of a vector -> names and units of its entries."""
+MOST = 2000  # The largest number of steps of a run that is played to exported code.
+Vectors = Mapping[str, Sequence[Signal]]  # Name of a vector -> names and units of its entries.
 
 
 @dataclass(frozen=True, eq=False)

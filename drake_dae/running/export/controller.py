@@ -35,12 +35,9 @@ from drake_dae.running.export.c_code import (
 )
 from drake_dae.systems.plants.contract import Plant
 
-CONTROL = "control"
-"""The name of a controller's output port and a plant's input port."""
-
-FINEST = 1000
-"""The largest ratio of the shortest sample period to the common period."""
-
+CONTROL = "control"  # The name of a controller's output port and a plant's input port.
+FINEST = 1000  # The largest ratio of the shortest sample period to the common period.
+# A step of the program that plays a run.
 STEP = """
 static int step(int k, double *found) {{
   {prefix}_controller_inputs in;
@@ -54,7 +51,6 @@ static int step(int k, double *found) {{
   return out.status;
 }}
 """
-"""A step of the program that plays a run."""
 
 SAMPLING = "give the loop a sampling, in a scenario `sampling: {period: 0.001}`"
 

@@ -25,10 +25,9 @@ from drake_dae.running.export.c_code import (
     written,
 )
 
+# The method and its longest step in s in place of error control, which no export has.
 SCHEME, LONGEST = "runge_kutta5", 1e-3
-"""The method and its longest step in s in place of error control, which no export has."""
-
-
+# A step of the program that plays a run.
 STEP = """
 static int step(int k, double *found) {{
   const int status = {prefix}_loop_advance(&own, rows[k][0]);
@@ -36,7 +35,6 @@ static int step(int k, double *found) {{
   return status;
 }}
 """
-"""A step of the program that plays a run."""
 
 
 @checked(ModelError)

@@ -39,6 +39,9 @@ _SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "caps
 _SIZES |= {"ellipsoid": {}, "mesh": {}}
 """Shape -> how many numbers its sizes have, in URDF and SDFormat."""
 
+_OF_MANY_AXES = ("planar", "floating", "universal", "ball", "free")
+"""Types of joints that no motor drives, and that follow no other joint."""
+
 _FLAT = 1e-8
 """A scale of a mesh up to which Drake takes none."""
 
@@ -84,7 +87,7 @@ class Mender:
         root = mjcf.read_included(file, within)
         if kind == ".xml":
             for servo in mjcf.expand(root, file):
-                text = "position servos become motors without their gains: controls are efforts"
+                text = "servos become motors without their gains: controls are efforts"
                 self.tell(text, f"'{servo}'")
         parents = {child: parent for parent in root.iter() for child in parent}
 
@@ -103,8 +106,12 @@ class Mender:
                 if "," in value and number_in(value.replace(",", ".", 1)) is not None:
                     raise ModelError(f"{place(node)}: '{value}': numbers have a point, no comma")
         # Only the armature of joints without motor is lost.
-        for part, node in take_lost(root, kind, {*self.leave_out} - {mjcf.ARMATURE}):
-            if self.drives or not part.startswith(DRIVES):
+        for part, value, node, is_told in take_lost(
+            root, kind, {*self.leave_out} - {mjcf.ARMATURE}
+        ):
+            if is_told:
+                self.tell("Drake does not read, and leaves out", f"{place(node)}: {part} {value}")
+            elif self.drives or not part.startswith(DRIVES):
                 self.lost[part].append(place(node))
         for inertial in root.iter("inertial"):
             if text := mend_inertia(inertial, kind, place(inertial)):
@@ -112,7 +119,9 @@ class Mender:
                     self.lost["inertia"].append(text)
                 self.tell("moments of inertia of no body become possible ones", text)
         for joint in root.iter("joint"):
-            self._mend_limits(joint, kind, place(joint))
+            self._mend_limits(joint, place(joint))
+            if kind == ".sdf":
+                self._mend_axes(joint, place(joint))
         if kind == ".urdf":
             self._mend_urdf(root, file, model, placed)
         elif kind == ".sdf":
@@ -130,14 +139,30 @@ class Mender:
     def tell(self, kind: str, item: str, category: type[Warning] = RobotFileWarning) -> None:
         self.told[category, kind].append(item)
 
-    def _mend_limits(self, joint: Element, kind: str, place: str) -> None:
+    def _mend_axes(self, joint: Element, place: str) -> None:
+        """Writes axes of SDFormat as Drake has them: one damping, no motor, m for each turn."""
+        kind, pitch = joint.get("type"), joint.find("thread_pitch")
+        if kind == "screw" and pitch is not None:
+            joint.remove(pitch)  # Its unit is rad/m, and it turns left.
+            number = number_in(pitch.text or "")
+            if number == 0.0:
+                raise ModelError(f"{place}: with thread_pitch 0 it is no screw; mend the file")
+            if number is not None and joint.find("screw_thread_pitch") is None:
+                SubElement(joint, "screw_thread_pitch").text = repr(-2.0 * np.pi / number)
+        if kind not in _OF_MANY_AXES:
+            return
+        axes = [axis for axis in joint if axis.tag in ("axis", "axis2")]
+        dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
+        if len({*map(number_in, dampings)}) > 1:
+            if "axis2/damping" not in self.leave_out:
+                self.lost["axis2/damping"].append(f"{place}: {' and '.join(dampings)}")
+            for axis in axes[1:]:
+                _child(_child(axis, "dynamics"), "damping").text = dampings[0]
+        for axis in axes:
+            _child(_child(axis, "limit"), "effort").text = "0"
+
+    def _mend_limits(self, joint: Element, place: str) -> None:
         """Removes limits that Drake refuses, and those of joints that have none."""
-        # Drake damps no free body, and limits no ball joint.
-        own = {"free": "damping", "ball": "range"} if kind == ".xml" else {}
-        part = own.get(joint.get("type", ""), "")
-        values = [number_in(word) for word in joint.attrib.pop(part, "").split()]
-        if any(values) and (part == "damping" or joint.get("limited") != "false"):
-            self.lost[f"joint/{part}"].append(place)
         is_continuous = joint.get("type") == "continuous"
         for owner in (joint, *(joint.find(way) for way in ("limit", "axis/limit", "axis2/limit"))):
             if owner is None:
@@ -215,7 +240,7 @@ class Mender:
         for mimic in [part for part in joint if part.tag == tag]:
             ratio = number_in(mimic.get("multiplier", "1"))
             offset = number_in(mimic.get("offset", "0"))
-            if joint.get("type") in ("planar", "floating", "universal", "ball"):
+            if joint.get("type") in _OF_MANY_AXES:
                 self.lost[f"joint/{tag}"].append(f"joint '{name}'")
             elif ratio == 0.0 and offset is not None:
                 self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
@@ -226,6 +251,7 @@ class Mender:
 
     def _mend_urdf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
         root.attrib.setdefault("name", file.stem)
+        _remove(root, "mujoco")
         for link in root.iterfind("link"):
             self._mend_shapes(link, file, model)
         # Drake refuses names of several colours, of none, or of one that is defined later.
@@ -239,8 +265,8 @@ class Mender:
                 if not len(material):
                     owner.remove(material)
         moving: set[str | None] = set()
-        still: set[str | None] = set()  # Joints that Drake drives not: their effort limit is 0.
-        for joint in root.findall("joint"):
+        still: set[str | None] = set()  # Joints that Drake drives not.
+        for joint in (*root.findall("joint"), *root.findall("drake:joint")):
             name, kind = joint.get("name", ""), joint.get("type")
             ends = joint.find("parent"), joint.find("child")
             parent, child = ("" if end is None else end.get("link", "") for end in ends)
@@ -257,6 +283,7 @@ class Mender:
                 SubElement(root, "frame", own | ({} if origin is None else origin.attrib))
                 self.floating.append(Floating(model, name, child, own["name"]))
             self._follow(model, joint, "mimic")
+            still |= {name} if kind in _OF_MANY_AXES else set()
             for limit in joint.iterfind("limit"):
                 effort = number_in(limit.get("effort", "")) or 0.0
                 if effort > 0.0:
@@ -268,8 +295,9 @@ class Mender:
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
             if driven & still and self.drives:
-                self.lost["transmission/joint"] += [f"joint '{one}': effort 0" for one in driven]
-            if not has_type or not driven & moving:
+                why = "its effort is 0, or it has more than one axis"
+                self.lost["transmission/joint"] += [f"joint '{one}': {why}" for one in driven]
+            if not has_type or not driven & moving or driven & still:
                 root.remove(transmission)
                 continue
             for actuator in transmission.iterfind("actuator"):  # Their names may be equal.
@@ -354,6 +382,18 @@ class Mender:
                     owner.remove(asset)
         if not self.has_geometry:
             _remove(root, "contact")
+        many = {one.get("name"): one.get("type", "") for one in root.iter("joint")}
+        many |= {one.get("name"): "free" for one in root.iter("freejoint")}
+        for owner in root.iterfind("actuator"):
+            for motor in owner.findall("motor"):
+                type_of_joint = many.get(motor.get("joint"), "")
+                if "joint" in motor.attrib and type_of_joint not in _OF_MANY_AXES:
+                    continue
+                owner.remove(motor)
+                part = f"{type_of_joint}/motor"
+                if "joint" in motor.attrib and self.drives and part not in self.leave_out:
+                    name = motor.get("name", motor.get("joint", ""))
+                    self.lost[part].append(f"{file.name}: motor '{name}'")
         for joint, armature in mjcf.armatures(root):
             if joint:
                 self.joints["armature"][model, joint] = armature
@@ -387,6 +427,12 @@ def _has_hull(mesh: str, changed: int) -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def _child(owner: Element, tag: str) -> Element:
+    """The first child of a tag, which is made if there is none."""
+    found = owner.find(tag)
+    return SubElement(owner, tag) if found is None else found
 
 
 def _remove(owner: Element, tag: str) -> int:

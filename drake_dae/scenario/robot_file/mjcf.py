@@ -28,6 +28,11 @@ _ONE_DEFAULT = {
 }
 """Parents whose elements have one and the same default -> the names under which it is written."""
 
+_SERVOS = ("position", "velocity", "intvelocity", "general")
+"""Actuators whose control is no effort, while their range of forces limits an effort."""
+
+_LAW = ("dyntype", "gaintype", "biastype")
+
 _OF_GENERAL = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}
 """What motors and servos set themselves, whatever is the default."""
 
@@ -44,10 +49,10 @@ def expand(root: Element, file: Path) -> list[str]:
     """Writes an MJCF file so that each element says all that it means, where it means it.
 
     Included files and defaults of classes go into their places. Inactive equalities go. Limits of
-    motors become those of the efforts at joints, the gear times those of motors. Position servos
-    become motors, since controls are efforts here; their names are returned. Bodies of mass 0,
-    which MuJoCo takes if they do not move or move with others, lose their inertia, and their
-    geometry its mass.
+    motors become those of the efforts at joints, the gear times those of motors. Servos become
+    motors, since controls are efforts here; their names are returned. Bodies of mass 0, which
+    MuJoCo takes if they do not move or move with others, lose their inertia, and their geometry its
+    mass.
     """
     _include(root, file, (file.resolve(),), count(1))
     root.attrib.setdefault("model", file.stem)
@@ -61,20 +66,25 @@ def expand(root: Element, file: Path) -> list[str]:
                 equality.remove(constraint)
     for joint in root.iter("joint"):  # MuJoCo takes an empty range for none.
         words = joint.get("range", "").split()
-        if "limited" not in joint.attrib and not any(map(number_in, words)):
+        if joint.get("limited", "auto" if any(map(number_in, words)) else "false") == "false":
             joint.attrib.pop("range", None)
     servos = []
-    for motor in [*root.iterfind("actuator/motor"), *root.iterfind("actuator/position")]:
-        if motor.tag == "position":  # Its control is a position, and has no limit of efforts.
+    for motor in root.iterfind("actuator/*"):
+        general = {key: motor.attrib.pop(key, "") for key in _OF_GENERAL if motor.tag == "general"}
+        gain = 1.0
+        if motor.tag == "general" and {general[key] for key in _LAW} <= {"", "none", "fixed"}:
+            motor.tag = "motor"  # Of a control in another unit.
+            gain = abs(number_in([*general["gainprm"].split(), "1"][0]) or 1.0)
+        elif motor.tag in _SERVOS:  # Its control is no effort, and neither are its limits.
             motor.tag = "motor"
             servos.append(motor.get("name", motor.get("joint", "")))
             motor.attrib.pop("ctrlrange", None)
             motor.attrib.pop("ctrllimited", None)
         gear = abs(number_in([*motor.get("gear", "").split(), "1"][0]) or 1.0)
-        for key in ("ctrlrange", "forcerange"):
+        for key, scale in (("ctrlrange", gain * gear), ("forcerange", gear)):
             bounds = [number_in(word) for word in motor.get(key, "").split()]
-            if gear != 1.0 and bounds and None not in bounds:
-                motor.set(key, " ".join(repr(gear * (bound or 0.0)) for bound in bounds))
+            if scale != 1.0 and bounds and None not in bounds:
+                motor.set(key, " ".join(repr(scale * (bound or 0.0)) for bound in bounds))
     for body in root.iter("body"):
         inertial = body.find("inertial")
         if inertial is None or weighs_by_geometry(root):
@@ -125,7 +135,7 @@ def _apply_defaults(root: Element) -> None:
             tag = owner.tag if owner.tag in _ONE_DEFAULT else node.tag
             known = classes.get(node.attrib.pop("class", inherited), {})
             values = {} if node.tag in _ONE_DEFAULT else known.get(tag, {})
-            if node.tag in ("motor", "position"):
+            if owner.tag == "actuator" and node.tag != "general":
                 values = {key: value for key, value in values.items() if key not in _OF_GENERAL}
             if _TURNS & node.attrib.keys():
                 values = {key: value for key, value in values.items() if key not in _TURNS}

@@ -8,17 +8,23 @@ the formats; a test feeds them through Drake.
 """
 
 from collections.abc import Callable, Collection, Iterator
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from drake_dae.arrays import number_in
 
-# "owner: parts that Drake reads | parts that change no equation". Of "a=0" that holds with this
-# value only, of "a=never" with none; "*" is all others. Owners without a line hold geometry.
+# "owner: parts that Drake reads | parts that change no equation | parts that are told, no error".
+# Of "a=0" that holds with this value only, of "a=never" with none; "*" is all others. Owners
+# without a line hold geometry. "limit@ball" has what is different in joints of this type.
 _URDF = """
 robot: name material link joint drake:joint transmission frame gazebo drake:linear_bushing_rpy
 robot: drake:linear_spring_damper drake:ball_constraint drake:distance_constraint
 robot: drake:tendon_constraint drake:collision_filter_group
-robot: | version sensor ros2_control disable_collisions link_group group verbose plugin mujoco
+robot: | version sensor ros2_control disable_collisions link_group group verbose plugin
+robot: mujoco
+mujoco: compiler option | *
+compiler: | * | boundmass=0 boundinertia=0 settotalmass=-1 inertiafromgeom=auto
+option: | * | gravity=earth density=0 viscosity=0 wind=0
 gazebo: | * reference joint=never constraint=never gravity=1 turnGravityOff=0 springStiffness=0
 gazebo: velocity_decay | dampingFactor=0 kinematic=0 static=0 link=never model=never axis=never
 gazebo: | inertial=never
@@ -37,7 +43,13 @@ joint: | mechanical_reduction offset sensor disable_collision
 origin: xyz rpy
 axis: xyz | rpy
 limit: lower upper velocity effort drake:acceleration
+limit@floating limit@planar limit@ball limit@universal limit@screw limit@curvilinear: || lower
+limit@floating limit@planar limit@ball limit@universal limit@screw limit@curvilinear: || upper
+limit@floating limit@planar limit@ball limit@universal limit@screw limit@curvilinear: || velocity
+limit@floating limit@planar limit@ball limit@universal: || drake:acceleration
+limit@screw limit@curvilinear: || drake:acceleration effort
 dynamics: damping | coulomb_window friction=0
+dynamics@floating: | damping=0
 mimic: joint multiplier offset
 transmission: type=simple joint actuator | name mechanicalReduction plugin param
 transmission: | use_simulated_gripper_joint
@@ -63,9 +75,15 @@ inertia: ixx iyy izz ixy ixz iyz
 joint: name type parent child pose axis axis2 screw_thread_pitch thread_pitch drake:rotor_inertia
 joint: drake:gear_ratio drake:controller_gains drake:mimic
 joint: | sensor plugin physics gearbox_ratio gearbox_reference_body
+joint@revolute joint@prismatic joint@continuous joint@ball joint@fixed: | axis2 thread_pitch
+joint@screw: | axis2
+joint@universal: | thread_pitch
 axis axis2: xyz limit dynamics use_parent_model_frame | initial_position
 limit: lower upper effort velocity drake:acceleration | stiffness dissipation
+limit@ball limit@universal limit@screw: || lower upper velocity drake:acceleration
+limit@ball limit@universal: || effort
 dynamics: damping spring_reference spring_stiffness | friction=0
+dynamics@ball dynamics@universal dynamics@screw: | spring_reference spring_stiffness=0
 """
 
 _MJCF = """
@@ -89,9 +107,11 @@ inertial: pos quat axisangle euler xyaxes zaxis mass diaginertia fullinertia
 joint: name type pos axis range limited damping ref armature
 joint: | stiffness=0 springdamper=0 frictionloss=0 actuatorfrclimited=0 class group user margin
 joint: | solreflimit solimplimit solreffriction solimpfriction springref actuatorgravcomp
+joint@free: | damping=0 range
+joint@ball: || range
 freejoint: name | group align class user
 geom: name type pos quat axisangle euler xyaxes zaxis size fromto mesh mass density contype
-geom: conaffinity group material rgba friction | shellinertia=0 fluidshape=none class condim
+geom: conaffinity group material rgba friction | shellinertia=0 fluidshape=ellipsoidal class condim
 geom: | priority solmix solref solimp margin gap fitscale user hfield fluidcoef
 actuator: motor
 motor: name joint gear ctrlrange=+- ctrllimited forcerange=+- forcelimited
@@ -103,7 +123,7 @@ asset: mesh material | texture hfield skin
 mesh: name file scale inertia | *
 """
 
-DRIVES = ("transmission/", "actuator/", "motor/")
+DRIVES = ("transmission/", "actuator/", "motor/", "ball/motor", "free/motor")
 """Parts that only drive joints: nothing of them is lost if the scenario names the driven joints."""
 
 
@@ -125,52 +145,83 @@ _RULES: dict[str, Callable[[str], bool]] = {
     "simple": lambda value: "SimpleTransmission" in value,
     "earth": lambda value: value.split() in (["0", "0", "-9.8"], ["0", "0", "-9.81"]),
     "enable": lambda value: value == "enable",
-    "none": lambda value: value == "none",
+    "ellipsoidal": lambda value: value == "none",
+    "auto": lambda value: value in ("false", "auto"),
+    "unlimited": lambda value: (
+        not any(0.0 < abs(number_in(word) or 0.0) < 1e16 for word in value.split())
+    ),
 }
 """A value in the tables -> whether one in a file means the same."""
 
 
-def _table(text: str) -> dict[str, dict[str, tuple[bool, str]]]:
-    """Owner -> its parts -> whether Drake reads it, and the value that is meant."""
-    table: dict[str, dict[str, tuple[bool, str]]] = {}
+class _Part(NamedTuple):
+    """How Drake takes a part: it reads it, or what value of it is without effect, or it is told."""
+
+    is_read: bool = False
+    meant: str = "never"
+    is_told: bool = False
+
+
+def _table(text: str) -> dict[str, dict[str, _Part]]:
+    """Owner -> its parts."""
+    table: dict[str, dict[str, _Part]] = {}
     for line in text.strip().splitlines():
         owners, _, parts = line.partition(": ")
-        read, _, idle = parts.partition("|")
         for owner in owners.split():
-            for names, is_read in ((read, True), (idle, False)):
+            for k, names in enumerate(parts.split("|")):
                 for part in names.split():
                     name, _, value = part.partition("=")
-                    table.setdefault(owner, {})[name] = (is_read, value)
+                    meant = value or ("unlimited" if k == 2 else "")
+                    table.setdefault(owner, {})[name] = _Part(k == 0, meant, k == 2)
     return table
 
 
 READ_BY_DRAKE = {".urdf": _table(_URDF), ".sdf": _table(_SDF), ".xml": _table(_MJCF)}
 
 
+class Lost(NamedTuple):
+    """What Drake does not read: "<parent>/<name>", its value, and the element to which it belongs.
+
+    What Drake does not read of joints of one type is "<type>/<name>". It is told, or refused.
+    """
+
+    part: str
+    value: str
+    owner: Element
+    is_told: bool
+
+
 def take_lost(
-    element: Element, kind: str, leave_out: Collection[str]
-) -> Iterator[tuple[str, Element]]:
-    """Removes what Drake does not read of an element, and yields what is lost: part and owner."""
-    table = READ_BY_DRAKE[kind].get(element.tag)
-    if table is None:
+    element: Element, kind: str, leave_out: Collection[str], joint: str = ""
+) -> Iterator[Lost]:
+    """Removes what Drake does not read of an element, and yields what is lost.
+
+    `joint` is the type of the joint to which the element belongs.
+    """
+    tables = READ_BY_DRAKE[kind]
+    if element.tag not in tables:
         return
+    if element.tag in ("joint", "drake:joint"):
+        joint = element.get("type", "")
+    of_type = tables.get(f"{element.tag.removeprefix('drake:')}@{joint}", {})
+    table = tables[element.tag] | of_type
     parts: list[tuple[str, str, Element | None]]
     parts = [(name, value, None) for name, value in element.items()]
     for child in element:
         parts.append((child.tag, (child.text or "").strip() or child.get("value", ""), child))
     for name, value, node in parts:
         is_foreign = ":" in name and name not in table and not name.startswith("drake:")
-        other = (name.startswith("xmlns"), "") if is_foreign else table.get("*", (True, "never"))
-        is_read, meant = table.get(name, other)
-        part = f"{element.tag}/{name}"
-        is_meant = _RULES[meant](value)
+        other = _Part(name.startswith("xmlns"), "") if is_foreign else table.get("*", _Part(True))
+        known = table.get(name, other)
+        part = f"{joint if name in of_type else element.tag}/{name}"
+        is_meant = _RULES[known.meant](value)
         if not is_meant and part not in leave_out:
-            yield part, element
-        if is_read and is_meant and part not in leave_out:
+            yield Lost(part, value, element, known.is_told)
+        if known.is_read and is_meant and part not in leave_out:
             if node is not None:
-                yield from take_lost(node, kind, leave_out)
-                own = READ_BY_DRAKE[kind].get(name, {})
-                if own and not any(is_read for is_read, _ in own.values()):
+                yield from take_lost(node, kind, leave_out, joint)
+                own = tables.get(name, {})
+                if own and not any(part.is_read for part in own.values()):
                     element.remove(node)
         elif node is not None:
             element.remove(node)

@@ -1,10 +1,12 @@
 """Reads a robot's files into a MultibodyPlant, and into links of the library."""
 
+import logging
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import get_native_id
 from types import MappingProxyType
 
 import numpy as np
@@ -132,10 +134,11 @@ def read_robot(
             models = _mended(robot, files, mender)
             if mender.lost:
                 raise ModelError(_told(mender.lost))
-            if isinstance(models, Path):
-                parser.AddModels(str(models))
-            else:
-                ProcessModelDirectives(models, parser)
+            with _remarks(mender):
+                if isinstance(models, Path):
+                    parser.AddModels(str(models))
+                else:
+                    ProcessModelDirectives(models, parser)
             _add_floating_joints(plant, mender)
     for (category, kind), items in mender.told.items():
         warnings.warn(f"{kind}: {_listed(items)}", category, stacklevel=2)
@@ -203,10 +206,33 @@ def drake_errors(originals: Mapping[Path, Path] = MappingProxyType({})) -> Itera
     except DrakeDaeError:
         raise
     except (RuntimeError, ValueError, SystemExit) as error:
-        text = str(error)
-        for copy, original in originals.items():
-            text = text.replace(str(copy), str(original))
-        raise ModelError(text) from None
+        raise ModelError(_of_originals(str(error), originals)) from None
+
+
+@contextmanager
+def _remarks(mender: Mender) -> Iterator[None]:
+    """Tells what Drake logs in this thread."""
+    here, logger = get_native_id(), logging.getLogger("drake")
+
+    def passes(record: logging.LogRecord) -> bool:
+        is_remark = record.thread == here and record.levelno >= logging.WARNING
+        if is_remark:
+            text = _of_originals(record.getMessage(), mender.originals)
+            mender.tell("Drake reads the file with remarks", text.replace(" warning:", ""))
+        return not is_remark
+
+    logger.addFilter(passes)
+    try:
+        yield
+    finally:
+        logger.removeFilter(passes)
+
+
+def _of_originals(text: str, originals: Mapping[Path, Path]) -> str:
+    """A text of Drake with the names of files in the place of those of their copies."""
+    for copy, file in originals.items():
+        text = text.replace(f"/{copy}", file.name).replace(str(copy), file.name)
+    return " ".join(text.split())
 
 
 def _told(lost: Mapping[str, list[str]]) -> str:

@@ -106,8 +106,9 @@ class Robot:
             other. Without a number the limit is that of the file. Controls have this order, after
             those of the file's own actuators.
         leave_out: What is left out of the file: elements and attributes by "<parent>/<name>", as
-            "joint/stiffness" or "equality/weld". Drake reads not all that a file says; what of it
-            changes the equations is an error until it is named here. Besides, inertia: impossible
+            "joint/stiffness" or "equality/weld", and of one type of joints by "<type>/<name>", as
+            "universal/spring_stiffness". Drake reads not all that a file says; what of it changes
+            the equations is an error until it is named here. Besides, inertia: impossible
             moments of inertia, which the nearest possible ones replace; empty_limits: position
             limits that are empty intervals, such as 0 to 0.
         payloads: Masses attached to the robot, known to plant and law.

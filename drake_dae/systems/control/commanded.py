@@ -17,13 +17,11 @@ from drake_dae.systems.control.references import (
     reference_block,
 )
 
-RATES = {"N": 40.0, "N m": 40.0}
-"""Unit -> the rate w of the lags, in 1/s; `RATE` for others."""
+RATES, RATE = {"N": 40.0, "N m": 40.0}, 12.0
+"""Unit -> the rate w of the lags, in 1/s; that of others."""
 
-SPEEDS = {"m": 0.4, "N": 400.0, "N m": 40.0}
-"""Unit -> the largest speed V of a change, in this unit per second; `SPEED` for others."""
-
-RATE, SPEED = 12.0, 1.0
+SPEEDS, SPEED = {"m": 0.4, "N": 400.0, "N m": 40.0}, 1.0
+"""Unit -> the largest speed V of a change, in this unit per second; that of others."""
 
 
 @checked(ReferenceSignalError)
@@ -75,11 +73,9 @@ class CommandedReferences(ReferenceGenerator):
             rate = ca.vertcat(first, w * (y[:-1, :] - y[1:, :]))
             states.append(y)
             rates.append(rate)
-            change = y[-1]
-            for order in range(degree + 1):
-                rows.append(change)
-                if order < degree:
-                    change = ca.jtimes(change, y, rate)
+            rows.append(y[-1])
+            for _ in range(degree):
+                rows.append(ca.jtimes(rows[-1], y, rate))
         block = replace(
             base,
             outputs={"reference": base.outputs["reference"] + stacked(rows)},

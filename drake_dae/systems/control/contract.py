@@ -28,11 +28,10 @@ else:
 Derived = dict[str, tuple[FloatArray, tuple[Signal, ...]]]
 """Name of a signal -> its values, one row for each time, and their names and units."""
 
-SIGNAL = "signal_"
-"""The beginning of the name of an input port for a signal."""
-
 Compared = tuple[FloatArray, FloatArray, Sequence[Signal]]
 """Outputs z and their desired values, shape (k,) each, and their names and units."""
+
+SIGNAL = "signal_"  # the beginning of the name of an input port for a signal
 
 
 @checked(ModelError)
@@ -139,8 +138,8 @@ class Controller(System):
         port = self.GetInputPort("reference") if self.HasInputPort("reference") else None
         if port is None or not port.HasValue(context):
             return None
-        desired, law = port.Eval(context)[self.law.layout.lowest], self.law
-        return shown("controlled_output"), desired, law.system.output_signals
+        desired = port.Eval(context)[self.law.layout.lowest]
+        return shown("controlled_output"), desired, self.law.system.output_signals
 
     def predicted_error(
         self, times: FloatArray, values: Mapping[str, FloatArray], parameters: FloatArray
@@ -155,8 +154,8 @@ class Controller(System):
 
 def check_law(dae: DaeSystem, law: TrackingLaw) -> None:
     """Refuses a law for a system of another size than the plant's, by a WiringError."""
-    remedy = "the law for the plant's system, TrackingLaw(plant.dae, ...), or for"
-    check_same_sizes(dae, law.system, "law", f"{remedy} a model of the same structure")
+    remedy = "the law for the plant's system, TrackingLaw(plant.dae, ...), or for one like it"
+    check_same_sizes(dae, law.system, "law", remedy)
 
 
 def check_same_sizes(dae: DaeSystem, other: DaeSystem, what: str, remedy: str) -> None:

@@ -28,17 +28,14 @@ class TrackingController(ParameterizedSystem, Controller):
         reference: R, output-major, r_i, ..., r_i^(mu_i); shape (sum (mu_i + 1),).
         measured_force: The constraint force from a sensor, shape (m,); if the law takes it.
         exogenous: The signals w with their derivatives, if there are any.
+        hold: Of a law with integrals, shape (k,): an error is not integrated while its entry is not
+            0, as while a drive is at its limit or a contact is lost; 0 without a wire.
 
     Output ports:
         control: u, shape (p,).
         tracking_error: e = z - r (29) by the controller's own model, one entry per output.
-        integral: The integrals of errors, shape (k,), if the law has any; its state. They start at
-            zero, or at the values of `set_integral`. An integral is not updated while its entry of
-            `hold` is not 0 (anti-windup).
-
-    A law with integrals also has an input port `hold`, shape (k,): an error is not integrated while
-    its entry is not 0, for example while a drive is at its limit or a contact is lost. Without a
-    wire it is 0.
+        integral: The integrals of errors, shape (k,), if the law has any. They start at zero, or at
+            the values of `set_integral`.
 
     The first two output ports have direct feedthrough from all input ports except `hold`, and
     except `measured_force` if the law only integrates it. Numeric parameter 0 holds the model's
@@ -47,16 +44,15 @@ class TrackingController(ParameterizedSystem, Controller):
     Args:
         law: The law.
         outputs: z at which its zero dynamics are judged, shape (p,); see `ZeroDynamics.stability`.
-        sample_period: The sample period of integrals in s, as for discrete plants; 0 for continuous
-            integrals.
+        sample_period: That of integrals in s, as for discrete plants; 0 for continuous ones.
 
     Warns:
         NonMinimumPhaseWarning: The zero dynamics (35) are unstable about that equilibrium.
 
     Raises:
         ModelError: The period is not valid.
-        SingularityError: A(x) or B(x) is singular on the way; the exception has time and state.
-        NonFiniteError: A value is not finite on the way, likewise.
+        SingularityError, NonFiniteError: A(x) or B(x) is singular, or a value is not finite, on the
+            way; the exception has time and state.
     """
 
     __slots__ = SHARED_DICTIONARY

@@ -1,7 +1,7 @@
 """What acts on a robot of a control: it is sampled, late, held between samples, and limited."""
 
 from dataclasses import dataclass
-from math import ceil, floor, isfinite
+from math import ceil, floor
 from typing import Any
 
 import casadi as ca
@@ -10,17 +10,15 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import EventStatus
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import check_whole_number
+from drake_dae.arrays import check_whole_number, positive
 from drake_dae.blocks.block import Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.errors import ModelError, NonFiniteError, WiringError
 
-_SAME = 1e-9
-"""Times that differ by less than this, in periods, count as equal."""
+_SAME = 1e-9  # Times that differ by less than this, in periods, count as equal.
 
-MOST_ON_THE_WAY = 10_000
-"""The largest number of computations in progress: each is stored and shifted at every sample."""
+MOST_ON_THE_WAY = 10_000  # computations in progress: each is stored, and shifted at every sample
 
 
 @checked(ModelError)
@@ -41,14 +39,12 @@ class Sampling:
     delay: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (isfinite(self.period) and self.period > 0.0):
-            raise ModelError(f"a sampling's period must be positive, got {self.period:g} s")
-        if not (isfinite(self.delay) and self.delay >= 0.0):
-            raise ModelError(f"a sampling's delay must be 0 or more, got {self.delay:g} s")
-        if not self.delay / self.period <= MOST_ON_THE_WAY:
+        positive("a sampling's period", self.period)
+        most = MOST_ON_THE_WAY * self.period
+        if not 0.0 <= self.delay <= most:
             raise ModelError(
-                f"a sampling's delay may be {MOST_ON_THE_WAY} periods at most, here "
-                f"{MOST_ON_THE_WAY * self.period:g} s, got {self.delay:g} s"
+                f"a sampling's delay must be from 0 to {MOST_ON_THE_WAY} periods, here {most:g} s, "
+                f"got {self.delay:g} s"
             )
 
     @property
@@ -102,9 +98,8 @@ class ControlHold(TracedSystem):
         except NonFiniteError as error:
             raise WiringError(
                 "the first control cannot be found, as where a law reads the force that its own "
-                "control makes: put a ForceSensor with a sample_period between, which has a force "
-                "at the start, or set what control_hold holds before the first sample by "
-                "SetDiscreteState"
+                "control makes: put a ForceSensor with a sample_period between, or set what "
+                "control_hold holds before the first sample by SetDiscreteState"
             ) from error
 
 

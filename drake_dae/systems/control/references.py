@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from math import factorial
 
 import casadi as ca
@@ -39,11 +39,8 @@ class ReferenceGenerator(TracedSystem):
         degrees: The degrees mu_1, ..., mu_p, `TrackingLaw.degrees`.
 
     Attributes:
-        references, degrees: The arguments.
         reference_parameters: Name -> default of each parameter of its references, shape (k,),
             stacked in numeric parameter 0. References may share a parameter by its name.
-
-    The block converts to AutoDiffXd and to symbolic expressions.
 
     Raises:
         ReferenceSignalError: The references cover too few or too many outputs, or are not smooth
@@ -74,25 +71,24 @@ class ReferenceGenerator(TracedSystem):
         return BlockFunction(self._base, "", {"R": self._base.outputs["reference"]})
 
     def set_parameter(self, context: Context, name: str, value: ArrayLike) -> None:
-        """Changes a parameter of its references in a context.
-
-        `value` has shape (k,), or is a number for all entries.
+        """Changes a parameter of its references in a context, shape (k,), or all its entries.
 
         Raises:
             ReferenceSignalError: There is no such parameter, or the value does not fit.
         """
         self.check_context(context)
-        sizes = {known: default.size for known, default in self.reference_parameters.items()}
-        if name not in sizes:
-            raise ReferenceSignalError(unknown_name("parameter of references", name, sizes))
-        given = numbers(f"parameter '{name}'", value, ReferenceSignalError)
-        if given.shape not in ((), (sizes[name],)) or not all_finite(given):
+        known, first = self.reference_parameters, 0
+        if name not in known:
+            raise ReferenceSignalError(unknown_name("parameter of references", name, known))
+        size, given = known[name].size, numbers(f"parameter '{name}'", value, ReferenceSignalError)
+        if given.shape not in ((), (size,)) or not all_finite(given):
             raise ReferenceSignalError(
-                f"parameter '{name}' takes {sizes[name]} finite numbers, got {value!r}"
+                f"parameter '{name}' takes {size} finite numbers, got {value!r}"
             )
+        for before in takewhile(lambda each: each != name, known):
+            first += known[before].size
         values = context.get_numeric_parameter(0).CopyToVector()
-        first = sum([*sizes.values()][: [*sizes].index(name)])
-        values[first : first + sizes[name]] = given
+        values[first : first + size] = given
         context.get_mutable_numeric_parameter(0).SetFromVector(values)
 
 
@@ -102,22 +98,14 @@ def reference_block(
     parameters: Mapping[str, FloatArray],
 ) -> Block:
     """R(t) with its derivatives, as a block; see `ReferenceGenerator`."""
-    covered = sum(reference.size for reference in references)
-    if covered != len(degrees):
+    if (covered := sum(reference.size for reference in references)) != len(degrees):
         raise ReferenceSignalError(
             f"the references cover {covered} outputs, the law has {len(degrees)}"
         )
     symbols = {name: ca.SX.sym(name, value.size) for name, value in parameters.items()}
     moved = [reference.with_parameters(symbols) for reference in references]
-    ranges = []
-    for each in map(_whole, references):
-        if isinstance(each, TrajectoryReference):
-            first, last = each.trajectory.start_time(), each.trajectory.end_time()
-            reason = (
-                f"the reference Trajectory covers {first:g} to {last:g} s; extend it over the "
-                "whole simulation"
-            )
-            ranges.append(Requirement(each.margin(TIME), reason, FailureKind.OUTSIDE))
+    wholes = map(_whole, references)
+    ranges = (each.range for each in wholes if isinstance(each, TrajectoryReference))
     return Block(
         "reference",
         outputs={"reference": traced_references(moved, degrees, TIME)},
@@ -180,16 +168,15 @@ class TrajectoryReference(Reference):
     trajectory: Trajectory
 
     def __post_init__(self) -> None:
-        if not isinstance(self.trajectory, PiecewisePolynomial | BsplineTrajectory):
+        path = self.trajectory
+        if not isinstance(path, PiecewisePolynomial | BsplineTrajectory):
             raise ReferenceSignalError(
                 "a reference Trajectory must be a PiecewisePolynomial or a BsplineTrajectory, got "
-                f"a {type(self.trajectory).__name__}; sample it into one of these"
+                f"a {type(path).__name__}; sample it into one of these"
             )
-        if self.trajectory.cols() != 1:
-            raise ReferenceSignalError(
-                "a reference Trajectory must be a column, this one is "
-                f"{self.trajectory.rows()} x {self.trajectory.cols()}"
-            )
+        if path.cols() != 1:
+            size = f"{path.rows()} x {path.cols()}"
+            raise ReferenceSignalError(f"a reference Trajectory must be a column, got {size}")
 
     @property
     def size(self) -> int:
@@ -199,16 +186,19 @@ class TrajectoryReference(Reference):
         pieces = self._pieces
         table = [pieces.expression(time)]
         for order in range(max(degrees)):
-            self._check_breaks(pieces, order, degrees)
+            _check_breaks(pieces, order, degrees)
             pieces = _derivative(pieces)
             table.append(pieces.expression(time))
         rows = [table[k][i] for i, degree in enumerate(degrees) for k in range(degree + 1)]
-        return ca.vertcat(*rows) + ca.if_else(self.margin(time) >= 0.0, 0.0, np.nan)
+        return ca.substitute(self.range.of(ca.vertcat(*rows)), TIME, time)
 
-    def margin(self, time: ca.SX) -> ca.SX:
-        """The distance of a time from the ends of the trajectory, in s; negative outside."""
+    @property
+    def range(self) -> Requirement:
+        """That TIME is in the range of the trajectory."""
         first, last = self.trajectory.start_time(), self.trajectory.end_time()
-        return ca.fmin(time - first, last - time) + 1e-9 * max(1.0, abs(last))
+        margin = ca.fmin(TIME - first, last - TIME) + 1e-9 * max(1.0, abs(last))
+        text = f"the reference Trajectory covers {first:g} to {last:g} s; extend it over the run"
+        return Requirement(margin, text, FailureKind.OUTSIDE)
 
     @property
     def _pieces(self) -> PiecewisePolynomials:
@@ -232,25 +222,22 @@ class TrajectoryReference(Reference):
                 factors[i, :, : power.size] += np.outer(values, power)
         return PiecewisePolynomials(breaks, factors)
 
-    def _check_breaks(
-        self, pieces: PiecewisePolynomials, order: int, degrees: Sequence[int]
-    ) -> None:
-        before = pieces.factors[:-1].sum(axis=2)
-        jumps = pieces.factors[1:, :, 0] - before
-        for row, degree in enumerate(degrees):
-            bad = np.abs(jumps[:, row]) > 1e-6 * (1.0 + np.abs(before[:, row]))
-            if order < degree and bad.any():
-                i = int(np.argmax(bad))
-                raise ReferenceSignalError(
-                    f"derivative {order} of row {row} of the reference Trajectory jumps by "
-                    f"{jumps[i, row]:.3g} at t = {pieces.breaks[i + 1]:g} s, but the law needs a "
-                    f"reference with {degree} derivatives; use a smoother trajectory"
-                )
+
+def _check_breaks(pieces: PiecewisePolynomials, order: int, degrees: Sequence[int]) -> None:
+    """Refuses a jump of a derivative below the highest one."""
+    before = pieces.factors[:-1].sum(axis=2)
+    jumps = pieces.factors[1:, :, 0] - before
+    needed = order < np.array(degrees)
+    for i, row in np.argwhere((np.abs(jumps) > 1e-6 * (1.0 + np.abs(before))) & needed):
+        raise ReferenceSignalError(
+            f"derivative {order} of row {row} of the reference Trajectory jumps by "
+            f"{jumps[i, row]:.3g} at t = {pieces.breaks[i + 1]:g} s, but the law needs a "
+            f"reference with {degrees[row]} derivatives; use a smoother trajectory"
+        )
 
 
 def _derivative(pieces: PiecewisePolynomials) -> PiecewisePolynomials:
     powers = np.arange(pieces.factors.shape[2])
     factors = (pieces.factors * powers)[:, :, 1:] / np.diff(pieces.breaks)[:, None, None]
-    if not factors.shape[2]:
-        factors = np.zeros((*factors.shape[:2], 1))
-    return PiecewisePolynomials(pieces.breaks, factors)
+    constant = np.zeros((*factors.shape[:2], 1))
+    return PiecewisePolynomials(pieces.breaks, factors if factors.shape[2] else constant)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -21,8 +22,7 @@ else:
     # also from this one.
     System = object
 
-NOWHERE: list[int] = []
-"""No indices: for a block without exogenous parameters."""
+NOWHERE: list[int] = []  # of a block without exogenous parameters
 
 
 @checked(ModelError)
@@ -124,11 +124,9 @@ class Plant(System):
         """
         parameters = self.current_parameters(context)
         if isinstance(guess, Mapping):
-            names = [signal.name for signal in self.dae.state_signals]
-            start, fixed = self.dae.nominal_state.copy(), [*fixed, *guess]
-            for name in set(guess) & set(names):  # The manifold refuses others.
-                start[names.index(name)] = guess[name]
-            guess = start
+            fixed = [*fixed, *guess]  # Of which the manifold refuses unknown ones.
+            pairs = zip(self.dae.state_signals, self.dae.nominal_state, strict=True)
+            guess = np.array([guess.get(signal.name, value) for signal, value in pairs])
         state = self.structure.manifold.settle(guess, parameters, fixed)
         self.check_start(state, parameters)
         self.set_state(context, state)

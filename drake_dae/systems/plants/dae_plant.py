@@ -54,9 +54,6 @@ class DaePlant(ParameterizedSystem, Plant):
         structure: Its structure; found if None.
         project: False leaves the drift off N* uncorrected, to study it.
 
-    Attributes:
-        structure: The structure.
-
     Raises:
         AssumptionError: The system violates one of Assumptions (1)-(3).
         ModelError: It is not a system, or the structure is that of another one.
@@ -90,9 +87,8 @@ class DaePlant(ParameterizedSystem, Plant):
         """Returns the error with dependent constraints, or as that of a Painleve paradox."""
         if not isinstance(error, SingularityError):
             return error
-        parameters = values.get("parameters", np.zeros(0))
+        parameters = values.get("parameters", np.zeros(0)).copy()
         if "input exogenous" in values:
-            parameters = parameters.copy()
             parameters[self.exogenous_places] = values["input exogenous"]
         if not self.dae.frictional_contacts:
             names = self.structure.dependent_constraints(error.state, parameters)
@@ -126,11 +122,10 @@ def dae_block(structure: ConstraintStructure, project: bool = True) -> Block:
         force = ca.substitute(force, control, none)
     projection = None
     if project and system.num_constraints:
-        parameters = system.parameter_symbol
         step = manifold.newton_step
         symbols = [ca.SX.sym(*item) for item in zip(step.input_names, step.sizes, strict=True)]
         newton = ca.Function("newton", symbols, step.function.call(symbols)[:1])
-        projection = Projection(newton, manifold.projected, parameters)
+        projection = Projection(newton, manifold.projected, system.parameter_symbol)
     return Block(
         system.name,
         inputs={"control": control},

@@ -39,11 +39,7 @@ class RobotPlant(DaePlant):
 
     Args:
         model: The robot.
-        structure: The structure of `model.dae`; found if None.
-        project: False leaves the drift off N* uncorrected, to study it.
-
-    Attributes:
-        model: The robot.
+        structure, project: As for `DaePlant`.
     """
 
     __slots__ = SHARED_DICTIONARY
@@ -66,8 +62,8 @@ class RobotPlant(DaePlant):
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
-        names = ["loop_state"] if self.model.loop_joints.signals else []
-        return {name: self.block.signals[name] for name in names}
+        signals = self.model.loop_joints.signals
+        return {"loop_state": signals} if signals else {}
 
 
 def robot_block(model: RobotModel, structure: ConstraintStructure, project: bool = True) -> Block:

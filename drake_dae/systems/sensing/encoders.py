@@ -31,20 +31,15 @@ class Encoders:
 
         vm_k = a vm_(k-1) + (1 - a) (qm_k - qm_(k-1)) / T,    a = exp(-w T),
 
-    which starts at the robot's velocity. If a position passes many multiples of delta between
-    samples, its rounding errors are like white noise, uniform over (-delta/2, delta/2): see
-    `position_deviation` and `velocity_deviation`.
-
-    An observer with a `state_rate` estimates velocities from positions: it takes measured ones only
-    if their noise is given, and no differences.
+    which starts at the robot's velocity. An observer with a `state_rate` estimates velocities from
+    positions: it takes measured ones only if their noise is given, and no differences.
 
     Attributes:
-        resolution: delta in rad or m, one number for all positions or one each; 0 for none.
+        resolution: delta in rad or m, one number for all positions or one each, as for the others;
+            0 for none.
         velocity_bandwidth: w in rad/s; None for directly measured velocities.
-        position_bias: b in rad or m, one number or one each.
-        position_noise: sigma_q in rad or m, one number or one each.
-        velocity_noise: sigma_v in rad/s or m/s, one number or one each; only without a
-            velocity_bandwidth.
+        position_bias, position_noise: b and sigma_q in rad or m.
+        velocity_noise: sigma_v in rad/s or m/s; only without a velocity_bandwidth.
         seed: The seed of the noise.
 
     Raises:
@@ -63,9 +58,10 @@ class Encoders:
         for name in ("resolution", "position_noise", "velocity_noise", "position_bias"):
             given, is_bias = numbers(name, getattr(self, name)), name == "position_bias"
             if given.ndim > 1 or not (np.isfinite(given).all() and (is_bias or np.all(given >= 0))):
+                right = "finite" if is_bias else "0 or more"
                 raise ModelError(
-                    f"the {name} of encoders must be {'finite' if is_bias else '0 or more'}, one "
-                    f"number or one for each position, got {brief(getattr(self, name))}"
+                    f"the {name} of encoders must be {right}, one number or one for each position, "
+                    f"got {brief(getattr(self, name))}"
                 )
         if self.velocity_bandwidth is not None:
             positive("the velocity_bandwidth of encoders", self.velocity_bandwidth)
@@ -85,24 +81,11 @@ class Encoders:
 
     @property
     def position_deviation(self) -> FloatArray:
-        """The standard deviation of qm - q - b, sqrt(delta^2 / 12 + sigma_q^2), rad or m."""
-        return np.sqrt(np.square(self.resolution) / 12.0 + np.square(self.position_noise))
+        """The standard deviation of qm - q - b, sqrt(delta^2 / 12 + sigma_q^2), rad or m.
 
-    def velocity_deviation(self, period: float) -> FloatArray:
-        """The standard deviation of vm, rad/s or m/s.
-
-        For white position errors it follows from the sum of squares of the impulse response of the
-        filtered difference, (1 - a) / T (1, -(1 - a), -(1 - a) a, ...):
-
-            position_deviation (1 - a) / T sqrt(2 / (1 + a)).
-
-        Args:
-            period: T in s.
+        Between samples a position passes many multiples of delta, so that rounding is white noise.
         """
-        if self.velocity_bandwidth is None:
-            return np.array(self.velocity_noise, dtype=float)
-        a = np.exp(-self.velocity_bandwidth * positive("period", period))
-        return self.position_deviation * (1.0 - a) / period * np.sqrt(2.0 / (1.0 + a))
+        return np.sqrt(np.square(self.resolution) / 12.0 + np.square(self.position_noise))
 
 
 @checked(ModelError)
@@ -115,16 +98,9 @@ class StateSensor(TracedSystem):
     """
 
     __slots__ = SHARED_DICTIONARY
-    measures = True
-    """It is part of the machine, not of a controller that is exported alone."""
+    measures = True  # It is part of the machine, not of a controller that is exported alone.
 
-    def __init__(
-        self,
-        size: int,
-        num_positions: int,
-        encoders: Encoders,
-        period: float,
-    ) -> None:
+    def __init__(self, size: int, num_positions: int, encoders: Encoders, period: float) -> None:
         check_whole_number("num_positions", num_positions, 1)
         check_whole_number("size", size, 2 * num_positions)
         self.encoders, self.sample_period = encoders, positive("period", period)

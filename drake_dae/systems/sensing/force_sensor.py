@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import vector
+from drake_dae.arrays import FloatArray, brief, numbers, vector
 from drake_dae.blocks.block import TIME, Block, Held
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
@@ -29,8 +29,7 @@ class ForceSensor(TracedSystem):
 
     Input ports:
         force: The constraint force in N (N m), shape (m,).
-        noise: Noise of deviation 1, shape (m,), for example from Drake's RandomSource; only with a
-            noise_deviation.
+        noise: Noise of deviation 1, shape (m,), as of Drake's RandomSource; with a noise_deviation.
 
     Output port:
         measured_force: The measured force, shape (m,); no direct feedthrough from `force`.
@@ -41,21 +40,16 @@ class ForceSensor(TracedSystem):
         size: The number of forces, m.
         time_constant: The time constant of the lag in s; 0 for none, then it must sample.
         sample_period: The time between samples in s; 0 for none, then it must lag.
-        bias: A constant error in N, a number or shape (m,).
-        noise_deviation: The standard deviation of the noise in N, a number or shape (m,).
-        drift: The rate at which the bias changes in N/s, a number or shape (m,).
-
-    Attributes:
-        time_constant, sample_period, bias, noise_deviation, drift: The arguments, the last three as
-            arrays of shape (m,).
+        bias: A constant error in N, a number or shape (m,), as the next two.
+        noise_deviation: The standard deviation of the noise in N.
+        drift: The rate at which the bias changes in N/s.
 
     Raises:
         ModelError: A number is negative, or there is neither lag nor sampling.
     """
 
     __slots__ = SHARED_DICTIONARY
-    measures = True
-    """It is part of the machine, not of a controller that is exported alone."""
+    measures = True  # It is part of the machine, not of a controller that is exported alone.
 
     def __init__(
         self,
@@ -66,27 +60,12 @@ class ForceSensor(TracedSystem):
         noise_deviation: ArrayLike = 0.0,
         drift: ArrayLike = 0.0,
     ) -> None:
-        self.time_constant = float(time_constant)
-        self.sample_period = float(sample_period)
-        try:
-            errors = [np.asarray(value, dtype=float) for value in (bias, noise_deviation, drift)]
-            self.bias, self.noise_deviation, self.drift = (
-                np.broadcast_to(value, (size,)) for value in errors
-            )
-        except ValueError:
-            raise ModelError(
-                f"a ForceSensor's bias, noise_deviation and drift are numbers or shape ({size},), "
-                f"got {bias!r}, {noise_deviation!r} and {drift!r}"
-            ) from None
-        positive = [self.time_constant, self.sample_period, *self.noise_deviation]
-        numbers = [*positive, *self.bias, *self.drift]
-        if min(positive) < 0 or not np.all(np.isfinite(numbers)):
-            raise ModelError(
-                "a ForceSensor's time_constant, sample_period and noise_deviation must be finite "
-                f"and not negative, got {time_constant}, {sample_period}, {noise_deviation!r}; its "
-                f"bias and drift must be finite, got {bias!r}, {drift!r}"
-            )
-        if not (self.time_constant or self.sample_period):
+        self.time_constant, self.sample_period = time_constant, sample_period
+        errors = _errors(size, bias, noise_deviation, drift)
+        for name, value in (("time_constant", time_constant), ("sample_period", sample_period)):
+            if not 0.0 <= value < np.inf:
+                raise ModelError(f"a ForceSensor's {name} must be 0 or more, got {value:g}")
+        if not (time_constant or sample_period):
             raise ModelError(
                 "a ForceSensor needs a time_constant or a sample_period: without state it would "
                 "close an algebraic loop"
@@ -94,28 +73,27 @@ class ForceSensor(TracedSystem):
         force, y, sampled, noise = (
             ca.SX.sym(name, size) for name in ("force", "y", "sampled", "noise")
         )
-        parts = self.bias, self.noise_deviation, self.drift
         names = [Signal(f"{p}[{i}]") for p in ("bias", "noise", "drift") for i in range(size)]
-        bias, deviation, drift = (ca.SX.sym(name, size) for name in ("bias", "deviation", "drift"))
+        parameters = ca.SX.sym("errors", 3 * size)
+        of_bias, deviation, of_drift = ca.vertsplit(parameters, size)
         inputs = {"force": force}
-        measured = (y if self.time_constant else force) + bias + drift * TIME
-        if self.noise_deviation.any():
+        measured = (y if time_constant else force) + of_bias + of_drift * TIME
+        if errors[size : 2 * size].any():
             inputs["noise"] = noise
             measured = measured + deviation * noise
         block = Block(
             "force_sensor",
             inputs,
-            {"measured_force": sampled if self.sample_period else measured},
-            parameters=ca.vertcat(bias, deviation, drift),
-            start={"parameters": np.concatenate(parts)},
+            {"measured_force": sampled if sample_period else measured},
+            parameters=parameters,
+            start={"parameters": errors},
             signals={"parameters": names},
         )
-        if self.time_constant:
-            rate = (force - y) / self.time_constant
-            block = replace(block, state=y, derivative=rate)
-        if self.sample_period:
-            start, period = np.zeros(size), self.sample_period
-            held = Held(sampled, measured, start, period, is_unrestricted=False)
+        if time_constant:
+            block = replace(block, state=y, derivative=(force - y) / time_constant)
+        if sample_period:
+            start = np.zeros(size)
+            held = Held(sampled, measured, start, sample_period, is_unrestricted=False)
             block = replace(block, held={"measured_force": held})
         super().__init__(block)
 
@@ -133,11 +111,9 @@ class ForceSensor(TracedSystem):
         """
         self.check_context(context)
         size = self.block.inputs["force"].numel()
-        lags = self.time_constant, self.sample_period
-        other = ForceSensor(size, *lags, bias, noise_deviation, drift)
-        if other.noise_deviation.any() and "noise" not in self.block.inputs:
+        errors = _errors(size, bias, noise_deviation, drift)
+        if errors[size : 2 * size].any() and "noise" not in self.block.inputs:
             raise ModelError("a ForceSensor that was made without noise has no port for it")
-        errors = np.concatenate([other.bias, other.noise_deviation, other.drift])
         context.get_mutable_numeric_parameter(0).SetFromVector(errors)
 
     def set_force(self, context: Context, force: ArrayLike) -> None:
@@ -160,3 +136,19 @@ class ForceSensor(TracedSystem):
             return np.inf
         a = np.exp(-self.sample_period / self.time_constant) if self.time_constant else 0.0
         return float((1.0 + a) / (1.0 - a))
+
+
+def _errors(size: int, *errors: ArrayLike) -> FloatArray:
+    """The bias, noise_deviation and drift of all forces, shape (3 m,)."""
+    found = []
+    for name, given in zip(("bias", "noise_deviation", "drift"), errors, strict=True):
+        values = numbers(name, given)
+        least = 0.0 if name == "noise_deviation" else -np.inf
+        if values.shape not in ((), (size,)) or not np.all(np.isfinite(values) & (values >= least)):
+            right = "finite, 0 or more" if least == 0.0 else "finite"
+            raise ModelError(
+                f"a ForceSensor's {name} must be {right}, a number or shape ({size},), got "
+                f"{brief(given)}"
+            )
+        found.append(np.broadcast_to(values, size))
+    return np.concatenate(found)

@@ -69,27 +69,19 @@ def open_contact(system: DaeSystem, force: str | Sequence[str]) -> DaeSystem:
 
 def _contact(system: DaeSystem, forces: Sequence[int]) -> OpeningContact:
     """The contact with some constraint forces; raises as `open_contact` does."""
-    names = [signal.name for signal in system.constraint_input_signals]
-    outputs = listed(signal.name for signal in system.output_signals)
-    others = [i for i in range(len(names)) if i not in forces]
-    depending = [
-        j for j in range(system.num_outputs) if any(not system.m[j, i].is_zero() for i in forces)
-    ]
-    fitting = [
-        j
-        for j in depending
-        if system.l[j].is_zero() and all(system.m[j, i].is_zero() for i in others)
-    ]
-    if len(depending) == len(fitting) == len(forces):
-        total = [j for j in fitting if all(system.m[j, i].is_one() for i in forces)]
-        if len(total) == 1:
-            return OpeningContact(tuple(fitting), tuple(forces), total[0])
-    own = ", ".join(f"'{names[i]}'" for i in forces)
+    m = ca.sparsify(system.m)
+    others = [i for i in range(system.num_constraints) if i not in forces]
+    places = [j for j in range(system.num_outputs) if m[j, forces].nnz()]
+    total = [j for j in places if all(m[j, i].is_one() for i in forces)]
+    is_alone = not m[places, others].nnz() and all(system.l[j].is_zero() for j in places)
+    if is_alone and len(places) == len(forces) and len(total) == 1:
+        return OpeningContact(tuple(places), tuple(forces), total[0])
+    own = ", ".join(f"'{system.constraint_input_signals[i].name}'" for i in forces)
     raise ModelError(
         f"{system.name}: {own} must be outputs, one by itself, or of "
         "several points as many outputs of these alone, one of them their sum, such as "
         "ForceCombinations, so that distances can be in their places where the contact is open; "
-        f"the outputs are {outputs}"
+        f"the outputs are {listed(signal.name for signal in system.output_signals)}"
     )
 
 
@@ -109,25 +101,26 @@ def opening_contact(law: TrackingLaw, free_law: TrackingLaw) -> OpeningContact:
         )
     if law.deflection is not None:
         raise ModelError(f"{closed.name}: a contact_stiffness is not for tasks; leave it out")
-    contact = _contact(closed, [names.index(name) for name in gone])
-    for place, force in zip(contact.places, contact.forces, strict=True):
-        distance = closed.constraint_output_signals[force].name
-        if free.output_signals[place].name != distance:
-            raise ModelError(
-                f"the free law must have the output '{distance}' where the law has "
-                f"'{closed.output_signals[place].name}'; make its system by open_contact"
-            )
     if law.exogenous_degrees != free_law.exogenous_degrees:
         raise ModelError(
             f"{closed.name}: the law in contact needs {law.exogenous_degrees} derivatives of its "
             f"exogenous signals, as of an observer's estimates, the free law "
             f"{free_law.exogenous_degrees}; leave them, or the observer, out"
         )
+    contact = _contact(closed, [names.index(name) for name in gone])
+    distances = dict(zip(contact.places, contact.forces, strict=True))
     for i, (degree, freed) in enumerate(zip(law.degrees, free_law.degrees, strict=True)):
-        name = free.output_signals[i].name
-        if i in contact.places and freed < 2:
-            raise ModelError(f"'{name}' must have degree 2 or more, as where forces move it")
-        if i not in contact.places and degree != freed:
+        name, in_contact = free.output_signals[i].name, closed.output_signals[i].name
+        if i in distances:
+            distance = closed.constraint_output_signals[distances[i]].name
+            if name != distance:
+                raise ModelError(
+                    f"the free law must have the output '{distance}' where the law has "
+                    f"'{in_contact}'; make its system by open_contact"
+                )
+            if freed < 2:
+                raise ModelError(f"'{name}' must have degree 2 or more, as where forces move it")
+        elif degree != freed:
             raise ModelError(
                 f"'{name}' has degree {degree} in contact and {freed} without, so that no "
                 "reference leads from one to the other"

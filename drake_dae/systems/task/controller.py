@@ -116,9 +116,6 @@ class TaskController(ParameterizedSystem, Controller):
         values = law.system.parameter_vector(parameters)
         return ZeroDynamics(law.system, structure=law.structure).state(goal, guess, values)
 
-    def changes(self, values: Mapping[str, FloatArray]) -> tuple[PhaseChange, ...]:
-        return changes_of(self.task, values["change"])
-
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
         named = {"change": CHANGE, "desired_output": self.output_signals}
@@ -143,27 +140,28 @@ class TaskController(ParameterizedSystem, Controller):
                 "take a CompliantPlant or a ContactPlant (in a scenario: plant: !CompliantContact)"
             )
 
+    def _outputs(self, outputs: FloatArray, residual: FloatArray) -> FloatArray:
+        """Positions and forces, then distances."""
+        return np.concatenate([outputs, residual[..., self._distances]], axis=-1)
+
     def derived(self, values: Mapping[str, FloatArray]) -> Derived:
         """Outputs are positions, forces and distances; "phase" is 1 for the current one, else 0."""
         signals, residual = self.output_signals, values["constraint_residual"]
-        outputs = np.concatenate([values["controlled_output"], residual[..., self._distances]], -1)
+        outputs = self._outputs(values["controlled_output"], residual)
         own = signals[len(self.law.degrees) :]
+        motion = (*own, *(signal.derivative(1) for signal in own))
         *names, end = self.phase_names
         phases = (*(Signal(f"{i + 1} {name}") for i, name in enumerate(names)), Signal(end))
         places = values["change"][..., 1:2].astype(int)
         return {
             "phase": ((places == np.arange(len(phases))).astype(float), phases),
-            "distance": (
-                residual[..., self._motion],
-                (*own, *(signal.derivative(1) for signal in own)),
-            ),
+            "distance": (residual[..., self._motion], motion),
             "controlled_output": (outputs, signals),
             "tracking_error": (outputs - values["desired_output"], signals),
         }
 
     def compared(self, context: Context, shown: Callable[[str], FloatArray]) -> Compared:
-        distances = shown("constraint_residual")[self._distances]
-        outputs = np.concatenate([shown("controlled_output"), distances])
+        outputs = self._outputs(shown("controlled_output"), shown("constraint_residual"))
         return outputs, self.GetOutputPort("desired_output").Eval(context), self.output_signals
 
     def predicted_error(
@@ -172,26 +170,27 @@ class TaskController(ParameterizedSystem, Controller):
         """Zero: the references of each phase begin as those before it end."""
         return np.zeros((times.size, len(self.output_signals)))
 
-
-def changes_of(task: Task, rows: FloatArray) -> tuple[PhaseChange, ...]:
-    """The changes by `change` of each sample; those between two samples are left out."""
-    first = np.unique(rows[:, 0], return_index=True)[1]
-    changes, end = list[PhaseChange](), len(task.all_phases)
-    for row in rows[first].tolist():
-        number, place, is_closed, start, cause, force, distance, rate, ending, before = row
-        if not number:
-            continue  # The task has not begun.
-        at = int(place)
-        name = task.all_phases[at].name if at < end else "done" if ending == ALL_DONE else "held"
-        failed = ending == GIVEN_UP if at == end else cause > SUCCESS
-        lasted = f" {start - changes[-1].time:.4g} s" if changes else ""
-        reason = _reason(task, int(before), int(cause), lasted)
-        again = sum(change.place == at for change in changes)
-        if again and at < end:
-            reason += f", retry {again} of {task.retries_of(at)}"
-        motion = force, distance, rate
-        changes.append(PhaseChange(start, name, at, bool(is_closed), reason, *motion, failed))
-    return tuple(changes)
+    def changes(self, values: Mapping[str, FloatArray]) -> tuple[PhaseChange, ...]:
+        task, rows, changes = self.task, values["change"], list[PhaseChange]()
+        end = len(task.all_phases)
+        # Those between two samples of the record are left out.
+        first = np.unique(rows[:, 0], return_index=True)[1]
+        for row in rows[first].tolist():
+            number, place, is_closed, start, cause, force, distance, rate, ending, before = row
+            if not number:
+                continue  # The task has not begun.
+            at = int(place)
+            rests = "done" if ending == ALL_DONE else "held"
+            name = task.all_phases[at].name if at < end else rests
+            failed = ending == GIVEN_UP if at == end else cause > SUCCESS
+            lasted = f" {start - changes[-1].time:.4g} s" if changes else ""
+            reason = _reason(task, int(before), int(cause), lasted)
+            again = sum(change.place == at for change in changes)
+            if again and at < end:
+                reason += f", retry {again} of {task.retries_of(at)}"
+            motion = force, distance, rate
+            changes.append(PhaseChange(start, name, at, bool(is_closed), reason, *motion, failed))
+        return tuple(changes)
 
 
 def _reason(task: Task, place: int, cause: int, lasted: str) -> str:

@@ -18,17 +18,16 @@ Watched = Literal["force", "time", "distance", "travel", "control", "signal"]
 Outcome = Literal["success", "guard", "late", "lost"]
 """How a phase ends."""
 
+FAILURES: tuple[Outcome, ...] = "guard", "late", "lost"
+
 NEXT, DONE, APPROACH, HOLD, LEAVE = ENDS = "next", "done", "approach", "hold", "leave"
 """What may follow a phase besides the name of another one."""
 
 UNITS = {"force": "N", "time": "s", "distance": "m", "travel": "m", "control": "", "signal": ""}
 """Watched quantity -> its unit; a control has its own."""
 
-_SPEED = 0.05
-"""The default speed of an Approach, in m/s."""
-
-_AWAY = 0.02
-"""The distance in m from its start at which a Release has left the contact."""
+_SPEED, _AWAY = 0.05, 0.02
+"""The default speed of an Approach, in m/s; the way in m after which a Release has left."""
 
 _FALL, _LEAST = PathLimits(0.5, 1.0), -1e3
 """How fast the reference of a Release falls below zero, in N/s and N/s^2, and its least value."""
@@ -91,14 +90,14 @@ class Moment:
     wanted: Any  # the reference of the force, in contact, or of the distance
     away: Any = 0.0  # the increase of the distance since the phase began, m
     travel: Any = 0.0
-    signals: Mapping[str, Any] = field(default_factory=dict)
-    controls: Mapping[str, Any] = field(default_factory=dict)  # "" is the largest |u|
+    signal: Mapping[str, Any] = field(default_factory=dict)
+    control: Mapping[str, Any] = field(default_factory=dict)  # "" is the largest |u|
 
     def margin(self, condition: Condition) -> Any:
         """A number that is positive until a condition holds."""
-        value: Any = getattr(self, condition.of, None)
+        value: Any = getattr(self, condition.of)
         if condition.of in ("signal", "control"):
-            value = getattr(self, f"{condition.of}s")[condition.name]
+            value = value[condition.name]
         return condition.limit - value if condition.above is not None else value - condition.limit
 
 
@@ -126,16 +125,12 @@ class Phase:
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
-        name: The name of the phase; by default that of its class, with a number if there are
-            several.
+        name: Its name; by default that of its class, with a number if there are several.
         until: The conditions, one of which ends it with success; its own end if left out.
         guards: The conditions, one of which is a failure.
         within: The largest duration of the phase, in s.
-        on_success: The successor if it succeeds: the name of a phase, or next, done, approach,
-            hold or leave.
-        on_failure: The successor if it fails.
-        if_late: The successor if it lasts longer than `within`; on_failure if left out.
-        if_lost: The successor if the contact is lost; on_failure if left out.
+        on_success, on_failure: The successors if it succeeds, or fails, as in rule 6.
+        if_late, if_lost: Those if it is late, or the contact is lost; on_failure if left out.
         retries: How many times it may be entered again; as many as the task allows if left out.
         if_spent: The successor in its place once these are used up.
     """
@@ -174,8 +169,8 @@ class Phase:
 
     def felt(self, contact_force: float) -> float:
         """The force at which it has touched, or with which it presses, in N."""
-        forces = [each.above for each in self.until if each.of == "force"]
-        return min([force for force in forces if force is not None], default=contact_force)
+        forces = [each for each in self.until if each.of == "force" and each.above is not None]
+        return min([force.limit for force in forces], default=contact_force)
 
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         """Output name -> its reference, whose time starts with the phase.
@@ -215,10 +210,8 @@ class Phase:
     def successor(self, outcome: Outcome) -> tuple[str, str]:
         """What follows after an outcome, and the attribute that says so."""
         keys = {"success": "on_success", "late": "if_late", "lost": "if_lost"}
-        key = keys.get(outcome, "on_failure")
-        if getattr(self, key) is None:
-            key = "on_failure"
-        return getattr(self, key), key
+        word = getattr(self, key := keys.get(outcome, "on_failure"))
+        return (word, key) if word is not None else (self.on_failure, "on_failure")
 
 
 @checked(ModelError)
@@ -296,7 +289,7 @@ class Press(Phase):
 
 
 class _Lasting(Phase):
-    """A phase that ends after its `duration`."""
+    """A phase that ends after its `duration`, in s, or with `until`, which then ends it alone."""
 
     duration: float | None
     holds_contact = True
@@ -328,8 +321,7 @@ class Move(_Lasting):
     Attributes:
         references: Name -> reference, whose time starts with the phase, or a number; names as those
             of `references_by_name`. They may include the force or the distance.
-        duration: The duration of the phase, in s; not needed with `until`, which then ends it
-            alone, within `within`.
+        duration: The duration of the phase, in s; not needed with `until`, which ends it alone.
     """
 
     references: Mapping[str, Reference | float]
@@ -345,8 +337,7 @@ class Dwell(_Lasting):
     """All outputs, including the force, come to rest for some time, or until a signal is present.
 
     Attributes:
-        duration: The duration of the phase, in s; not needed with `until`, which then ends it
-            alone, within `within`.
+        duration: The duration of the phase, in s; not needed with `until`, which ends it alone.
     """
 
     duration: float | None = None

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain, count
 from math import ceil, inf
 
 from drake_dae.arguments import checked
@@ -12,6 +13,7 @@ from drake_dae.systems.task.phases import (
     APPROACH,
     DONE,
     ENDS,
+    FAILURES,
     HOLD,
     LEAVE,
     NEXT,
@@ -27,9 +29,6 @@ it."""
 
 _STRONGEST = 10.0
 """The largest factor by which the low-pass reduces noise; its time constant is then 50 samples."""
-
-_RESERVED = (*ENDS, "held", "end")
-"""Words that cannot be names of phases."""
 
 
 @checked(ModelError)
@@ -70,11 +69,9 @@ class Task:
     def __post_init__(self) -> None:
         positive("contact_force", self.contact_force)
         positive("patience", self.patience)
-        for name in ("force_noise", "tare_time"):
+        for name in ("force_noise", "tare_time", "retries"):
             if not 0.0 <= getattr(self, name) < inf:
                 raise ModelError(f"{name} must be 0 or more, got {getattr(self, name):g}")
-        if self.retries < 0:
-            raise ModelError(f"retries must be 0 or more, got {self.retries}")
         least = self.force_noise * _STEADY / _STRONGEST
         if self.contact_force < least:
             raise ModelError(
@@ -93,7 +90,9 @@ class Task:
                     f"than the contact_force of {self.contact_force:g} N; give more, or a smaller "
                     "contact_force"
                 )
-            for outcome in self._outcomes(place):
+            can_lose = phase.holds_contact and self.contacts[place]
+            self._check(place, "success")
+            for outcome in FAILURES[: 3 if can_lose else 2]:
                 self._check(place, outcome)
 
     @cached_property
@@ -135,14 +134,14 @@ class Task:
 
         Also whether the task is done if there is none, or the robot rests for another reason.
         """
-        chain, at, word = list[int](), place, self.all_phases[place].successor(outcome)[0]
+        found, at, word = list[int](), place, self.all_phases[place].successor(outcome)[0]
         while True:
             to = self.place_of(at, word)
             if word == LEAVE and not self.is_closed_after(place, outcome):
                 to = None
-            if to is None or to in chain:
-                return chain, word in (NEXT, DONE) and to is None
-            chain.append(to)
+            if to is None or to in found:
+                return found, word in (NEXT, DONE) and to is None
+            found.append(to)
             at, word = to, self.all_phases[to].if_spent
 
     def place_of(self, place: int, word: str) -> int | None:
@@ -184,46 +183,39 @@ class Task:
 
     def tare_samples(self, sample_period: float) -> int:
         """The number of samples in the mean for the bias of the force; 0 without a tare_time."""
-        count = ceil(self.tare_time / sample_period - 1e-9)
+        samples = ceil(self.tare_time / sample_period - 1e-9)
         needed = ceil((_STEADY * self.force_noise / self.contact_force) ** 2)
-        if 0 < count < needed:
+        if 0 < samples < needed:
             raise ModelError(
                 f"tare_time: a mean over {self.tare_time:g} s keeps too much of the force sensor's "
                 f"noise of {self.force_noise:g} N; it must be {needed * sample_period:g} s or more"
             )
-        return count
-
-    def _outcomes(self, place: int) -> list[Outcome]:
-        can_lose = self.phases[place].holds_contact and self.contacts[place]
-        return ["success", "guard", "late", *(["lost"] if can_lose else [])]  # type: ignore[list-item]
+        return samples
 
     def _check(self, place: int, outcome: Outcome) -> None:
         """Refuses words that lead nowhere, and phases that cannot follow another one."""
-        phase, where = self.phases[place], self.where(place)
-        for word, key in (phase.successor(outcome), (phase.if_spent, "if_spent")):
+        phase, names = self.phases[place], [each.name for each in self.phases]
+        successor = phase.successor(outcome)
+        for word, key in (successor, (phase.if_spent, "if_spent")):
+            text = ""
             if word == APPROACH and self.place_of(place, word) is None:
-                raise ModelError(
-                    f"{where}: {key}: approach goes back to an Approach, and there is none before "
-                    "it"
-                )
-            names = [each.name for each in self.phases]
-            if word not in (*ENDS, *names):
-                known = unknown_name("phase", word, names)
-                raise ModelError(f"{where}: {key}: {known}; or take {', '.join(ENDS)}")
+                text = "approach goes back to an Approach, and there is none before it"
+            elif word not in (*ENDS, *names):
+                text = f"{unknown_name('phase', word, names)}; or take {', '.join(ENDS)}"
+            if text:
+                raise ModelError(f"{self.where(place)}: {key}: {text}")
         is_closed = self.is_closed_after(place, outcome)
-        key = phase.successor(outcome)[1]
         for to in self.successors(place, outcome)[0]:
             begins, text = self.contacts[to], ""
             if outcome == "lost" and begins and self.is_closed_after(to, "success"):
-                text = "it begins in contact, but the contact is lost; choose another by if_lost"
+                text = "in contact, but the contact is lost; choose another by if_lost"
             elif begins and not is_closed:
-                text = "it begins in contact, but the robot is free; an Approach must lead there"
+                text = "in contact, but the robot is free; an Approach must lead there"
             elif outcome == "success" and is_closed and not begins:
-                text = (
-                    "it begins with a free robot, but it is in contact; a Release must lead there"
-                )
+                text = "with a free robot, but it is in contact; a Release must lead there"
             if text:
-                raise ModelError(f"{self.where(to)}, after {phase.name} by {key}: {text}")
+                where = f"{self.where(to)}, after {phase.name} by {successor[1]}"
+                raise ModelError(f"{where}: it begins {text}")
 
     def __repr__(self) -> str:
         return f"Task({', '.join(phase.name for phase in self.phases)})"
@@ -232,17 +224,16 @@ class Task:
 def _named(phases: Sequence[Phase]) -> tuple[Phase, ...]:
     """The phases with distinct names: those with the name of their class are numbered."""
     chosen = [phase.name for phase in phases if phase.name != type(phase).__name__]
-    renamed = list[Phase]()
+    taken, renamed = {*chosen}, list[Phase]()
     for index, phase in enumerate(phases):
-        where, name, number = f"phase {index + 1} of the task", phase.name, 1
-        if name in _RESERVED or name != name.strip():
+        where, name = f"phase {index + 1} of the task", phase.name
+        if name in (*ENDS, "held", "end") or name != name.strip():
             raise ModelError(f"{where}: '{name}' is no name of a phase; give it another one")
         if chosen.count(name) > 1:
             raise ModelError(f"{where}: more than one phase has the name '{name}'")
         if name == type(phase).__name__:
-            taken = {*chosen, *(other.name for other in renamed)}
-            while name in taken:
-                number += 1
-                name = f"{phase.name} {number}"
-        renamed.append(phase if phase.name == name else replace(phase, name=name))
+            numbered = (f"{name} {number}" for number in count(2))
+            name = next(each for each in chain([name], numbered) if each not in taken)
+        taken.add(name)
+        renamed.append(replace(phase, name=name))
     return tuple(renamed)

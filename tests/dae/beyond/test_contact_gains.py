@@ -25,17 +25,9 @@ def test_noise_of_the_force_is_that_of_the_docstring():
     """
     stiffness, mobility, period, noise = 1e5, 0.03, 1e-3, 5e-4
     found = contact_gains(stiffness, mobility, period)
-    c, integral, slow = (
-        found.constraint_damping,
-        found.force_gain,
-        found.observer_force_rate,
-    )
+    c, integral, slow = (found.constraint_damping, found.force_gain, found.observer_force_rate)
     loop = np.array(
-        [
-            [0.0, 1.0, 0.0],
-            [-mobility * stiffness, -c, -mobility * integral],
-            [stiffness, 0.0, 0.0],
-        ]
+        [[0.0, 1.0, 0.0], [-mobility * stiffness, -c, -mobility * integral], [stiffness, 0.0, 0.0]]
     )
     driven = np.diag([0.0, period * ((c + slow) * noise) ** 2, 0.0])
     deviation = stiffness * np.sqrt(solve_continuous_lyapunov(loop, -driven)[0, 0])

@@ -51,6 +51,36 @@ def test_a_start_near_a_singular_guess_stays_within_limits(kind, two, tmp_path):
     np.testing.assert_allclose(reached, [0.3, 0.4], atol=1e-9)
 
 
+CRANK = """
+robot: {{file: {folder}/crank.urdf, base: {{weld: base}}, actuators: []}}
+constraints:
+- !RevoluteLoopJoint {{frame_a: rod, frame_b: slider, point_a: [0.5, 0, 0], axis: y, planar: true}}
+start: {{positions: {{crank: {crank}, rod: {rod}, slide: {slide}}}}}
+"""
+
+
+@pytest.mark.parametrize(("crank", "rod", "slide"), [(-1.2, -0.46, -0.28), (2.28, 1.87, 0.1)])
+def test_a_mechanism_without_drive_starts_within_a_turn_of_what_is_given(
+    crank, rod, slide, tmp_path
+):
+    """Newton's method ends a whole turn of the crank, or of the rod, away from these."""
+    parts = [link(name, 1.0) for name in ("base", "crank", "rod", "slider")]
+    joints = [
+        joint("crank", "base", "crank", "0 1 0", (0.0, 0.0, 0.0), "continuous"),
+        joint("rod", "crank", "rod", "0 1 0", (0.2, 0.0, 0.0), "continuous"),
+        joint("slide", "base", "slider", "1 0 0", (0.0, 0.0, 0.0), "prismatic"),
+    ]
+    (tmp_path / "crank.urdf").write_text(robot("crank", *parts, *joints))
+    text = CRANK.format(folder=tmp_path, crank=crank, rod=rod, slide=slide)
+    (tmp_path / "crank.yaml").write_text(text)
+    loop, context = build_scenario(load_scenario(tmp_path / "crank.yaml"))
+    q = loop.plant.state(loop.plant.GetMyContextFromRoot(context))[:3]
+    assert np.all(np.abs(q[:2] - [crank, rod]) < np.pi)
+    one, both = q[0], q[:2].sum()
+    reached = [0.2 * np.cos(one) + 0.5 * np.cos(both), 0.2 * np.sin(one) + 0.5 * np.sin(both)]
+    np.testing.assert_allclose(reached, [q[2], 0.0], atol=1e-9)
+
+
 def test_a_start_outside_of_limits_is_refused(tmp_path):
     """Both postures that reach it turn joint one beyond a limit of 0.2 rad."""
     scenario = reaching(tmp_path, -0.4, "{one: 0.1, two: 0.1}")

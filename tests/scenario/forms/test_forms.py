@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -10,8 +9,6 @@ from numpy.typing import ArrayLike
 
 from drake_dae.errors import ModelError, ScenarioError
 from drake_dae.scenario.form import (
-    NUMBERS,
-    TRIPLE,
     Family,
     Key,
     Reader,
@@ -72,10 +69,6 @@ class Everything:
 READER = Reader(
     Everything,
     {Surface: Family({"!Bowl": Bowl, "!Funnel": Cone})},
-    {
-        ArrayLike: Annotated[Any, NUMBERS],
-        tuple[float, float, float]: Annotated[Any, TRIPLE],
-    },
     {
         Config: {"accuracy": Key(float, 0.25, "How well."), "step": Key(float, 0.1, "How far.")},
         Cone: {**keys_of(Cone), "angle": Key(float, 30.0, "")},

@@ -1,5 +1,6 @@
 """The tables of what Drake reads of robot files, fed through Drake part by part."""
 
+import warnings
 from copy import deepcopy
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -226,11 +227,6 @@ LOST = {
         ),
         "joint/actuatorfrcrange": ('<joint name="l"', '<joint name="l" actuatorfrcrange="-1 1"'),
         "joint/armature": ('<joint name="l"', '<joint type="ball" armature="0.1"'),
-        "joint/damping": (
-            "<worldbody>",
-            '<worldbody><body name="e"><joint type="free" damping="2"/><geom size="1"/></body>',
-        ),
-        "joint/range": ('<joint name="l"', '<joint name="l" type="ball" range="0 1"'),
         "body/gravcomp": ('<body name="b"', '<body name="b" gravcomp="1"'),
         "body/frame": ("<geom", "<frame><body/></frame><geom"),
         "mujoco/tendon": ("<equality>", '<tendon><fixed name="t"/></tendon><equality>'),
@@ -238,14 +234,18 @@ LOST = {
         "equality/weld": ("<equality>", '<equality><weld body1="a" body2="c"/>'),
         "option/density": ("<option", '<option density="1000"'),
         "flag/gravity": ("<worldbody>", '<option><flag gravity="disable"/></option><worldbody>'),
-        "actuator/general": ("<actuator>", '<actuator><general joint="k" gainprm="3"/>'),
+        "actuator/muscle": ("<actuator>", '<actuator><muscle joint="k"/>'),
+        "ball/motor": (
+            ('<joint name="l"', "<actuator>"),
+            ('<joint name="l" type="ball"', '<actuator><motor joint="l"/>'),
+        ),
         "motor/tendon": ("</actuator>", '<motor tendon="t"/></actuator>'),
         "motor/forcerange": ('forcerange="-4 4"', 'forcerange="-4 9"'),
         "compiler/settotalmass": ("<compiler", '<compiler settotalmass="3"'),
         "inertia": ('"0.3 0.4 0.5"', '"3 0.4 0.5"'),
     },
 }
-READ_IN_PART = "motor/forcerange", "joint/armature", "joint/damping", "joint/range"
+READ_IN_PART = "motor/forcerange", "joint/armature", "ball/motor"
 CASES = [(kind, part, *change) for kind, lost in LOST.items() for part, change in lost.items()]
 
 
@@ -271,6 +271,142 @@ def test_what_is_lost_is_an_error_with_its_name_until_it_is_left_out(
         assert facts(text, kind) == facts(WHOLE[kind], kind) or part.startswith("transmission")
     except (RuntimeError, ValueError):
         assert part == "robot/loop_joint"
+
+
+URDF_MASS = '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+SDF_MASS = "<inertial><mass>2</mass></inertial>"
+SCREW = '<drake:screw_thread_pitch value="0.1"/>'
+CURVES = '<drake:curves><drake:line_segment length="3"/></drake:curves>'
+
+
+def one_joint(kind: str, form: str, part: str = "", rest: str = "") -> str:
+    """A robot with one joint 'j' of a type, with one part of it in a file's format."""
+    if kind == ".urdf":
+        tag = "joint" if form in ("revolute", "prismatic", "planar", "floating") else "drake:joint"
+        rest += {"screw": SCREW, "curvilinear": CURVES}.get(form, "")
+        return f"""<robot name="r" xmlns:drake="d"><link name="a">{URDF_MASS}</link>
+<{tag} name="j" type="{form}"><parent link="world"/><child link="a"/>
+<limit {part if "damping" not in part else ""}/><dynamics {part if "damping" in part else ""}/>
+{rest}</{tag}></robot>"""
+    if kind == ".sdf":
+        is_limit = "damping" not in part and "spring" not in part
+        limit = "" if "effort" in part else "<effort>0</effort>"
+        inner = (
+            f"<limit>{limit}{part * is_limit}</limit><dynamics>{part * (not is_limit)}</dynamics>"
+        )
+        axes = f"<axis><xyz>0 0 1</xyz>{inner}</axis>"
+        if form == "universal":
+            damping = part * ("damping" in part)
+            axes += f"<axis2><xyz>0 1 0</xyz><dynamics>{damping}</dynamics></axis2>"
+        return f"""<sdf version="1.9" xmlns:drake="d"><model name="r">
+<link name="a">{SDF_MASS}</link><joint name="j" type="{form}"><parent>world</parent>
+<child>a</child>{axes}{rest}</joint></model></sdf>"""
+    return f"""<mujoco model="r"><compiler angle="radian"/><worldbody><body name="a">
+<inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/><joint name="j" type="{form}" {part}/></body>
+</worldbody>{rest}</mujoco>"""
+
+
+OF_TYPES = {
+    ".urdf": (
+        "revolute prismatic planar floating ball universal screw curvilinear",
+        [f'{name}="1.5"' for name in ("upper", "velocity", "drake:acceleration", "damping")]
+        + ['lower="-1.5"'],
+    ),
+    ".sdf": (
+        "revolute prismatic ball universal screw",
+        [
+            f"<{name}>1.5</{name}>"
+            for name in ("upper", "velocity", "drake:acceleration", "damping", "effort")
+        ]
+        + ["<lower>-1.5</lower>", "<spring_stiffness>1.5</spring_stiffness>"],
+    ),
+    ".xml": ("hinge slide ball free", ['range="-1.5 1.5"', 'damping="1.5"', 'ref="1.5"']),
+}
+MEANT_OF_NO = {("ball", 'ref="1.5"'), ("free", 'ref="1.5"'), ("free", 'range="-1.5 1.5"')}
+"""What MuJoCo does not read either."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "form", "part"),
+    [
+        (kind, form, part)
+        for kind, (forms, some) in OF_TYPES.items()
+        for form in forms.split()
+        for part in some
+        if (form, part) not in MEANT_OF_NO
+    ],
+)
+def test_what_drake_does_not_read_of_a_type_of_joint_is_told(kind, form, part, tmp_path: Path):
+    """A limit is told, with joint, key and value; a force that is lost is refused."""
+    if form == "planar":
+        part = part.replace('damping="1.5"', 'damping="1.5 1.5 1.5"')
+    text = one_joint(kind, form, part)
+    is_read = facts(text, kind) != facts(one_joint(kind, form), kind)
+    (tmp_path / f"robot{kind}").write_text(text)
+    key, error = part.strip("<").split("=")[0].split(">")[0], ""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        try:
+            finalize(read_robot(Robot(str(tmp_path / f"robot{kind}")))[0])
+        except ModelError as caught:
+            error = str(caught)
+    warned = [str(one.message) for one in told if f"'j': {form}/{key} " in str(one.message)]
+    is_force = key in ("damping", "spring_stiffness")
+    assert [("1.5" in text) for text in warned] == ([] if is_read or is_force else [True])
+    assert (f"{form}/{key}" in error) == (is_force and not is_read)
+    if error:
+        left_out = Robot(str(tmp_path / f"robot{kind}"), leave_out=[f"{form}/{key}"])
+        finalize(read_robot(left_out)[0])
+
+
+def test_the_pitch_of_a_screw_is_that_of_its_older_key_and_0_is_none(tmp_path: Path):
+    """thread_pitch is in rad/m with the other sign; screw_thread_pitch is in m for each turn."""
+    file = tmp_path / "robot.sdf"
+    found = []
+    for rest in ("<thread_pitch>-20</thread_pitch>", "<screw_thread_pitch>0.314159265358979</s"):
+        file.write_text(
+            one_joint(".sdf", "screw", "", rest.replace("</s", "</screw_thread_pitch>"))
+        )
+        plant = read_robot(Robot(str(file)))[0]
+        found.append(plant.GetJointByName("j").screw_pitch())
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-14)
+    file.write_text(one_joint(".sdf", "screw", "", "<thread_pitch>0.0</thread_pitch>"))
+    with pytest.raises(ModelError, match=r"robot\.sdf:\d+: joint 'j'.* 0"):
+        read_robot(Robot(str(file)))
+
+
+def test_two_dampings_of_a_universal_joint_are_refused_until_one_is_left_out(tmp_path: Path):
+    text = one_joint(".sdf", "universal", "<damping>1.5</damping>")
+    (tmp_path / "robot.sdf").write_text(text[::-1].replace("5.1", "5.2", 1)[::-1])
+    with pytest.raises(ModelError, match=r"axis2/damping .*'j': 1\.5 and 2\.5"):
+        read_robot(Robot(str(tmp_path / "robot.sdf")))
+    robot = Robot(str(tmp_path / "robot.sdf"), leave_out=["axis2/damping"])
+    np.testing.assert_equal(read_robot(robot)[0].GetJointByName("j").default_damping_vector(), 1.5)
+
+
+def test_options_of_mujoco_in_a_urdf_are_told_and_those_without_effect_are_not(tmp_path: Path):
+    option = '<mujoco><compiler {} meshdir="../m" balanceinertia="true"/></mujoco></robot>'
+    file = tmp_path / "robot.urdf"
+    file.write_text(URDF.replace("</robot>", option.format('settotalmass="3"')))
+    with pytest.warns(RobotFileWarning, match="compiler/settotalmass 3"):
+        read_robot(Robot(str(file)))
+    file.write_text(one_joint(".urdf", "revolute").replace("</robot>", option.format("")))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_robot(Robot(str(file)))
+
+
+def test_what_drake_remarks_is_one_warning_with_the_users_file(tmp_path: Path):
+    geoms = "".join(f'<geom name="g{k}" size="1" material="none"/>' for k in range(20))
+    text = one_joint(".xml", "hinge").replace("</body>", f"{geoms}</body>")
+    (tmp_path / "robot.xml").write_text(text)
+    with pytest.warns(RobotFileWarning) as told:
+        read_robot(Robot(str(tmp_path / "robot.xml")), scene_graph=SceneGraph())
+    (line,) = {str(one.message) for one in told}
+    assert "robot.xml:" in line
+    assert "g0" in line
+    assert "12 more" in line
+    assert "/" not in line.replace("robot.xml", "")
 
 
 HARMLESS = {
@@ -308,6 +444,24 @@ def test_what_changes_no_equation_passes(kind: str, old: str, new: str, tmp_path
     assert old in WHOLE[kind]
     (tmp_path / f"robot{kind}").write_text(WHOLE[kind].replace(old, new, 1))
     finalize(read_robot(Robot(str(tmp_path / f"robot{kind}")))[0])
+
+
+@pytest.mark.parametrize("tag", ["velocity", "intvelocity", 'general biastype="affine"'])
+def test_servos_become_motors_with_their_limits_of_efforts(tag: str, tmp_path: Path):
+    text = MJCF.replace('<motor name="n"', f'<{tag} name="n" ctrlrange="-1 1" gear="2"')
+    (tmp_path / "robot.xml").write_text(text)
+    with pytest.warns(RobotFileWarning, match="'n'"):
+        plant = read_robot(Robot(str(tmp_path / "robot.xml")))[0]
+    assert plant.GetJointActuatorByName("n").effort_limit() == 2.0 * 4.0
+
+
+def test_a_general_actuator_without_a_law_is_a_motor_with_the_gain_in_its_limit(tmp_path: Path):
+    text = MJCF.replace('<motor name="n"', '<general name="n" ctrlrange="-1 1" gainprm="3 0 0"')
+    (tmp_path / "robot.xml").write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        plant = read_robot(Robot(str(tmp_path / "robot.xml")))[0]
+    assert plant.GetJointActuatorByName("n").effort_limit() == 3.0  # Its forces are within 4.
 
 
 @pytest.mark.parametrize("tag", ["motor", "general", "position"])

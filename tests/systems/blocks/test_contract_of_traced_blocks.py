@@ -10,7 +10,6 @@ from actuated import actuated
 from alone import alone
 from arms import arm, law
 from blocks_of_users import Counter_
-from problems import PROBLEMS
 from pydrake.symbolic import Variable, if_then_else, logical_and
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
@@ -312,16 +311,6 @@ def test_feedthrough_is_that_of_the_system(name):
                 assert ca.depends_on(value, symbol) <= system.HasDirectFeedthrough(i, j)
                 if name in SYSTEMS:
                     assert ca.depends_on(value, symbol) == system.HasDirectFeedthrough(i, j)
-
-
-@pytest.mark.parametrize("name", sorted(PROBLEMS))
-def test_any_plant_of_equations_is_traced(name):
-    """At a state on N*."""
-    plant = DaePlant(PROBLEMS[name]().system)
-    diagram, context = alone(plant)
-    own = plant.GetMyMutableContextFromRoot(context)
-    plant.set_consistent_state(own, plant.structure.states[0])
-    check_functions(diagram, context, compose(diagram, context=context))
 
 
 def test_a_system_that_cannot_be_traced_is_named():

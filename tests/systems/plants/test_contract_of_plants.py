@@ -261,7 +261,7 @@ def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monk
 @pytest.mark.parametrize(
     ("maker", "told"),
     [
-        ("members", "plant: maker"),
+        ("members", "plant.maker: "),
         (
             "no_such_module:Plant",
             r"plant\.maker: .*'no_such_module:Plant'",

@@ -26,8 +26,8 @@ MEMBERS = {
     "Dwell": (Dwell(2.0), Moment(1.9, 0.0, 0.1, 0.0, 0.1), Moment(2.1, 0.0, 0.1, 0.0, 0.1)),
     "Dwell until": (
         Dwell(until=[Condition("signal", above=0.5, name="ready"), Condition("time", above=2.0)]),
-        Moment(1.9, 20.0, 0.0, 0.0, 20.0, signals={"ready": 0.4}),
-        Moment(1.9, 20.0, 0.0, 0.0, 20.0, signals={"ready": 1.0}),
+        Moment(1.9, 20.0, 0.0, 0.0, 20.0, signal={"ready": 0.4}),
+        Moment(1.9, 20.0, 0.0, 0.0, 20.0, signal={"ready": 1.0}),
     ),
     "Move until": (
         Move({}, until=[Condition("force", above=5.0)]),
@@ -36,8 +36,8 @@ MEMBERS = {
     ),
     "Press until": (
         Press(20.0, until=[Condition("control", above=3.0, name="joint7")]),
-        Moment(1.0, 20.0, 0.0, 0.0, 20.0, controls={"": 9.0, "joint7": 2.9}),
-        Moment(1.0, 20.0, 0.0, 0.0, 20.0, controls={"": 9.0, "joint7": 3.1}),
+        Moment(1.0, 20.0, 0.0, 0.0, 20.0, control={"": 9.0, "joint7": 2.9}),
+        Moment(1.0, 20.0, 0.0, 0.0, 20.0, control={"": 9.0, "joint7": 3.1}),
     ),
     "Release until": (
         Release(until=[Condition("distance", above=0.01)]),
@@ -62,6 +62,8 @@ def test_phase_keeps_the_rules(name):
     assert phase.awaits(CONTACT_FORCE)
     # Rule 1: what leads from one law to the other says so of both ends.
     assert (phase.begins_in_contact is None) == (phase.ends_in_contact is None)
+    # Rule 5: others end before, or without a contact.
+    assert phase.holds_contact == isinstance(phase, Press | Move | Dwell)
     # Rule 2: what approaches has no goal for the distance.
     goals = phase.goals("contact")
     assert set(goals) <= {"contact"}

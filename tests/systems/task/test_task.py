@@ -221,20 +221,6 @@ def test_free_member_is_the_robot_without_the_wall():
     assert_allclose(moved, wanted, rtol=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("phases", "message"),
-    [
-        ([], "phases"),
-        ([Approach(), Retreat(0.1)], "Retreat, after Approach"),
-        ([Retreat(0.1), Press(20.0)], "Press, after Retreat"),
-        ([Press(20.0, if_lost="approach")], "if_lost: "),
-    ],
-)
-def test_phases_that_make_no_sense_are_refused(phases, message):
-    with pytest.raises(ModelError, match=message):
-        Task(phases)
-
-
 def controller_of(phases, law, free_law, period=PERIOD):
     return TaskController(Task(phases), law, free_law, sample_period=period)
 

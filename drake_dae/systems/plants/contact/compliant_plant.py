@@ -19,7 +19,7 @@ from drake_dae.robots import RobotModel
 from drake_dae.systems.parameterized import ParameterizedSystem, changed_parameters
 from drake_dae.systems.plants.contact.contact_forces import contact_force_signals
 from drake_dae.systems.plants.contact.contact_laws import (
-    Compliance,
+    PointContact,
     ball_normals,
     contact_force,
     contact_step,
@@ -97,15 +97,25 @@ class CompliantPlant(ParameterizedSystem, Plant):
         structure: ConstraintStructure | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        dae = model.dae
-        structure = constraint_structure_of(type(self).__name__, dae, structure)
+        dae, count = model.dae, len(model.constraints)
         values = dae.parameter_vector(changed_parameters(model, parameters or {}))
         self.model: RobotModel = model
-        self.time_step, self._stepped = material.time_step, np.zeros(0)
-        self._check_step(values)
-        self.structure, self.material = structure, material
-        self._equations = CompliantEquations(model, structure, material)
-        super().__init__(dae, self._equations.block(values))
+        self.structure = constraint_structure_of(type(self).__name__, dae, structure)
+        self.time_step, self.material = material.time_step, material
+        self._checked_step = np.zeros(0)
+        numbers, normals = ca.SX.sym("material", 4), ca.SX.sym("normals", 3 * count)
+        contacts = point_contacts(model, normals, numbers, material)
+        own = ca.vertcat(dae.parameter_symbol, numbers, normals)
+        depths = {"depths": ca.vertcat(*(contact.depth for contact in contacts))}
+        inputs = {"state": dae.state, "parameters": own}
+        self._normals = dae.trace("normals", {"normals": ball_normals(model)}, often=False)
+        self._depths = TracedFunction("depths", inputs, depths, often=False)
+        start = {
+            "state": self.structure.manifold.project(dae.nominal_state, values),
+            "parameters": self._placed(values, material),
+        }
+        block = compliant_block(model, self.structure, material, contacts, start)
+        super().__init__(dae, replace(block, parameters=own))
 
     @property
     def further_signals(self) -> Mapping[str, Sequence[Signal]]:
@@ -147,71 +157,33 @@ class CompliantPlant(ParameterizedSystem, Plant):
         """Sets stiffness, dissipation, friction and radius, and places the balls on the robot.
 
         In the nominal configuration, with the parameters of the context, a ball touches at the
-        point of its constraint.
-
-        Args:
-            context: The context of the plant.
-            material: The material, with the time_step and stiction_tolerance of the plant,
-                and a friction if and only if that of the plant has one.
-
-        Raises:
-            ModelError: The material does not fit the plant, a ball its surface, or the step the
-                stages with the parameters of the context.
+        point of its constraint. A ModelError says that the material has another time_step or
+        stiction_tolerance than the plant, or a friction although that has none; that a ball does
+        not fit its surface; or that the step does not fit the stages.
         """
-        fixed, others = (
-            (given.time_step, given.stiction_tolerance, given.friction is None)
-            for given in (self.material, material)
-        )
-        if fixed != others:
+
+        def fixed(given: PointMaterial) -> tuple[float, float, bool]:
+            return given.time_step, given.stiction_tolerance, given.friction is None
+
+        if fixed(material) != fixed(self.material):
             raise ModelError(
                 f"{self.dae.name}: the plant was made with {self.material}; only its stiffness, "
                 f"dissipation, radius and a number of its friction may change, got {material}"
             )
-        values = context.get_numeric_parameter(0).CopyToVector()
-        values = values[: self.dae.parameter_symbol.numel()]
-        self._check_step(values)
-        placed = self._equations.own_parameters(values, material)
+        placed = self._placed(self.parameters(context), material)
         context.get_mutable_numeric_parameter(0).SetFromVector(placed)
 
-    def _check_step(self, values: FloatArray) -> None:
-        """Refuses a step that is too long for the stages; see `check_step`."""
-        if self.model.stages and self.time_step and not np.array_equal(values, self._stepped):
-            check_step(self.model, self.time_step, values)
-            self._stepped = values.copy()
-
-    @property
-    def contact_force_signals(self) -> Sequence[Signal]:
-        """Names and units of `contact_force`."""
-        return self.block.signals["contact_force"]
-
-
-class CompliantEquations:
-    """The equations of a `CompliantPlant`, whose state is x, or (x, F) if it is discrete."""
-
-    def __init__(
-        self, model: RobotModel, structure: ConstraintStructure, material: PointMaterial
-    ) -> None:
-        dae, self._model, self._material = model.dae, model, material
-        self._structure = structure
-        numbers = ca.SX.sym("material", 4)
-        normals = ca.SX.sym("normals", 3 * len(model.constraints))
-        self._compliance = Compliance(numbers[0], numbers[1], material.stiction_tolerance)
-        friction = None if material.friction is None else numbers[2]
-        self._contacts = point_contacts(model, normals, numbers[3], friction)
-        self._parameters = ca.vertcat(dae.parameter_symbol, numbers, normals)
-        self._normals = dae.trace("normals", {"normals": ball_normals(model)}, often=False)
-        depths = ca.vertcat(*(contact.depth for contact in self._contacts))
-        inputs = {"state": dae.state, "parameters": self._parameters}
-        self._depths = TracedFunction("depths", inputs, {"depths": depths}, often=False)
-
-    def own_parameters(self, values: FloatArray, material: PointMaterial) -> FloatArray:
+    def _placed(self, values: FloatArray, material: PointMaterial) -> FloatArray:
         """Those of the system, `PointMaterial.values`, and `ball_normals`, if the balls fit."""
-        dae, manifold = self._model.dae, self._structure.manifold
-        state = manifold.project(dae.nominal_state, values)
+        model = self.model
+        if model.stages and self.time_step and not np.array_equal(values, self._checked_step):
+            check_step(model, self.time_step, values)
+            self._checked_step = values.copy()
+        state = self.structure.manifold.project(model.dae.nominal_state, values)
         normals = self._normals(state, values)[0]
         parameters = np.concatenate([values, material.values, normals])
         depths = self._depths(state, parameters)[0]
-        for constraint, depth in zip(self._model.constraints, depths.tolist(), strict=True):
+        for constraint, depth in zip(model.constraints, depths.tolist(), strict=True):
             if not depth <= FITS * material.radius:
                 raise ModelError(
                     f"a ball with a radius of {material.radius:g} m does not fit "
@@ -220,119 +192,124 @@ class CompliantEquations:
                 )
         return parameters
 
-    def block(self, values: FloatArray) -> Block:
-        """The block of the plant, with these defaults of the system's parameters."""
-        dae, structure, material = self._model.dae, self._structure, self._material
-        period, control = material.time_step, ca.SX.sym("u", dae.num_controls)
-        forces = contact_force_signals(self._model)
-        if period:
-            force = ca.SX.sym("F", len(forces))
-            advanced, slack = self._step(control, period)
-        else:
-            v = self._model.links.v
-            each = [contact_force(contact, v, self._compliance) for contact in self._contacts]
-            force = ca.vertcat(*each)
-            advanced, slack = self._rate(control, force)
-        fits = Requirement(slack, OUTSIDE, FailureKind.OUTSIDE)
-        state, advanced = structure.manifold.project(dae.nominal_state), fits.of(advanced)
-        normals = ca.horzcat(*(touch.normal for _, touch in touching(self._model)))
-        lambdas = ca.sum1(normals * ca.reshape(force, 3, -1)).T
-        block = Block(
-            dae.name,
-            inputs={"control": control},
-            outputs={
-                "state": dae.state,
-                **joint_outputs(self._model),
-                "contact_force": force,
-                "constraint_force": lambdas,
-                "constraint_residual": structure.manifold.residual_expression,
-                "controlled_output": dae.outputs(lambdas),
-            },
-            parameters=self._parameters,
-            start={"state": state, "parameters": self.own_parameters(values, material)},
-            requirements=(fits,),
-            signals={
-                **port_signals(structure),
-                "control": dae.control_signals,
-                "contact_force": forces,
-                "parameters": [*dae.parameter_signals, *material.signals],
-            },
-        )
-        if not period:
-            return replace(block, state=dae.state, derivative=advanced, scale=dae.scale)
-        n, none = dae.num_states, np.zeros(len(forces))
-        held = {
-            "state": Held(dae.state, advanced[:n, 0], state, period),
-            "contact_force": Held(force, advanced[n:, 0], none, period),
-        }
-        return replace(block, held=held)
-
-    def _balance(self, control: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """M and tau - H without contact, with torques within the limits of the actuators."""
-        model, dae, links = self._model, self._model.dae, self._model.links
-        nq, nv = links.q.numel(), links.v.numel()
-        part = slice(nq, nq + nv)
-        viscous = [
-            parameter.symbol
-            for constraint in model.constraints
-            for parameter in constraint.parameters
-            if parameter.name == f"{constraint.name}.viscous_friction"
-        ]
-        # Viscous friction belongs to the contacts here.
-        forces = dae.f[part]
-        if viscous:
-            forces = ca.substitute(forces, ca.vertcat(*viscous), ca.DM.zeros(len(viscous)))
-        limits = ca.DM(links.effort_limits)
-        torque = control if model.joint_force is None else model.joint_force
-        within = ca.fmin(ca.fmax(torque, -limits), limits)
-        if model.joint_force is not None:
-            within -= model.joint_force  # It is also part of f.
-        drive = ca.mtimes(ca.SX(ca.sparsify(ca.DM(links.actuation_matrix))), within)
-        return dae.mass_matrix[part, part], forces + drive
-
-    def _rate(self, control: ca.SX, force: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """x' of a continuous plant, and a number that is negative where it is not valid."""
-        model, links = self._model, self._model.links
-        mass, forces = self._balance(control)
-        jacobian = ca.vertcat(*(contact.jacobian for contact in self._contacts))
-        forces += ca.mtimes(jacobian.T, force)
-        change = PositiveDefiniteFactorization(mass).solve(forces)
-        velocity = ca.mtimes(links.velocity_map, links.v)
-        rate = ca.vertcat(velocity, change, stage_rates(model, control))
-        return rate, self._within_limits(links.q)
-
-    def _step(self, control: ca.SX, h: float) -> tuple[ca.SX, ca.SX]:
-        """(x, F) after a step, and a number that is negative where they are not valid."""
-        model, links = self._model, self._model.links
-        mass, forces = self._balance(control)
-        # D of the friction -D v of joints, at the velocities before the step.
-        kinematics, size = links.kinematics(), links.v.numel()
-        resistance = (load.resistance(kinematics) for load in model.known_forces)
-        mass += h * (ca.diag(ca.DM(_damping(model))) + sum(resistance, ca.SX(size, size)))
-        free = links.v + h * PositiveDefiniteFactorization(mass).solve(forces)
-        moved = contact_step(self._contacts, links.v, free, mass, h, self._compliance)
-        velocities, contact_forces, slack = moved
-        velocity = ca.mtimes(links.velocity_map, velocities)
-        # Drake's stops push if a joint would pass its limit within two steps.
-        ahead = self._within_limits(links.q + 2.0 * h * velocity)
-        stages = stages_after(model, h, control) if model.stages else ca.SX(0, 1)
-        after = ca.vertcat(links.q + h * velocity, velocities, stages, contact_forces)
-        return after, ca.fmin(slack, ahead)
-
-    def _within_limits(self, q: ca.SX) -> ca.SX:
-        """The least distance of joints from their limits; negative beyond one."""
-        low, high = self._model.links.position_limits
-        gaps = [q[i] - low[i] for i in np.flatnonzero(np.isfinite(low)).tolist()]
-        gaps += [high[i] - q[i] for i in np.flatnonzero(np.isfinite(high)).tolist()]
-        return reduce(ca.fmin, gaps, ca.SX(1))
+    @property
+    def contact_force_signals(self) -> Sequence[Signal]:
+        """Names and units of `contact_force`."""
+        return self.block.signals["contact_force"]
 
 
-def _damping(model: RobotModel) -> FloatArray:
-    """The damping of the joints, which Drake takes implicitly, shape (nv,)."""
-    damping, plant = np.zeros(model.links.v.numel()), model.links.plant
-    if plant is not None:
-        for index in plant.GetJointIndices():
-            joint = plant.get_joint(index)
-            first = joint.velocity_start()
-            damping[first : first + joint.num_velocities()] = joint.default_damping_vector()
-    return damping
+def compliant_block(
+    model: RobotModel,
+    structure: ConstraintStructure,
+    material: PointMaterial,
+    contacts: Sequence[PointContact],
+    start: Mapping[str, FloatArray],
+) -> Block:
+    """The equations of a `CompliantPlant`, whose state is x, or (x, F) if it is discrete."""
+    dae, period, names = model.dae, material.time_step, contact_force_signals(model)
+    control, force = ca.SX.sym("u", dae.num_controls), ca.SX.sym("F", len(names))
+    if period:
+        advanced, slack = _step(model, contacts, control, period)
+    else:
+        force = ca.vertcat(*(contact_force(contact, model.links.v) for contact in contacts))
+        advanced, slack = _rate(model, contacts, control, force)
+    fits = Requirement(slack, OUTSIDE, FailureKind.OUTSIDE)
+    advanced = fits.of(advanced)
+    normals = ca.horzcat(*(touch.normal for _, touch in touching(model)))
+    lambdas = ca.sum1(normals * ca.reshape(force, 3, -1)).T
+    block = Block(
+        dae.name,
+        inputs={"control": control},
+        outputs={
+            "state": dae.state,
+            **joint_outputs(model),
+            "contact_force": force,
+            "constraint_force": lambdas,
+            "constraint_residual": structure.manifold.residual_expression,
+            "controlled_output": dae.outputs(lambdas),
+        },
+        start=start,
+        requirements=(fits,),
+        signals={
+            **port_signals(structure),
+            "control": dae.control_signals,
+            "contact_force": names,
+            "parameters": [*dae.parameter_signals, *material.signals],
+        },
+    )
+    if not period:
+        return replace(block, state=dae.state, derivative=advanced, scale=dae.scale)
+    after, pushed = ca.vertsplit(advanced, [0, dae.num_states, advanced.numel()])
+    held = {
+        "state": Held(dae.state, after, start["state"], period),
+        "contact_force": Held(force, pushed, np.zeros(len(names)), period),
+    }
+    return replace(block, held=held)
+
+
+def _balance(model: RobotModel, control: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """M and tau - H without contact, with torques within the limits of the actuators."""
+    dae, links = model.dae, model.links
+    nq, nv = links.q.numel(), links.v.numel()
+    part = slice(nq, nq + nv)
+    viscous = [
+        parameter.symbol
+        for constraint in model.constraints
+        for parameter in constraint.parameters
+        if parameter.name == f"{constraint.name}.viscous_friction"
+    ]
+    # Viscous friction belongs to the contacts here.
+    forces = dae.f[part]
+    if viscous:
+        forces = ca.substitute(forces, ca.vertcat(*viscous), ca.DM.zeros(len(viscous)))
+    limits = ca.DM(links.effort_limits)
+    torque = control if model.joint_force is None else model.joint_force
+    within = ca.fmin(ca.fmax(torque, -limits), limits)
+    if model.joint_force is not None:
+        within -= model.joint_force  # It is also part of f.
+    drive = ca.mtimes(ca.SX(ca.sparsify(ca.DM(links.actuation_matrix))), within)
+    return dae.mass_matrix[part, part], forces + drive
+
+
+def _rate(
+    model: RobotModel, contacts: Sequence[PointContact], control: ca.SX, force: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """x' of a continuous plant, and a number that is negative where it is not valid."""
+    links = model.links
+    mass, forces = _balance(model, control)
+    jacobian = ca.vertcat(*(contact.jacobian for contact in contacts))
+    change = PositiveDefiniteFactorization(mass).solve(forces + ca.mtimes(jacobian.T, force))
+    velocity = ca.mtimes(links.velocity_map, links.v)
+    rate = ca.vertcat(velocity, change, stage_rates(model, control))
+    return rate, _within_limits(model, links.q)
+
+
+def _step(
+    model: RobotModel, contacts: Sequence[PointContact], control: ca.SX, h: float
+) -> tuple[ca.SX, ca.SX]:
+    """(x, F) after a step, and a number that is negative where they are not valid."""
+    links, kinematics, size = model.links, model.links.kinematics(), model.links.v.numel()
+    mass, forces = _balance(model, control)
+    # D of the friction -D v of joints, which Drake takes implicitly, at the velocities before.
+    damping = np.zeros(size)
+    for joint in map(links.plant.get_joint, links.plant.GetJointIndices()) if links.plant else ():
+        first = joint.velocity_start()
+        damping[first : first + joint.num_velocities()] = joint.default_damping_vector()
+    resistance = (load.resistance(kinematics) for load in model.known_forces)
+    mass += h * (ca.diag(ca.DM(damping)) + sum(resistance, ca.SX(size, size)))
+    free = links.v + h * PositiveDefiniteFactorization(mass).solve(forces)
+    velocities, contact_forces, slack = contact_step(contacts, links.v, free, mass, h)
+    velocity = ca.mtimes(links.velocity_map, velocities)
+    # Drake's stops push if a joint would pass its limit within two steps.
+    ahead = _within_limits(model, links.q + 2.0 * h * velocity)
+    stages = stages_after(model, h, control) if model.stages else ca.SX(0, 1)
+    after = ca.vertcat(links.q + h * velocity, velocities, stages, contact_forces)
+    return after, ca.fmin(slack, ahead)
+
+
+def _within_limits(model: RobotModel, q: ca.SX) -> ca.SX:
+    """The least distance of joints from their limits; negative beyond one."""
+    low, high = model.links.position_limits
+    gaps = [q[i] - low[i] for i in np.flatnonzero(np.isfinite(low)).tolist()]
+    gaps += [high[i] - q[i] for i in np.flatnonzero(np.isfinite(high)).tolist()]
+    return reduce(ca.fmin, gaps, ca.SX(1))

@@ -27,10 +27,7 @@ class ContactForces(LeafSystem):
 
     __slots__ = SHARED_DICTIONARY
 
-    def __init__(
-        self,
-        pairs: Sequence[tuple[Sequence[GeometryId], Sequence[GeometryId]]],
-    ) -> None:
+    def __init__(self, pairs: Sequence[tuple[Sequence[GeometryId], Sequence[GeometryId]]]) -> None:
         super().__init__()
         self.set_name("contact_forces")
         self._pairs = pairs
@@ -55,30 +52,17 @@ class ContactForces(LeafSystem):
     def again(self) -> "ContactForces":
         return ContactForces(self._pairs)
 
-    def contact_force(self, results: ContactResults) -> list[float]:
-        """The contact forces of Drake's contact results, N: 3 m numbers."""
-        # Plain numbers: this runs at each step, and arrays of three numbers take twice the time.
-        total = [0.0] * (3 * len(self._pairs))
-        for i in range(results.num_point_pair_contacts()):
-            point = results.point_pair_contact_info(i)
-            # The force is that on B.
-            self._add(total, point.point_pair().id_B, point.contact_force())
-        for i in range(results.num_hydroelastic_contacts()):
-            patch = results.hydroelastic_contact_info(i)
-            # The force is that on the body of M.
-            self._add(total, patch.contact_surface().id_M(), patch.F_Ac_W().translational())
-        return total
-
-    def _add(self, total: list[float], geometry: GeometryId, force: FloatArray) -> None:
-        """Adds the force of a contact on a geometry to the forces on the robot."""
-        first, sign = self._owners[geometry]
-        x, y, z = force.tolist()
-        total[first] += sign * x
-        total[first + 1] += sign * y
-        total[first + 2] += sign * z
-
     def _contact_force(self, context: Context) -> FloatArray:
-        return np.array(self.contact_force(self._results.Eval(context)))
+        results, total = self._results.Eval(context), np.zeros(3 * len(self._pairs))
+        points = map(results.point_pair_contact_info, range(results.num_point_pair_contacts()))
+        patches = map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts()))
+        # The force of a point is that on B, that of a patch on the body of M.
+        forces = [(each.point_pair().id_B, each.contact_force()) for each in points]
+        forces += [(p.contact_surface().id_M(), p.F_Ac_W().translational()) for p in patches]
+        for geometry, force in forces:
+            first, sign = self._owners[geometry]
+            total[first : first + 3] += sign * force
+        return total
 
 
 def contact_block(
@@ -99,7 +83,7 @@ def contact_block(
     # J of the velocities of all contact points, shape (3 m, nv).
     nominal = structure.manifold.project(dae.nominal_state, values)
     normals = ca.SX.sym("normals", given.numel())
-    contacts = point_contacts(model, normals, ca.SX(material.radius), None)
+    contacts = point_contacts(model, normals, ca.SX(material.values), material)
     at = ca.Function("n", [dae.state, dae.parameter_symbol], [ball_normals(model)])
     (jacobian,) = ca.substitute(
         [ca.vertcat(*(contact.jacobian for contact in contacts))],

@@ -7,6 +7,7 @@ import casadi as ca
 
 from drake_dae.errors import ModelError
 from drake_dae.robots import Constraint, RobotModel, Touch
+from drake_dae.systems.plants.contact.contact_material import PointMaterial
 from drake_dae.trace.expressions import as_constant, length_of
 from drake_dae.trace.factorization import Factorization, PositiveDefiniteFactorization
 
@@ -24,7 +25,6 @@ AT_REST = 1e-6
 SOFT = 1e-3
 """Drake's `sigma`: the speed scale of friction relative to the change of speed by an impulse."""
 
-
 TURNS = 4
 """The number of iterations for the deepest point of a ball, if a distance is exact only on the
 surface: they reduce the error of its direction by (radius / radius of curvature)^4."""
@@ -40,6 +40,9 @@ class PointContact:
     velocity: ca.SX  # of the surface there
     friction: ca.SX
     viscous_friction: ca.SX  # N s/m
+    stiffness: ca.SX  # k, N/m
+    dissipation: ca.SX  # d of Hunt and Crossley, s/m
+    stiction_tolerance: float  # v_s, m/s
 
 
 def touching(model: RobotModel) -> list[tuple[Constraint, Touch]]:
@@ -68,13 +71,14 @@ def ball_normals(model: RobotModel) -> ca.SX:
 
 
 def point_contacts(
-    model: RobotModel, normals: ca.SX, radius: ca.SX, friction: ca.SX | None
+    model: RobotModel, normals: ca.SX, numbers: ca.SX, material: PointMaterial
 ) -> list[PointContact]:
     """The contact of a robot's ball with the surface of each constraint.
 
-    `normals` are the `ball_normals` of the nominal configuration; `friction` that of all contacts.
+    `normals` are the `ball_normals` of the nominal configuration, `numbers` the material's values.
     """
     kinematics, links = model.links.kinematics(), model.links
+    stiffness, dissipation, friction, radius = ca.vertsplit(numbers)
     contacts = []
     for i, (constraint, touch) in enumerate(touching(model)):
         point = ca.SX.sym("point", 3)
@@ -83,19 +87,18 @@ def point_contacts(
         moving += ca.cross(kinematics.angular_velocity(touch.frame), lever)
         jacobian = ca.jacobian(kinematics.value(moving), links.v)
         velocity = kinematics.value(touch.velocity(point))
-        parameters = {
-            p.name.removeprefix(f"{constraint.name}."): p.symbol for p in constraint.parameters
-        }
-        coefficient = parameters.get("friction", ca.SX(0)) if friction is None else friction
-        viscous = parameters.get("viscous_friction", ca.SX(0))
-        arm = radius * normals[3 * i : 3 * i + 3]
-        ball = links.position(touch.frame, touch.point) + ca.mtimes(
-            links.rotation(touch.frame), arm
-        )
+        coefficients = {"friction": ca.SX(0), "viscous_friction": ca.SX(0)}
+        for parameter in constraint.parameters:
+            coefficients[parameter.name.removeprefix(f"{constraint.name}.")] = parameter.symbol
+        own = coefficients["friction"] if material.friction is None else friction
+        arm = ca.mtimes(links.rotation(touch.frame), radius * normals[3 * i : 3 * i + 3])
+        ball = links.position(touch.frame, touch.point) + arm
         normal, depth = _overlap(touch, ball, radius)
         contact = ball - normal * (radius - depth / 2)
         moves, drags = ca.substitute([jacobian, velocity], [point], [contact])
-        contacts.append(PointContact(depth, normal, moves, drags, coefficient, viscous))
+        rubs = own, coefficients["viscous_friction"]
+        gives = stiffness, dissipation, material.stiction_tolerance
+        contacts.append(PointContact(depth, normal, moves, drags, *rubs, *gives))
     return contacts
 
 
@@ -114,16 +117,7 @@ def _overlap(touch: Touch, ball: ca.SX, radius: ca.SX) -> tuple[ca.SX, ca.SX]:
     return normal, -ca.substitute(clearance, point, ball - radius * normal)
 
 
-@dataclass(frozen=True, eq=False)
-class Compliance:
-    """k in N/m, d of Hunt and Crossley in s/m, and v_s in m/s, of all contacts of a plant."""
-
-    stiffness: ca.SX
-    dissipation: ca.SX
-    stiction_tolerance: float
-
-
-def contact_force(contact: PointContact, v: ca.SX, compliance: Compliance) -> ca.SX:
+def contact_force(contact: PointContact, v: ca.SX) -> ca.SX:
     """The force on the robot of a continuous MultibodyPlant, in N, shape (3, 1):
 
         f_n = k x max(0, 1 + d x'),    f_t = -mu f_n step5(|v_t| / v_s) v_t / |v_t| - c v_t,
@@ -132,10 +126,10 @@ def contact_force(contact: PointContact, v: ca.SX, compliance: Compliance) -> ca
     friction c is not Drake's.
     """
     relative = ca.mtimes(contact.jacobian, v) - contact.velocity
-    approach, tolerance = -ca.dot(contact.normal, relative), compliance.stiction_tolerance
+    approach, tolerance = -ca.dot(contact.normal, relative), contact.stiction_tolerance
     sliding = relative + contact.normal * approach
-    damping = ca.fmax(0, 1 + compliance.dissipation * approach)
-    push = compliance.stiffness * contact.depth * damping
+    damping = ca.fmax(0, 1 + contact.dissipation * approach)
+    push = contact.stiffness * contact.depth * damping
     speed = ca.sqrt(ca.sumsqr(sliding))
     s = speed / tolerance
     slow = s**2 * (10 - 15 * s + 6 * s**2) / tolerance
@@ -146,12 +140,7 @@ def contact_force(contact: PointContact, v: ca.SX, compliance: Compliance) -> ca
 
 
 def contact_step(
-    contacts: Sequence[PointContact],
-    v: ca.SX,
-    free: ca.SX,
-    mass: ca.SX,
-    time_step: float,
-    compliance: Compliance,
+    contacts: Sequence[PointContact], v: ca.SX, free: ca.SX, mass: ca.SX, h: float
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """The step of a discrete MultibodyPlant with Drake's default, the "lagged" approximation:
 
@@ -173,48 +162,46 @@ def contact_step(
     constants: by the implicit function theorem, first derivatives are then those of the solution,
     at a third of the operations.
 
-    Returns:
-        v_+ from v before and v* = `free` after a step without contact; the mean forces of the
-        contacts on the robot in N; and a number that is negative where they were not found.
+    Returns v_+ from v before and v* = `free` after a step without contact; the mean forces of the
+    contacts on the robot in N; and a number that is negative where they were not found.
     """
-    h, count = time_step, len(contacts)
-    factored = PositiveDefiniteFactorization(mass)
+    count = len(contacts)
     axes = ca.diagcat(*(_axes(contact.normal) for contact in contacts))
     jacobian = ca.mtimes(axes, ca.vertcat(*(contact.jacobian for contact in contacts)))
-    response = factored.solve(jacobian.T)
-    is_reduced = 3 * count > v.numel()
-    delassus = None if is_reduced else ca.mtimes(jacobian, response)
     surface = ca.mtimes(axes, ca.vertcat(*(contact.velocity for contact in contacts)))
     before = ca.mtimes(jacobian, v) - surface
     target = ca.mtimes(jacobian, free) - surface
-    parts = [slice(3 * i, 3 * i + 3) for i in range(count)]
+    response = PositiveDefiniteFactorization(mass).solve(jacobian.T)
+    is_reduced = 3 * count > v.numel()
+    delassus = None if is_reduced else ca.mtimes(jacobian, response)
     laws = [
-        (p, _Lagged.of(contact, before[p], jacobian[p, :], mass, h, compliance))
-        for p, contact in zip(parts, contacts, strict=True)
+        _Lagged.of(contact, of_one, rows, mass, h)
+        for contact, of_one, rows in zip(contacts, _each(before), _each(jacobian), strict=True)
     ]
 
     def impulses(velocity: ca.SX) -> ca.SX:
-        return ca.vertcat(*(law.impulse(velocity[p]) for p, law in laws))
+        return ca.vertcat(
+            *(law.impulse(own) for law, own in zip(laws, _each(velocity), strict=True))
+        )
 
     def residual(velocity: ca.SX) -> ca.SX:
         gamma = impulses(velocity)
-        moved = ca.mtimes(response, gamma)
-        changed = ca.mtimes(jacobian, moved) if is_reduced else ca.mtimes(delassus, gamma)
-        return velocity - target - changed
+        if is_reduced:
+            return velocity - target - ca.mtimes(jacobian, ca.mtimes(response, gamma))
+        return velocity - target - ca.mtimes(delassus, gamma)
 
     velocity = before
-    shares = [law.share(before[p]) for p, law in laws]
+    shares = [law.share(own) for law, own in zip(laws, _each(before), strict=True)]
     for remaining in reversed(range(ITERATIONS)):
-        slopes = (
-            law.slope(velocity[p], share) for (p, law), share in zip(laws, shares, strict=True)
-        )
-        slope = ca.diagcat(*slopes)
+        now = list(zip(laws, _each(velocity), shares, strict=True))
+        slope = ca.diagcat(*(law.slope(own, share) for law, own, share in now))
         if is_reduced:
             matrix = mass - ca.mtimes([jacobian.T, slope, jacobian])
         else:
             matrix = ca.SX.eye(3 * count) - ca.mtimes(delassus, slope)
         if not remaining:
             velocity, matrix, slope = map(as_constant, (velocity, matrix, slope))
+            now = list(zip(laws, _each(velocity), shares, strict=True))
         change = -residual(velocity)
         if is_reduced:
             pushed = ca.mtimes([jacobian.T, slope, change])
@@ -222,14 +209,19 @@ def contact_step(
         else:
             change = _solved(matrix, change)
         shares = [
-            law.next_share(velocity[p], share, change[p])
-            for (p, law), share in zip(laws, shares, strict=True)
+            law.next_share(own, share, moved)
+            for (law, own, share), moved in zip(now, _each(change), strict=True)
         ]
         velocity += change
     slack = SOLVED * ca.fmax(ca.norm_2(target), AT_REST) - ca.norm_2(residual(velocity))
     impulse = impulses(velocity)
-    forces = ca.mtimes(axes.T, impulse) / h
-    return free + ca.mtimes(response, impulse), forces, slack
+    return free + ca.mtimes(response, impulse), ca.mtimes(axes.T, impulse) / h, slack
+
+
+def _each(stacked: ca.SX) -> list[ca.SX]:
+    """The three rows of each contact."""
+    parts: list[ca.SX] = ca.vertsplit(stacked, 3)
+    return parts
 
 
 def _axes(normal: ca.SX) -> ca.SX:
@@ -265,31 +257,27 @@ def _solved(matrix: ca.SX, right: ca.SX) -> ca.SX:
 class _Lagged:
     """The impulse of one contact as a function of its velocity, in its axes."""
 
-    viscous: ca.SX
-    elastic: ca.SX
-    lagged: ca.SX
-    softness: ca.SX
-    time_step: float
-    compliance: Compliance
+    contact: PointContact
+    h: float
+    elastic: ca.SX  # k x before the step
+    lagged: ca.SX  # mu gamma_0
+    softness: ca.SX  # e
 
     @classmethod
     def of(
-        cls,
-        contact: PointContact,
-        before: ca.SX,
-        jacobian: ca.SX,
-        mass: ca.SX,
-        h: float,
-        compliance: Compliance,
+        cls, contact: PointContact, before: ca.SX, jacobian: ca.SX, mass: ca.SX, h: float
     ) -> "_Lagged":
         """The impulse; its velocity before the step and J are in the contact's axes."""
-        elastic = compliance.stiffness * ca.fmax(contact.depth, 0)
-        damping = ca.fmax(0, 1 - compliance.dissipation * before[0])
+        elastic = contact.stiffness * ca.fmax(contact.depth, 0)
+        damping = ca.fmax(0, 1 - contact.dissipation * before[0])
         lagged = contact.friction * h * elastic * damping
         response = ca.mtimes(jacobian / ca.repmat(ca.diag(mass).T, 3, 1), jacobian.T)
-        softness = ca.fmax(compliance.stiction_tolerance, SOFT * ca.norm_fro(response) / 3 * lagged)
-        viscous = h * contact.viscous_friction * (elastic > 0)
-        return cls(viscous, elastic, lagged, softness, h, compliance)
+        softness = ca.fmax(contact.stiction_tolerance, SOFT * ca.norm_fro(response) / 3 * lagged)
+        return cls(contact, h, elastic, lagged, softness)
+
+    @property
+    def _viscous(self) -> ca.SX:
+        return self.h * self.contact.viscous_friction * (self.elastic > 0)
 
     def _size(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
         """v_t and |v_t|_s."""
@@ -310,13 +298,12 @@ class _Lagged:
 
     def impulse(self, velocity: ca.SX) -> ca.SX:
         """gamma in N s, shape (3, 1)."""
-        along = -self.lagged * self.share(velocity) - self.viscous * velocity[1:]
+        along = -self.lagged * self.share(velocity) - self._viscous * velocity[1:]
         return ca.vertcat(self._push(velocity)[0], along)
 
     def _push(self, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
         """gamma_n and its derivative."""
-        h, k, d = self.time_step, self.compliance.stiffness, self.compliance.dissipation
-        leaving = velocity[0]
+        h, k, d, leaving = self.h, self.contact.stiffness, self.contact.dissipation, velocity[0]
         elastic, damping = self.elastic - h * k * leaving, 1 - d * leaving
         touches = (self.elastic > 0) * (elastic > 0) * (damping > 0)
         return touches * h * elastic * damping, -touches * h * (h * k * damping + d * elastic)
@@ -326,4 +313,4 @@ class _Lagged:
         sliding, size = self._size(velocity)
         plane = ca.SX.eye(2)
         along = self.lagged / size * (plane - ca.mtimes(share, (sliding / size).T))
-        return ca.diagcat(self._push(velocity)[1], -along - self.viscous * plane)
+        return ca.diagcat(self._push(velocity)[1], -along - self._viscous * plane)

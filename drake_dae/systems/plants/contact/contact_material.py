@@ -31,8 +31,8 @@ class PointMaterial:
 
     If the robot tilts by an angle a from its nominal orientation, the ball rolls: it touches at a
     distance 2 radius sin(a / 2) from the point of the constraint, and that point is radius (1 - cos
-    a) off the surface. This deviation from ideal contact is reduced by a smaller radius, not by a
-    stiffer contact. A tool that stays normal to its surface does not roll.
+    a) off the surface. A smaller radius reduces this deviation from ideal contact, a stiffer
+    contact does not. A tool that stays normal to its surface does not roll.
 
     Attributes:
         time_step: The step of the plant in s; 0 for a continuous plant.
@@ -43,10 +43,8 @@ class PointMaterial:
             steps of an explicit scheme must not exceed m v_s / (mu f_n), with the mass m that
             slides and the normal force f_n: the slope of friction over velocity is 15/8 mu f_n /
             v_s, and the velocity of a point that sticks would alternate from step to step. Where
-            the steps of a scenario are longer, `analyze` says so, and `simulate` before the run.
-        radius: The radius of the ball, m. In the nominal orientation it touches at the point of the
-            constraint; otherwise it rolls, with a deviation from ideal contact proportional to the
-            radius.
+            the steps of a scenario are longer, `analyze` and `simulate` say so.
+        radius: The radius of the ball, m.
     """
 
     time_step: float = 1e-3
@@ -97,15 +95,13 @@ class PointMaterial:
 @checked(ModelError)
 @dataclass(frozen=True)
 class ContactMaterial(PointMaterial):
-    """The contact model of Drake's MultibodyPlant for a robot.
+    """The contact model of Drake's MultibodyPlant for a robot, in steps, and as `PointMaterial`.
 
     The robot touches with a ball; the surfaces are those of its constraints. With point contact the
     force is stiffness times depth. With hydroelastic contact the ball is rigid, and the surface has
-    the pressure modulus times depth / thickness; curved surfaces are meshes. Where the
-    robot tilts, the ball rolls: see `PointMaterial`.
+    the pressure modulus times depth / thickness; curved surfaces are meshes.
 
     Attributes:
-        time_step: The step of the plant, s, positive.
         contact_model: "point" or "hydroelastic".
         modulus: The hydroelastic modulus, Pa.
         thickness: The thickness of the compliant layer of a plane, m; hydroelastic contact only. A
@@ -128,17 +124,13 @@ class ContactMaterial(PointMaterial):
             positive(name, getattr(self, name))
 
     def stiffness_at(self, force: float, sphere: float | None = None) -> float:
-        """The slope of the normal force over depth, in N/m.
+        """The slope of the normal force over depth, in N/m, on a plane or a sphere of a radius.
 
         A ball of radius R, pressed by d into a layer with the pressure E s / h at depth s, has a
         patch of radius sqrt(2 R d): F = pi E R d^2 / h, so k = dF/dd = 2 sqrt(pi E R F / h). In a
         sphere of radius S, whose pressure rises to E at its center, h = S and 1 / R + 1 / S takes
         the place of 1 / R. Drake's mesh of a sphere has edges of about R, so that the contact is
         softer at small depths: by a third at R = 20 mm, S = 100 mm and d = 1 mm.
-
-        Args:
-            force: The normal force in N.
-            sphere: The radius of the sphere that the ball touches, in m; None for a plane.
         """
         if self.contact_model == "point":
             return self.stiffness
@@ -160,13 +152,12 @@ def surface_properties(
     material: ContactMaterial, friction: float, is_half_space: bool
 ) -> ProximityProperties:
     """The properties of the surface."""
-    properties = _common_properties(material, friction)
-    if material.contact_model == "hydroelastic" and is_half_space:
-        AddCompliantHydroelasticPropertiesForHalfSpace(
-            material.thickness, material.modulus, properties
-        )
-    elif material.contact_model == "hydroelastic":
-        AddCompliantHydroelasticProperties(material.radius, material.modulus, properties)
+    properties, modulus = _common_properties(material, friction), material.modulus
+    if material.contact_model == "hydroelastic":
+        if is_half_space:
+            AddCompliantHydroelasticPropertiesForHalfSpace(material.thickness, modulus, properties)
+        else:
+            AddCompliantHydroelasticProperties(material.radius, modulus, properties)
     return properties
 
 

@@ -31,7 +31,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.primitives import MatrixGain, Multiplexer
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
+from drake_dae.arrays import FloatArray, listed
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import ConstraintStructure, Signal
@@ -73,8 +73,8 @@ class ContactPlant(Diagram, Plant):
     """A robot in Drake's own contact: a discrete MultibodyPlant with the ports of a `RobotPlant`.
 
     Compliant contact with friction satisfies the constraints approximately, and may open. For each
-    constraint there is a ball on the robot at its point, and its surface in the
-    world; nothing else of the robot collides.
+    constraint there is a ball on the robot at its point, and its surface in the world; nothing else
+    of the robot collides.
 
     The plant steps at t_n = n time_step: its ports then have x(t_n), before the step to t_(n+1),
     which uses the control at t_n. The force is that of the step to t_n. After
@@ -103,7 +103,6 @@ class ContactPlant(Diagram, Plant):
         disturbances: Forces on the robot that its law does not know.
 
     Attributes:
-        dae, model, structure, time_step: As for `Plant`.
         multibody: Drake's plant.
         contact_force_signals: Names and units of `contact_force`.
 
@@ -144,14 +143,10 @@ class ContactPlant(Diagram, Plant):
         plant.Finalize()
         drawn = model.links.plant
         assert drawn is not None  # check_model.
-        names, model_names = (
-            (robot.GetPositionNames(), robot.GetVelocityNames(), robot.GetActuatorNames())
-            for robot in (plant, drawn)
-        )
-        if names != model_names:
+        if _names(plant) != _names(drawn):
             raise ModelError(
                 f"add_robot must add the robot of the model, with positions "
-                f"{', '.join(model_names[0])}; it has {', '.join(names[0]) or 'none'}"
+                f"{listed(drawn.GetPositionNames())}; it has {listed(plant.GetPositionNames())}"
             )
         self._masses = other_masses(model, plant, self._values)
         if disturbances:
@@ -164,21 +159,18 @@ class ContactPlant(Diagram, Plant):
         results, state = plant.get_contact_results_output_port(), plant.get_state_output_port()
         builder.Connect(state, signals.GetInputPort("state"))
         if "generalized_contact_force" in block.inputs:
-            builder.Connect(
-                _generalized_forces(builder, plant),
-                signals.GetInputPort("generalized_contact_force"),
-            )
+            force, name = _generalized_forces(builder, plant), "generalized_contact_force"
         else:
-            forces = builder.AddSystem(ContactForces(pairs))
-            builder.Connect(results, forces.GetInputPort("contact_results"))
-            builder.Connect(forces.get_output_port(), signals.GetInputPort("contact_force"))
+            sums, name = builder.AddSystem(ContactForces(pairs)), "contact_force"
+            builder.Connect(results, sums.GetInputPort("contact_results"))
+            force = sums.get_output_port()
+        builder.Connect(force, signals.GetInputPort(name))
         builder.ExportInput(plant.get_actuation_input_port(), "control")
-        builder.ExportOutput(state, "state")
-        builder.ExportOutput(state, "link_state")
-        for name in signals.block.outputs:
-            builder.ExportOutput(signals.GetOutputPort(name), name)
-        builder.ExportOutput(results, "contact_results")
-        builder.ExportOutput(scene_graph.get_query_output_port(), "query_object")
+        shown = {name: signals.GetOutputPort(name) for name in block.outputs}
+        shown |= {"state": state, "link_state": state, "contact_results": results}
+        shown["query_object"] = scene_graph.get_query_output_port()
+        for name, port in shown.items():
+            builder.ExportOutput(port, name)
         builder.BuildInto(self)
         self.set_name(model.dae.name)
 
@@ -192,9 +184,9 @@ class ContactPlant(Diagram, Plant):
         ):
             values = own_values(constraint, self.dae, self._values)
             solids = solids_of(constraint, values, point, material)
-            friction, name = material.friction, constraint.friction_parameter
-            if friction is None:
-                friction = self._values[self.dae.parameter_slice(name)].item() if name else 0.0
+            friction, name = material.friction or 0.0, constraint.friction_parameter
+            if material.friction is None and name is not None:
+                friction = self._values[self.dae.parameter_slice(name)].item()
             ball = plant.RegisterCollisionGeometry(
                 frame.body(),
                 RigidTransform(frame.GetFixedPoseInBodyFrame() @ center),
@@ -228,11 +220,11 @@ class ContactPlant(Diagram, Plant):
         model, values, drawn = self.model, self._values, self.model.links.plant
         assert drawn is not None  # check_model.
         state = self.structure.manifold.project(self.dae.nominal_state, values)
+        # A unit force without sliding gives the normal.
+        state[model.links.q.numel() :] = 0.0
         context = drawn.CreateDefaultContext()
         drawn.SetPositionsAndVelocities(context, state[: drawn.num_multibody_states()])
         loads = ConstraintWrenches(model, values)
-        # A unit force without sliding gives the normal.
-        state[model.links.q.numel() :] = 0.0
         wrenches = loads(state, np.ones(self.dae.num_constraints))
         balls = []
         for name, point, normal in zip(loads.frames, wrenches.points, wrenches.forces, strict=True):
@@ -271,37 +263,37 @@ class ContactPlant(Diagram, Plant):
             if center is None:
                 body.SetMass(multibody_context, mass)
             else:
-                squares = center @ center - center**2
-                unit = UnitInertia(*squares, *(-center[[0, 0, 1]] * center[[1, 2, 2]]))
-                inertia = SpatialInertia(mass, center, unit)
+                inertia = SpatialInertia(mass, center, UnitInertia.PointMass(center))
                 body.SetSpatialInertiaInBodyFrame(multibody_context, inertia)
+
+
+def _names(plant: MultibodyPlant) -> tuple[list[str], ...]:
+    return plant.GetPositionNames(), plant.GetVelocityNames(), plant.GetActuatorNames()
 
 
 def check_model(model: RobotModel, material: ContactMaterial) -> None:
     """Refuses a model or a material that Drake's contact cannot represent."""
+    compliant = "take a CompliantPlant (`plant: !CompliantContact`)"
     if model.links.plant is None:
         raise ModelError("Drake's contact needs a robot that a MultibodyPlant has read")
     if model.dae.exogenous or model.known_forces:
         raise ModelError(
-            "Drake's contact as the plant takes no exogenous signals and no robot.known_forces; "
-            "forces that the law does not know are disturbance forces (plant.disturbances). Use "
-            "`plant: !CompliantContact`, which has the same equations of contact, or a rollout"
+            "Drake's contact as the plant takes no exogenous signals and no robot.known_forces: "
+            f"{compliant}; forces that the law does not know are plant.disturbances"
         )
     if model.stages:
         raise ModelError(
             f"{model.name} has springs, motors or valves at its joints, which Drake's contact does "
-            "not step: take a CompliantPlant (`plant: !CompliantContact`)"
+            f"not step: {compliant}"
         )
     for constraint, _ in touching(model):
         values = own_values(constraint, model.dae, model.dae.parameter_values)
         surface = constraint.surface_at(values)
-        is_point = material.contact_model == "point"
-        if surface is None or (is_point and not surface.solids()):
+        if surface is None or (material.contact_model == "point" and not surface.solids()):
             raise ModelError(
-                f"'{constraint.name}' has no solid for Drake's point contact, as a "
-                "PointOnSurface has on a Plane, or on the outside of a Sphere or a "
-                "Cylinder. Use hydroelastic contact (contact_model: hydroelastic), which meshes "
-                "any smooth surface, or `plant: !CompliantContact`"
+                f"'{constraint.name}' has no solid for Drake's point contact, as a PointOnSurface "
+                "has on a Plane, or on the outside of a Sphere or a Cylinder: take hydroelastic "
+                f"contact (contact_model: hydroelastic) on any smooth surface, or {compliant}"
             )
 
 
@@ -315,8 +307,8 @@ def solids_of(
     exact = solids and all(isinstance(solid.form, HalfSpace | Sphere) for solid in solids)
     # Drake's own mesh of a long cylinder is too coarse: 2 N of ripple in a force of 20 N.
     if material.contact_model != "point" and not exact:
+        near = pose.inverse() @ point
         try:
-            near = pose.inverse() @ point
             solids = (surface.layer(near, material.piece, material.thickness),)
         except ModelError as error:
             raise ModelError(f"{constraint.name}: {error}") from None
@@ -330,9 +322,8 @@ def _generalized_forces(builder: DiagramBuilder, plant: MultibodyPlant) -> Outpu
     ports = [plant.get_generalized_contact_forces_output_port(each) for each in moving]
     if len(ports) == 1:
         return ports[0]
-    order = np.concatenate(
-        [plant.GetVelocitiesFromArray(each, np.arange(plant.num_velocities())) for each in moving]
-    )
+    places = np.arange(plant.num_velocities())
+    order = np.concatenate([plant.GetVelocitiesFromArray(each, places) for each in moving])
     stacked = builder.AddSystem(Multiplexer([port.size() for port in ports]))
     for i, port in enumerate(ports):
         builder.Connect(port, stacked.get_input_port(i))

@@ -70,14 +70,12 @@ class DisturbanceForce:
         return ExpressionReference(lambda time: [self._share(time)])
 
     def _share(self, time: ca.SX) -> ca.SX:
-        share = self._grown(time - self.start_time)
-        if self.end_time is not None:
-            share -= self._grown(time - self.end_time)
-        return share
+        def risen(start: float) -> ca.SX:
+            x = ca.fmin(ca.fmax((time - start) / self.rise, 0.0), 1.0)
+            return x * x * (3.0 - 2.0 * x)
 
-    def _grown(self, since: ca.SX) -> ca.SX:
-        x = ca.fmin(ca.fmax(since / self.rise, 0.0), 1.0)
-        return x * x * (3.0 - 2.0 * x)
+        share = risen(self.start_time)
+        return share if self.end_time is None else share - risen(self.end_time)
 
 
 class AppliedDisturbances(LeafSystem):
@@ -94,9 +92,7 @@ class AppliedDisturbances(LeafSystem):
         super().__init__()
         self.set_name("disturbances")
         self._arguments = plant, disturbances, frames
-        self._forces = [
-            disturbance.reference.derivatives([0, 0, 0]) for disturbance in disturbances
-        ]
+        self._forces = [each.reference.derivatives([0, 0, 0]) for each in disturbances]
         self._applied = []
         for disturbance, frame in zip(disturbances, frames, strict=True):
             applied = ExternallyAppliedSpatialForce()

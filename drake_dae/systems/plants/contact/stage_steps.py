@@ -8,11 +8,9 @@ from drake_dae.errors import ModelError
 from drake_dae.robots import RobotModel
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
-_GROWTH = 1e-7
-"""The allowed excess of the spectral radius over 1: round-off of motions without a force."""
+_GROWTH = 1e-7  # allowed excess of the spectral radius over 1: round-off of motions without a force
 
-_SHORTER = np.geomspace(1.0, 0.01, 300)[1:]
-"""The fractions of a too long step that are tried for the message."""
+_SHORTER = np.geomspace(1.0, 0.01, 300)[1:]  # of a too long step, tried for the message
 
 
 def stages_after(model: RobotModel, time_step: float, control: ca.SX) -> ca.SX:
@@ -74,17 +72,16 @@ def check_step(model: RobotModel, time_step: float, parameters: FloatArray) -> N
     if growth(time_step) <= 1.0 + _GROWTH:
         return
     fastest = float(np.abs(np.linalg.eigvals(slope)).max())
-    what = (
+    shorter = [float(f"{part * time_step:.1e}") for part in _SHORTER]
+    fitting = next((step for step in shorter if growth(step) <= 1.0 + _GROWTH), None)
+    remedy = f", and so is one of {shorter[-1]:g} s; damp it, or take an ideal plant"
+    if fitting is not None:
+        remedy = f". Take {fitting:g} s or less; the law may keep its period with `sampling`"
+    raise ModelError(
         f"a time_step of {time_step:g} s is too long for what drives the joints, which has motions "
         f"of {fastest:.3g} rad/s: each step would let one grow by {growth(time_step) - 1.0:.2g}"
+        f"{remedy}"
     )
-    for part in _SHORTER:
-        shorter = float(f"{part * time_step:.1e}")
-        if growth(shorter) <= 1.0 + _GROWTH:
-            raise ModelError(
-                f"{what}. Take {shorter:g} s or less; the law may keep its period with `sampling`"
-            )
-    raise ModelError(f"{what}, and so is one of {shorter:g} s; damp it, or take an ideal plant")
 
 
 def _num_link_states(model: RobotModel) -> int:

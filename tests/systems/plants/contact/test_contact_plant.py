@@ -108,19 +108,6 @@ def test_contact_forces_of_several_model_instances_are_those_of_drakes_results()
     assert found[:, 2].min() > 5.0
 
 
-def test_state_reference_and_log_belong_to_one_instant():
-    """What acts from t_(k+1) on is the law of the state and the reference logged for t_k."""
-    loop, _, record = run_scenario(two_link(ONE_LATE, "duration=0.05"))
-    assert_allclose(record.time, 1e-3 * np.arange(51), atol=1e-12)
-    law = loop.controller.law
-    parameters = law.all_parameters()
-    wanted = [
-        law.function(state, reference, parameters)[0].copy()
-        for state, reference in zip(record["state"], record["reference"], strict=True)
-    ]
-    assert_allclose(record["control"][1:], wanted[:-1], atol=1e-12)
-
-
 def test_law_may_be_sampled_more_slowly_than_the_plant_steps():
     """Held for four steps, and one sample late."""
     settings = "plant.time_step=2.5e-4", ONE_LATE, "duration=0.02"

@@ -1,16 +1,27 @@
-"""States at rest with constant outputs, and their stability by linearization.        (35)-(36)"""
+"""Stability of the zero dynamics: eigenvalues at rest, Floquet multipliers along R(t).   (35)-(36)
 
+To first order a disturbance delta of a state on Z(R) moves by delta' = (dx'/dx) delta, with the
+derivative of x' = f* + h* u at fixed R, and stays tangent to Z(R). At an equilibrium its
+eigenvalues on the tangent space decide. In bases T of the tangent spaces a period of a periodic
+motion takes T c to T M c; the eigenvalues of M are the multipliers.
+"""
+
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import pairwise
 
+import casadi as ca
 import numpy as np
+import scipy  # SciPy loads its large parts when they are used.
 import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
-from drake_dae.dae.manifold import coordinates
-from drake_dae.dae.pinned_motion import PinnedOutputs, PinnedPoint, PinnedSet
+from drake_dae.dae.manifold import coordinates, tangent
+from drake_dae.dae.pinned_motion import GROWN, PinnedMotion, PinnedOutputs, PinnedPoint, PinnedSet
 from drake_dae.dae.structure import Structure
-from drake_dae.errors import InconsistentStateError
+from drake_dae.errors import InconsistentStateError, ModelError
 from drake_dae.trace.newton import ROUND_OFF, NewtonModel, newton, shortest_steps
 from drake_dae.trace.round_off import DEPENDENT
 
@@ -22,6 +33,15 @@ ISOLATED = 1e-6  # An equilibrium is known to this distance, relative to the sca
 # The distance, relative to the scale, within which the slopes must be nearly constant.
 BESIDE = 1e-5
 SAME = 0.5  # The allowed relative change of the slopes there: then Newton's method contracts.
+# Along a periodic motion:
+ACCURACY = 1e-9  # The error of an integration step, relative to the scale of the states.
+MOST_STEPS = 5000  # The largest number of integration steps in a period.
+SECTIONS = 16  # The number of parts of a period; after each, the state is projected onto Z(R).
+# A motion is periodic if it returns to within this, relative to the scale of the states.
+CLOSED = 1e-7
+CARRIED = 1e-6  # The error of the matrix M, relative to its norm.
+NEWTON_STEPS = 12  # The largest number of Newton steps.
+REPEATED = 1e-6  # A reference has a period if it repeats itself to this, relative to its values.
 ComplexArray = np.typing.NDArray[np.complex128]
 
 
@@ -40,6 +60,17 @@ class Stability:
     verdict: Verdict
     reason: str
     eigenvalues: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=complex))
+    state: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class StabilityAlong:
+    """The stability of the internal states while the outputs follow a periodic reference."""
+
+    verdict: Verdict
+    reason: str
+    period: float
+    multipliers: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=complex))
     state: FloatArray | None = None
 
 
@@ -139,15 +170,11 @@ def judge(
 
 def without_dynamics(structure: Structure) -> Stability:
     """Judges a system without zero dynamics: whether R determines the motion."""
-    margins = {
-        "A(x) of Assumption (2)": structure.constraint_margin,
-        "B(x) of (16)": structure.control_margin,
-    }
-    for matrix, margin in margins.items():
+    for matrix, margin in dict(A=structure.constraint_margin, B=structure.control_margin).items():
         if margin is not None and margin.is_singular:
             reason = (
                 "no zero dynamics, but the reference does not determine the motion: "
-                f"{matrix} is singular at x = {show(margin.state)}"
+                f"{matrix}(x) is singular at x = {show(margin.state)}"
             )
             return Stability(Verdict.UNDECIDED, reason)
     return Stability(Verdict.STABLE, "no zero dynamics: the reference alone determines the motion")
@@ -162,9 +189,9 @@ class Equilibria:
         self.sizes = np.maximum(examined, system.spread_around(system.nominal_state))
         # The rates of states with a constant rate, such as clocks.
         explicit, self._clocks = system.explicit, np.zeros(system.num_states)
+        inputs = ca.horzcat(explicit.g, explicit.h)
         for i in range(system.num_states):
-            still = not (explicit.g[i, :].nnz() or explicit.h[i, :].nnz())
-            if still and explicit.f[i].is_constant():
+            if not inputs[i, :].nnz() and explicit.f[i].is_constant():
                 self._clocks[i] = float(explicit.f[i])
 
     def constant_outputs(self, state: FloatArray, parameters: FloatArray) -> FloatArray:
@@ -180,8 +207,8 @@ class Equilibria:
             still, by = np.zeros((state.size, direct.size)), np.eye(reference.size)[:, direct]
             slopes, rate = pinned.slopes(state, still, by), pinned.rate(state)
             if np.all(np.isfinite(slopes)) and np.all(np.isfinite(rate)):
-                nearest = -np.linalg.pinv(slopes / scale[:, None], DEPENDENT) @ (rate / scale)
-                reference[direct] = nearest
+                inverse = np.linalg.pinv(slopes / scale[:, None], DEPENDENT)
+                reference[direct] = -inverse @ (rate / scale)
         return reference
 
     def find(
@@ -195,10 +222,8 @@ class Equilibria:
         """
         system, scale = self.pinned.system, self.pinned.system.scale
         if self._clocks.any():
-            running = ", ".join(
-                f"{system.state_signals[i].name}' = {self._clocks[i]:g}"
-                for i in self._clocks.nonzero()[0]
-            )
+            pairs = zip(system.state_signals, self._clocks, strict=True)
+            running = ", ".join(f"{signal.name}' = {rate:g}" for signal, rate in pairs if rate)
             raise InconsistentStateError(
                 f"{system.name}: no state is an equilibrium, since {running} at all of "
                 "them, as for a clock: time must not be a state. Take it out of the state, as an "
@@ -242,8 +267,8 @@ class Equilibria:
 
     def unrest(self, pinned: PinnedSet, point: PinnedPoint) -> str:
         """Returns why a point is no regular state at rest, as text; empty if it is one."""
-        if flaw := pinned.flaw(point):
-            return flaw
+        if point.flaw:
+            return point.flaw
         slow = np.abs(point.rate) <= AT_REST * np.abs(pinned.slopes(point.state)) @ self.sizes
         unrest = np.where(slow, 0.0, point.unrest)
         worst = int(np.argmax(unrest))
@@ -278,3 +303,138 @@ class Equilibria:
                 isolated = all(abs(change) <= SAME * size for change in changes)
             count += not isolated
         return count
+
+
+class _MotionLost(Exception):
+    """Raised where a motion cannot be followed over a period."""
+
+
+class PeriodicMotions:
+    """The motions on Z(R(t)), given by `at`, with the period of R, and their multipliers."""
+
+    def __init__(self, at: Callable[[float], PinnedSet], scale: FloatArray, period: float) -> None:
+        self._at, self._scale, self._period = at, scale, period
+
+    def judge(self, motion: PinnedMotion) -> StabilityAlong:
+        """Judges the periodic motion found near a motion."""
+        if not motion.times.size:
+            return StabilityAlong(Verdict.UNDECIDED, str(motion.ending), self._period)
+        self._check_period(motion.times)
+        over = f"over {self._period:.6g} s"
+        # Late, when decaying disturbances are gone; or early, when growing ones are still small.
+        late = int(np.count_nonzero(motion.times <= motion.times[-1] - self._period)) - 1
+        for first in dict.fromkeys((max(late, 0), 0)):
+            try:
+                state, matrix = self._close(motion.states[first], float(motion.times[first]))
+            except _MotionLost:
+                continue
+            noise = CARRIED * max(1.0, float(np.linalg.norm(matrix, 2)))
+            values, errors = eigenvalues_of(matrix, np.full(matrix.shape, noise))
+            order = np.argsort(-np.abs(values), kind="stable")
+            values, errors = values[order], errors[order]
+            sizes = np.abs(values)
+            reason = f"the largest Floquet multiplier is {sizes[0]:.4g} {over}"
+            if np.any(sizes > 1.0 + errors):
+                verdict = Verdict.UNSTABLE
+                reason = f"small disturbances of the motion grow: {reason}"
+            elif np.all(sizes < 1.0 - errors):
+                verdict = Verdict.STABLE
+            else:
+                verdict, count = Verdict.UNDECIDED, np.count_nonzero(np.abs(sizes - 1.0) <= errors)
+                reason = (
+                    f"{count} of {sizes.size} Floquet multipliers are on the unit circle, up to "
+                    f"the error of integration, {over}"
+                )
+            return StabilityAlong(verdict, reason, self._period, values, state)
+        reason = f"no motion with the period {self._period:.6g} s of the reference is found"
+        if motion.ending is not None:
+            reason += f"; the motion ends: {motion.ending}"
+        return StabilityAlong(Verdict.UNDECIDED, reason, self._period)
+
+    def _check_period(self, times: FloatArray) -> None:
+        """Raises ModelError if the signals do not repeat, at a few times."""
+        begin = float(times[0])
+        last = max(float(times[-1]) - self._period, begin)
+        for time in np.linspace(begin, last, 4).tolist():
+            now, later = self._at(time), self._at(time + self._period)
+            for a, b in ((now.reference, later.reference), (now.parameters, later.parameters)):
+                allowed = REPEATED * max(1.0, float(np.max(np.abs(a), initial=0.0)))
+                if np.any(np.abs(b - a) > allowed):
+                    raise ModelError(
+                        f"{now.outputs.system.name}: the reference does not have the period "
+                        f"{self._period:g} s: it differs at {time:g} s and a period later"
+                    )
+
+    def _onto(self, state: FloatArray, time: float) -> FloatArray:
+        """Projects a state onto Z(R(t)), which must be near."""
+        projected, converged = self._at(time).project(state)
+        is_near = np.abs(projected - state) <= 0.1 * (self._scale + np.abs(state))
+        if not (converged and np.all(is_near)):
+            raise _MotionLost
+        return projected
+
+    def _close(self, state: FloatArray, begin: float) -> tuple[FloatArray, FloatArray]:
+        """Returns the start of the periodic motion near a state, and M.
+
+        Newton's method for the distance from the start after a period, along the tangent space.
+        """
+        for _ in range(NEWTON_STEPS):
+            basis = tangent(self._at(begin).gradients(state), self._scale)
+            later, columns, left = state, basis, MOST_STEPS
+            for start, stop in pairwise(np.linspace(begin, begin + self._period, SECTIONS + 1)):
+                later, columns, steps = self._section(later, columns, start, stop, left)
+                later, left = self._onto(later, stop), left - steps
+            scaled = (basis / self._scale[:, None]).T
+            matrix = scaled @ (columns / self._scale[:, None])
+            if not np.all(np.isfinite(matrix)):
+                break
+            gap = scaled @ ((later - state) / self._scale)
+            change = basis @ np.linalg.lstsq(matrix - np.eye(gap.size), -gap, rcond=CARRIED)[0]
+            if np.max(np.abs(change) / self._scale) <= CLOSED:
+                off = np.max(np.abs(later - state) / self._scale)
+                if off > 1e3 * CLOSED * max(1.0, float(np.linalg.norm(matrix, 2))):
+                    break
+                return state, matrix
+            state = self._onto(state + change, begin)
+        raise _MotionLost
+
+    def _section(
+        self, state: FloatArray, columns: FloatArray, begin: float, end: float, most: int
+    ) -> tuple[FloatArray, FloatArray, int]:
+        """Integrates a state and tangent columns; also returns the number of steps."""
+        n, unit = state.size, self._scale[:, None]
+
+        def split(both: FloatArray) -> tuple[FloatArray, FloatArray]:
+            parts = both.reshape(-1, n).T * unit
+            return parts[:, 0], parts[:, 1:]
+
+        def joined(first: FloatArray, rest: FloatArray) -> FloatArray:
+            return np.asarray((np.column_stack([first, rest]) / unit).T.reshape(-1))
+
+        def rate(time: float, both: FloatArray) -> FloatArray:
+            (x, along), pinned = split(both), self._at(time)
+            moved = joined(pinned.rate(x), pinned.slopes(x, along))
+            if not np.all(np.isfinite(moved)):
+                raise _MotionLost
+            return moved
+
+        def slopes(time: float, both: FloatArray) -> FloatArray:
+            # Without second derivatives, for which the iteration of the integrator compensates.
+            matrix = self._at(time).slopes(split(both)[0])
+            blocks = [matrix * self._scale / unit] * (1 + columns.shape[1])
+            return np.asarray(scipy.linalg.block_diag(*blocks), dtype=np.float64)
+
+        y, steps = joined(state, columns), 0
+        bound = GROWN * np.maximum(1.0, np.max(np.abs(y[:n])))
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # A failed step raises _MotionLost.
+            solver = scipy.integrate.LSODA(
+                rate, begin, y, end, rtol=ACCURACY, atol=ACCURACY, jac=slopes
+            )
+            while solver.status == "running":
+                solver.step()
+                steps += 1
+                largest = np.max(np.abs(solver.y[:n]))
+                if solver.status == "failed" or steps > most or not largest <= bound:
+                    raise _MotionLost
+        return (*split(solver.y), steps)

@@ -1,6 +1,5 @@
-"""What the commands of `drake-dae` share: options, checks of what they write, progress of waits."""
+"""What the commands share: complete files in a folder, pages that are opened, progress of waits."""
 
-import argparse
 import os
 import shlex
 import shutil
@@ -12,52 +11,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from drake_dae.errors import ModelError
 
 PATIENCE = 2.0
 """The time in s after which a command tells on a terminal what it does."""
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser with the kinds of options that several commands have."""
-
-    def flag(self, name: str, text: str) -> None:
-        """Adds an option without a value."""
-        self.add_argument(name, action="store_true", help=text)
-
-    def path(self, name: str, metavar: str, text: str, **more: Any) -> None:
-        """Adds a file or a folder; "", as from an unset variable of the shell, is refused."""
-
-        def made(given: str) -> Path:
-            if not given or "\0" in given:
-                raise argparse.ArgumentTypeError(f"a name is needed, got {given!r}")
-            return Path(given)
-
-        self.add_argument(name, type=made, metavar=metavar, help=text, **more)
-
-    def repeatable(self, name: str, metavar: str, text: str, **more: Any) -> None:
-        """Adds an option that may be repeated; its values are a list."""
-        more = {"action": "append", "default": [], **more}
-        self.add_argument(name, metavar=metavar, help=f"{text}; may be repeated", **more)
-
-    def scenario(self, default: str) -> None:
-        """Adds a scenario, and `--set` that changes it."""
-        text = f"a shipped scenario or a YAML file (default: {default})"
-        self.add_argument("scenario", nargs="?", default=default, help=text)
-        text = 'change the scenario, for example "integrator.accuracy=1e-8"'
-        self.repeatable("--set", "KEY=VALUE", text, dest="settings")
-
-    def out(self, metavar: str, text: str) -> None:
-        """Adds where to write, and whether files are replaced."""
-        self.path("--out", metavar, text)
-        self.flag("--force", "replace files that exist")
-
-    def json(self, text: str) -> None:
-        """Adds `--json`."""
-        text = f'{text} as JSON, all else on stderr; for an error, its text under "error"'
-        self.flag("--json", text)
 
 
 def check_folder(folder: Path) -> None:
@@ -121,13 +79,12 @@ def waiting(what: str) -> Iterator[None]:
             print(f"\r{what} ... {passed:.0f} s", end="", file=sys.stderr, flush=True)
         print(file=sys.stderr)
 
-    if not sys.stderr.isatty():
-        yield
-        return
     teller = threading.Thread(target=tell, daemon=True)
-    teller.start()
+    if sys.stderr.isatty():
+        teller.start()
     try:
         yield
     finally:
         done.set()
-        teller.join()
+        if teller.ident is not None:
+            teller.join()
