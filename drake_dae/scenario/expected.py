@@ -16,7 +16,7 @@ from drake_dae.dae.beyond.one_direction import DirectionGains
 from drake_dae.dae.law_model import damping_gains
 from drake_dae.dae.margins import ContactMargins
 from drake_dae.diagrams.record import Record
-from drake_dae.errors import DrakeDaeError
+from drake_dae.errors import DrakeDaeError, ModelError
 from drake_dae.references import Reference
 from drake_dae.robots import RobotModel, velocities_are_rates
 from drake_dae.running.judgement import OutputQuality
@@ -143,7 +143,10 @@ def stated_errors(
         DirectionGains((free[0], free[1], free[2]), 0.0, estimator.rate, estimator.state_rate),
         DirectionGains((0.0, 0.0, damping), of_forces[0][0], slow, estimator.state_rate),
     )
-    across, along = (Part.of(sensed, 0.0, own, bool(i)).error for i, own in enumerate(rates))
+    try:
+        across, along = (Part.of(sensed, 0.0, own, bool(i)).error for i, own in enumerate(rates))
+    except ModelError:  # Of a state_rate, which is told where it is used.
+        return None
     found = across, float(np.hypot(along, _bias(scenario)))
     return found if isfinite(sum(found)) else None
 
