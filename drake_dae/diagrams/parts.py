@@ -132,33 +132,29 @@ def check_force_loop(
                 "reads it closes an algebraic loop; pass a sensor=ForceSensor(...) with a "
                 "time_constant or a sample_period, or a sampling"
             )
-        return
     gain = float(np.linalg.norm(measured.gain, 2)) if measured and force.size() else 0.0
-    diverges = f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample"
-    if sensor is not None and gain >= (most := sensor.largest_stable_gain()):
-        raise WiringError(
-            f"{diverges} multiplies the force error by -Gbar; it must stay below {most:.3g}. Lower "
-            "force_gain, or give the sensor a time_constant well above its sample_period"
-        )
-    if sampling is not None and at_once and (radius := _radius(gain, sensor, sampling)) >= 1.0:
-        raise WiringError(
-            f"{diverges} of {sampling.period:g} s multiplies the force error by {radius:.3g}. "
-            "Lower force_gain, or give the sensor a time_constant well above the sampling's period "
-            "and delay"
-        )
+    lag, samples = (sensor.time_constant, sensor.sample_period) if sensor is not None else (0, 0)
+    loops = [(samples, 0)] if samples else []
+    if sampling is not None and at_once:
+        # The law reads what a sensor samples at the same instant one sample later.
+        loops.append((sampling.period, sampling.late_samples + bool(samples)))
+    for period, late in loops:
+        if (radius := _radius(gain, lag, period, late)) >= 1.0:
+            raise WiringError(
+                f"the sampled force loop diverges: with ||Gbar|| = {gain:.3g} each sample of "
+                f"{period:g} s multiplies the force error by {radius:.3g}. Lower force_gain, or "
+                "give the sensor a time_constant well above the period of samples and the delay"
+            )
 
 
-def _radius(gain: float, sensor: ForceSensor | None, sampling: Sampling) -> float:
+def _radius(gain: float, lag: float, period: float, late: int) -> float:
     """The factor by which each sample multiplies the force error of a rigid robot.
 
     The force follows the acting control, lambda = -Gbar y of an earlier sample, and the sensor
     follows the force, y' = a y + (1 - a) lambda. With a delay of d samples the factor is the
     largest root, in magnitude, of z^(d + 1) - a z^d + (1 - a) Gbar = 0.
     """
-    lag = sensor.time_constant if sensor is not None else 0.0
-    a = float(np.exp(-sampling.period / lag)) if lag else 0.0
-    # The law reads what a sensor samples at the same instant one sample later.
-    late = sampling.late_samples + bool(sensor is not None and sensor.sample_period)
+    a = float(np.exp(-period / lag)) if lag else 0.0
     polynomial = np.zeros(late + 2)
     polynomial[0] = 1.0
     polynomial[1] -= a

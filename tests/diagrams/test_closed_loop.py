@@ -13,15 +13,7 @@ from arms import (
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from runs import run, scenario
 
-from drake_dae import (
-    ConstantReference,
-    RobotPlant,
-    SinusoidReference,
-    TracedSystem,
-    build_scenario,
-    compile_diagram,
-    make_closed_loop,
-)
+import drake_dae as dd
 
 ARMS = ["two_link", "seven_joint"]
 
@@ -29,13 +21,13 @@ ARMS = ["two_link", "seven_joint"]
 @pytest.mark.parametrize(
     "references",
     [
-        [SinusoidReference(0.3, 0.1, 2.0), ConstantReference(20.0)],
-        {"wall.force": 20.0, "tool": SinusoidReference(0.3, 0.1, 2.0)},
+        [dd.SinusoidReference(0.3, 0.1, 2.0), dd.ConstantReference(20.0)],
+        {"wall.force": 20.0, "tool": dd.SinusoidReference(0.3, 0.1, 2.0)},
     ],
 )
 def test_references_come_in_order_or_by_name(references):
-    plant = RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
-    loop = make_closed_loop(plant, law("two_link"), references)
+    plant = dd.RobotPlant(arm("two_link").model, structure=arm("two_link").structure)
+    loop = dd.make_closed_loop(plant, law("two_link"), references)
     sin, cos = np.sin(1.4), np.cos(1.4)
     wanted = [0.3 + 0.1 * sin, 0.2 * cos, -0.4 * sin, 20.0]
     np.testing.assert_allclose(loop.reference.reference(0.7), wanted, rtol=1e-14)
@@ -73,8 +65,8 @@ COMPLIANT = "plant=!CompliantContact {time_step: 0.001, friction: 0.3}"
 )
 def test_a_loop_as_one_block_has_its_ports_and_its_motion(case):
     """To 1e-12 after 0.2 s: other common subexpressions are removed."""
-    loop, context = build_scenario(scenario(*case, "compiled=false"))
-    one = TracedSystem(compile_diagram(loop.diagram, context=context))
+    loop, context = dd.build_scenario(scenario(*case, "compiled=false"))
+    one = dd.TracedSystem(dd.compile_diagram(loop.diagram, context=context))
     own = one.CreateDefaultContext()
     for system, its in ((loop.diagram, context), (one, own)):
         simulator = Simulator(system, its)
@@ -93,7 +85,7 @@ def test_a_loop_as_one_block_has_its_ports_and_its_motion(case):
 def test_dynamics_are_those_of_multibody_plant(name):
     """The index-1 form [[M, -J'], [J, 0]] (v', lambda) = (B u - H, -Jdot v), solved densely."""
     found, random = arm(name), np.random.default_rng(2)
-    plant = RobotPlant(found.model, structure=found.structure)
+    plant = dd.RobotPlant(found.model, structure=found.structure)
     context = plant.CreateDefaultContext()
     for state in consistent_states(name, 20):
         q, v = np.split(state, 2)

@@ -7,34 +7,25 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.primitives import VectorLogSink
 from runs import run_scenario, scenario
 
-from drake_dae import (
-    ConstantReference,
-    DcMotors,
-    ForceSensor,
-    RobotPlant,
-    TrackingLaw,
-    build_scenario,
-    make_closed_loop,
-    poles,
-)
+import drake_dae as dd
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ScenarioError, WiringError
 
-REFERENCES = [ConstantReference(0.3), ConstantReference(20.0)]
-MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
+REFERENCES = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
+MOTORS = dd.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
 
 
 def rigid(sensor=None, gain=1.0, measured=True):
     found = arm("two_link")
-    law = TrackingLaw(
+    law = dd.TrackingLaw(
         found.model.dae,
-        poles(-8.0),
+        dd.poles(-8.0),
         structure=found.structure,
         measured_force=measured,
         force_gain=gain if measured else 0.0,
     )
-    plant = RobotPlant(found.model, structure=found.structure)
-    return make_closed_loop(plant, law, REFERENCES, LoopSettings(sensor=sensor))
+    plant = dd.RobotPlant(found.model, structure=found.structure)
+    return dd.make_closed_loop(plant, law, REFERENCES, LoopSettings(sensor=sensor))
 
 
 def test_a_direct_connection_that_loops_is_refused_with_the_remedy():
@@ -44,15 +35,15 @@ def test_a_direct_connection_that_loops_is_refused_with_the_remedy():
 
 def test_a_sampled_loop_that_diverges_is_refused():
     with pytest.raises(WiringError, match=r"1.5"):
-        rigid(ForceSensor(1, sample_period=0.01), gain=1.5)
+        rigid(dd.ForceSensor(1, sample_period=0.01), gain=1.5)
     # With a lag of five samples it is stable up to (1 + a) / (1 - a), a = exp(-1/5): 10.
-    loop = rigid(ForceSensor(1, time_constant=0.05, sample_period=0.01), gain=5.0)
+    loop = rigid(dd.ForceSensor(1, time_constant=0.05, sample_period=0.01), gain=5.0)
     assert loop.sensor.largest_stable_gain() == pytest.approx(10.03, abs=0.01)
 
 
 def test_a_sensor_that_no_law_uses_is_refused():
     with pytest.raises(WiringError, match="measured_force"):
-        rigid(ForceSensor(1, 0.01), measured=False)
+        rigid(dd.ForceSensor(1, 0.01), measured=False)
 
 
 def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
@@ -60,20 +51,20 @@ def test_a_sensor_of_a_wrong_size_is_refused_with_both_sizes():
         WiringError,
         match=r"2.*'two_link'.*1.*wall.force.*ForceSensor\(1, ",
     ):
-        rigid(ForceSensor(2, time_constant=0.01))
+        rigid(dd.ForceSensor(2, time_constant=0.01))
 
 
 @pytest.mark.slow
 def test_a_plant_of_another_diagram_is_refused_with_its_name():
-    loop, _ = build_scenario(scenario("two_link_wall"))
+    loop, _ = dd.build_scenario(scenario("two_link_wall"))
     with pytest.raises(WiringError, match="'two_link_arm'"):
-        make_closed_loop(loop.plant, loop.controller.law, loop.generator.references)
+        dd.make_closed_loop(loop.plant, loop.controller.law, loop.generator.references)
 
 
 def test_behind_motors_the_force_may_be_connected_directly():
     model = touching("two_link", [MOTORS])
-    law = TrackingLaw(model.dae, poles(-8.0), measured_force=True)
-    loop = make_closed_loop(RobotPlant(model, structure=law.structure), law, REFERENCES)
+    law = dd.TrackingLaw(model.dae, dd.poles(-8.0), measured_force=True)
+    loop = dd.make_closed_loop(dd.RobotPlant(model, structure=law.structure), law, REFERENCES)
     assert loop.sensor is None
     assert not loop.diagram.HasAnyDirectFeedthrough()
 
@@ -82,7 +73,7 @@ def test_behind_motors_the_force_may_be_connected_directly():
 @pytest.mark.parametrize("name", ["two_link_measured_force", "wall_point_contact"])
 def test_all_signals_are_in_one_log_of_which_the_record_is_cut(name):
     """The first sample has the values of the ports before the first step."""
-    loop, context = build_scenario(scenario(name, "compiled=false"))
+    loop, context = dd.build_scenario(scenario(name, "compiled=false"))
     logs = [each for each in loop.diagram.GetSystems() if isinstance(each, VectorLogSink)]
     assert logs == [loop.log]
     Simulator(loop.diagram, context).Initialize()
@@ -139,7 +130,7 @@ def test_a_scenario_with_another_mass_in_the_plant():
 )
 def test_refusals_name_the_key(name, setting, message):
     with pytest.raises(ScenarioError, match=message):
-        build_scenario(scenario(name, *([setting] if isinstance(setting, str) else setting)))
+        dd.build_scenario(scenario(name, *([setting] if isinstance(setting, str) else setting)))
 
 
 @pytest.mark.parametrize(
@@ -152,7 +143,7 @@ def test_refusals_name_the_key(name, setting, message):
 )
 def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
     """The tip is on the plant's wall at the wanted height, at rest, with the wanted force."""
-    loop, context = build_scenario(scenario("two_link_flexible", setting))
+    loop, context = dd.build_scenario(scenario("two_link_flexible", setting))
     own = loop.plant.GetMyContextFromRoot(context)
     state = loop.plant.state(own)
     q = state[:2]
@@ -166,6 +157,6 @@ def test_a_wrong_plant_starts_consistent_at_its_own_parameters(setting, start):
 
 def test_a_gain_without_effect_is_refused():
     with pytest.raises(ScenarioError, match=r"sensors\.force or law\.gains: "):
-        build_scenario(
+        dd.build_scenario(
             scenario("two_link_flexible", "sensors.force.time_constant=0.01", "law.force_gain=2")
         )

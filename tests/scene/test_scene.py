@@ -15,15 +15,7 @@ from recordings import animation, objects, transforms, vertices
 from runs import run_scenario, scenario, some
 from two_arms import two_arms
 
-from drake_dae import (
-    ImplicitSurface,
-    PointCoordinates,
-    PointOnSurface,
-    RobotModel,
-    RobotPlant,
-    build_scenario,
-    start_meshcat,
-)
+import drake_dae as dd
 from drake_dae.pictures.motion import follow, run_points
 from drake_dae.robots import ConstraintWrenches
 from drake_dae.scene.arrows import ForceArrows
@@ -129,7 +121,7 @@ def test_each_surface_is_drawn_once_around_the_whole_run(name, drawn):
 
 def shown_at_rest(model, forces):
     """The page of a robot that holds still with given constraint forces."""
-    meshcat, plant = start_meshcat(), RobotPlant(model)
+    meshcat, plant = dd.start_meshcat(), dd.RobotPlant(model)
     state = plant.structure.manifold.project(model.dae.nominal_state)
     arrows = draw_scene(plant, meshcat)
     meshcat.StartRecording()
@@ -142,13 +134,13 @@ def shown_at_rest(model, forces):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "surface",
-    [Saddle((1.2, 0.0, 0.0), 0.5), ImplicitSurface(lambda p: p[2] - p[0] ** 2, (1.2, 0.0, 0.0))],
+    [Saddle((1.2, 0.0, 0.0), 0.5), dd.ImplicitSurface(lambda p: p[2] - p[0] ** 2, (1.2, 0.0, 0.0))],
 )
 def test_a_surface_without_a_shape_is_drawn(surface):
     """Around the contact, every vertex on the surface."""
-    contact = PointOnSurface("tool", surface, name="it")
-    outputs = [PointCoordinates("tool", "x")]
-    model = RobotModel.from_multibody(parse("two_link_arm"), [contact], outputs, [1.2, -1.6])
+    contact = dd.PointOnSurface("tool", surface, name="it")
+    outputs = [dd.PointCoordinates("tool", "x")]
+    model = dd.RobotModel.from_multibody(parse("two_link_arm"), [contact], outputs, [1.2, -1.6])
     _, page = shown_at_rest(model, np.array([10.0]))
     points = vertices(objects(page)["/contact/it/surface/form"])
     points += transforms(page)["/contact/it/surface"][:3, 3]
@@ -165,7 +157,7 @@ def test_a_surface_without_a_shape_is_drawn(surface):
 
 
 def test_a_pulling_force_points_the_other_way_and_zero_has_no_length():
-    model, meshcat = arm("two_link").model, start_meshcat()
+    model, meshcat = arm("two_link").model, dd.start_meshcat()
     arrows, loads = ForceArrows(meshcat, model, length=0.3), ConstraintWrenches(model)
     state = arm("two_link").structure.manifold.project(model.dae.nominal_state)
     seen = {}
@@ -211,8 +203,8 @@ def test_force_and_moment_of_a_weld_are_drawn():
 
 
 def test_live_view_draws_while_it_runs():
-    meshcat = start_meshcat()
-    loop, context = build_scenario(scenario("two_link_wall"), meshcat)
+    meshcat = dd.start_meshcat()
+    loop, context = dd.build_scenario(scenario("two_link_wall"), meshcat)
     simulator = Simulator(loop.diagram, context)
     simulator.AdvanceTo(1.25)
     page = meshcat.StaticHtml()
@@ -243,7 +235,7 @@ def test_live_view_draws_while_it_runs():
 
 
 def test_only_this_machine_reaches_meshcat():
-    meshcat = start_meshcat()
+    meshcat = dd.start_meshcat()
     url = urlparse(meshcat.web_url())
     assert url.hostname == "localhost"
     with socket.create_connection(("localhost", url.port), timeout=5):

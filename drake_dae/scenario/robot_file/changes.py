@@ -15,6 +15,7 @@ from pydrake.multibody.tree import (
     JacobianWrtVariable,
     Joint,
     JointActuator,
+    JointIndex,
     PrismaticJoint,
     RevoluteJoint,
     RpyFloatingJoint,
@@ -40,8 +41,8 @@ from drake_dae.scenario.form import at
 from drake_dae.scenario.robot_file.mjcf import ARMATURE
 from drake_dae.scenario.robot_file.robot import Payload, Robot, RobotPlacement
 
-_Leader = tuple[str, float, float]
-"""The name of a joint that another one follows, the ratio, and the offset, rad or m."""
+_Leader = tuple[Joint, float, float]
+"""The joint that another one follows, the ratio, and the offset, rad or m."""
 
 
 def joints_of(plant: MultibodyPlant) -> list[Joint]:
@@ -54,6 +55,16 @@ def actuators_of(plant: MultibodyPlant) -> list[JointActuator]:
     return [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
 
 
+def noted(plant: MultibodyPlant, values: Mapping[tuple[str, str], Any]) -> dict[JointIndex, Any]:
+    """What a file says of joints, (model, joint) -> value, by the joints of the plant."""
+    found = {}
+    for joint in joints_of(plant):
+        for model in ("", plant.GetModelInstanceName(joint.model_instance())):
+            if (model, joint.name()) in values:
+                found[joint.index()] = values[model, joint.name()]
+    return found
+
+
 def change_robot(
     robot: Robot, plant: MultibodyPlant, known: Mapping[str, Mapping[tuple[str, str], Any]]
 ) -> None:
@@ -61,32 +72,24 @@ def change_robot(
 
     `known` is what the file says of joints, `Mender.joints`.
     """
-    of_joints = {
-        what: {
-            name: values[model, joint.name()]
-            for name, joint in joint_names(plant).items()
-            for model in ("", plant.GetModelInstanceName(joint.model_instance()))
-            if (model, joint.name()) in values
-        }
-        for what, values in known.items()
-    }
-    leaders = _leaders(plant, of_joints.get("follows", {}))
+    leaders = _leaders(plant, noted(plant, known["follows"]))
     if robot.base is not None:
         _weld_base(robot.base, plant)
-    if locked := of_joints.get("stands", {}) | robot.locked:
-        _lock_joints(locked, plant, leaders)
+    locked = _lock_joints(robot.locked, plant, leaders)
+    for follower, (leader, ratio, offset) in leaders.items():
+        if follower not in locked:
+            plant.AddCouplerConstraint(plant.get_joint(follower), leader, ratio, offset)
     _add_free_joints(robot.free, plant)
-    armatures = of_joints.get("armature", {})
+    efforts, armatures = (noted(plant, known[what]) for what in ("effort", "armature"))
     if robot.actuators is not None:
-        _drive_joints(robot.actuators, plant, leaders, of_joints.get("effort", {}), armatures)
+        _drive_joints(robot.actuators, plant, leaders, efforts, armatures)
     add_payloads("robot.payloads", robot.payloads, plant)
     driven = {actuator.joint().index() for actuator in actuators_of(plant)}
-    movable = _movable(plant)  # Without those that are locked.
-    for name, armature in armatures.items() if ARMATURE not in robot.leave_out else ():
-        if name in movable and movable[name].index() not in driven:
+    for name, joint in _movable(plant).items() if ARMATURE not in robot.leave_out else ():
+        if joint.index() in armatures and joint.index() not in driven:
             raise ModelError(
-                f"joint '{name}' has an armature of {armature:g} and no motor, and Drake gives "
-                "only motors one; name it under robot.actuators, or write leave_out: "
+                f"joint '{name}' has an armature of {armatures[joint.index()]:g} and no motor, and "
+                "Drake gives only motors one; name it under robot.actuators, or write leave_out: "
                 "[joint/armature] under robot"
             )
 
@@ -142,42 +145,44 @@ def _unattached(name: str, plant: MultibodyPlant) -> Frame:
 
 @at("robot.locked")
 def _lock_joints(
-    locked: Mapping[str, float], plant: MultibodyPlant, leaders: Mapping[str, _Leader]
-) -> None:
+    locked: Mapping[str, float], plant: MultibodyPlant, leaders: Mapping[JointIndex, _Leader]
+) -> Container[JointIndex]:
     """Replaces joints, and those that follow them, by welds with their constant X_FM(q).
 
     Drake supports locked joints only in discrete time. Actuator, damping and rotor go.
     """
-    joints, positions = _movable(plant), dict(locked)
+    movable = _movable(plant)
+    joints = {joint.index(): (name, joint) for name, joint in movable.items()}
+    positions = {index: offset for index, (_, ratio, offset) in leaders.items() if ratio == 0.0}
+    positions |= {_named(name, movable).index(): value for name, value in locked.items()}
     for _ in leaders:  # As often as the longest chain needs.
         for follower, (leader, ratio, offset) in leaders.items():
-            if leader in positions:
-                coupled = ratio * positions[leader] + offset
+            if leader.index() in positions and ratio != 0.0:
+                coupled = ratio * positions[leader.index()] + offset
                 if abs(positions.setdefault(follower, coupled) - coupled) > 1e-9:
-                    text = f"'{follower}' follows '{leader}', which makes it {coupled:g}"
-                    raise ModelError(f"{text}, and not {positions[follower]:g}; lock one of them")
+                    raise ModelError(
+                        f"'{joints[follower][0]}' follows '{leader.name()}', which makes it "
+                        f"{coupled:g}, and not {positions[follower]:g}; lock one of them"
+                    )
             elif follower in positions and ratio != 0.0:
-                positions[leader] = (positions[follower] - offset) / ratio
-    for name, value in positions.items():
-        joint = _named(name, joints)
+                positions[leader.index()] = (positions[follower] - offset) / ratio
+    if positions and plant.num_constraints() > 0:
+        raise ModelError(
+            "the file has constraints other than mimic joints, with which Drake locks no joint; "
+            "name them under robot.leave_out, and write them under constraints"
+        )
+    for index, value in positions.items():
+        name, joint = joints[index]
         low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        slides = isinstance(joint, PrismaticJoint)
         if not low - 1e-9 <= value <= high + 1e-9:  # Round-off of a ratio puts nothing outside.
-            unit = "m" if isinstance(joint, PrismaticJoint) else "rad"
+            unit = "m" if slides else "rad"
             why = "" if name in locked else ", as the joint that it is coupled to has it,"
             raise ModelError(
                 f"{name} = {value:g} {unit}{why} is outside its limits, {low:g} to {high:g} {unit}"
             )
-    if plant.num_constraints() > len(leaders):
-        raise ModelError(
-            "the file has constraints other than mimic joints, which Drake loses when a joint is "
-            "locked; name them under robot.leave_out, and write them under constraints"
-        )
-    for key in plant.GetConstraintIds():  # Drake removes no joint from a plant that has one.
-        plant.RemoveConstraint(key)
-    for name, value in positions.items():
-        joint = joints[name]
         own_name, inboard, outboard = joint.name(), joint.frame_on_parent(), joint.frame_on_child()
-        if isinstance(joint, PrismaticJoint):
+        if slides:
             pose = RigidTransform(value * joint.translation_axis())
         else:
             pose = RigidTransform(AngleAxis(value, joint.revolute_axis()), np.zeros(3))
@@ -189,19 +194,16 @@ def _lock_joints(
         except RuntimeError as error:
             raise ModelError(f"'{name}' cannot be locked: {error}") from None
         plant.AddJoint(WeldJoint(own_name, inboard, outboard, pose))
-    joints = _movable(plant)
-    for follower, (leader, ratio, offset) in leaders.items():
-        if follower in joints:
-            plant.AddCouplerConstraint(joints[follower], joints[leader], ratio, offset)
+    return positions
 
 
 @at("robot.actuators")
 def _drive_joints(
     driven: str | Sequence[str] | Mapping[str, float | None],
     plant: MultibodyPlant,
-    followers: Container[str],
-    efforts: Mapping[str, float],
-    armatures: Mapping[str, float],
+    followers: Container[JointIndex],
+    efforts: Mapping[JointIndex, float],
+    armatures: Mapping[JointIndex, float],
 ) -> None:
     """Adds actuators to the joints that a scenario names, and removes those of all other joints.
 
@@ -209,7 +211,7 @@ def _drive_joints(
     """
     joints = _movable(plant)
     if driven == "all":
-        driven = [name for name in joints if name not in followers]
+        driven = [name for name, joint in joints.items() if joint.index() not in followers]
     limits = driven if isinstance(driven, Mapping) else dict.fromkeys(driven)
     names, with_actuator = {_named(name, joints).index(): name for name in limits}, set()
     for actuator in actuators_of(plant):
@@ -222,9 +224,10 @@ def _drive_joints(
             actuator.set_effort_limit(limit)
     for name, limit in limits.items():
         if name not in with_actuator:
-            effort = efforts.get(name, np.inf) if limit is None else limit
-            actuator = plant.AddJointActuator(joints[name].name(), joints[name], effort)
-            actuator.set_default_rotor_inertia(armatures.get(name, 0.0))
+            joint = joints[name]
+            effort = efforts.get(joint.index(), np.inf) if limit is None else limit
+            actuator = plant.AddJointActuator(joint.name(), joint, effort)
+            actuator.set_default_rotor_inertia(armatures.get(joint.index(), 0.0))
 
 
 def _named(name: str, joints: Mapping[str, Joint]) -> Joint:
@@ -242,13 +245,17 @@ def _is_simple(joint: Joint) -> bool:
     return isinstance(joint, RevoluteJoint | PrismaticJoint)
 
 
-def _leaders(plant: MultibodyPlant, follows: Mapping[str, _Leader]) -> dict[str, _Leader]:
-    """Follower -> its leader, ratio and offset, by the names of joints in the plant."""
-    joints, leaders = joint_names(plant), dict[str, _Leader]()
-    names = {(int(j.model_instance()), j.name()): name for name, j in joints.items()}
-    for name, (leader, ratio, offset) in follows.items():
-        if leading := names.get((int(joints[name].model_instance()), leader)):
-            leaders[name] = leading, ratio, offset
+def _leaders(
+    plant: MultibodyPlant, follows: Mapping[JointIndex, tuple[str, float, float]]
+) -> dict[JointIndex, _Leader]:
+    """Joint that follows -> its leader, ratio and offset; a leader is of the same model."""
+    leaders = dict[JointIndex, _Leader]()
+    for index, (name, ratio, offset) in follows.items():
+        joint = plant.get_joint(index)
+        if name == joint.name() or not plant.HasJointNamed(name, joint.model_instance()):
+            text = f"joint '{joint.name()}' mimics '{name}', which is no other joint of its file"
+            raise ModelError(text)
+        leaders[index] = plant.GetJointByName(name, joint.model_instance()), ratio, offset
     return leaders
 
 
@@ -269,7 +276,7 @@ def cut_loops(plant: MultibodyPlant, parents: Mapping[tuple[str, str], str]) -> 
     """
     driven = {actuator.joint().index(): actuator for actuator in actuators_of(plant)}
     names = {joint.index(): name for name, joint in joint_names(plant).items()}
-    groups, cuts = list(range(plant.num_bodies())), []
+    named, groups, cuts = noted(plant, parents), list(range(plant.num_bodies())), []
     for joint in sorted(
         joints_of(plant),
         key=lambda joint: (not _is_simple(joint), joint.index() in driven),
@@ -280,28 +287,22 @@ def cut_loops(plant: MultibodyPlant, parents: Mapping[tuple[str, str], str]) -> 
         )
         if first == second:
             name = names.get(joint.index(), joint.name())
-            _check_parent(joint, name, plant, parents)
+            _check_parent(joint, name, plant, named.get(joint.index(), ""))
             cuts.append(_cut(joint, name, driven.get(joint.index()), plant))
         groups = [second if group == first else group for group in groups]
     return cuts
 
 
-def _check_parent(
-    joint: Joint, name: str, plant: MultibodyPlant, parents: Mapping[tuple[str, str], str]
-) -> None:
+def _check_parent(joint: Joint, name: str, plant: MultibodyPlant, named: str) -> None:
     """Refuses a loop that is open where its file means it to be closed.
 
     A joint of SDFormat is at its child; of a frame that is its parent, only the body counts.
     """
-    model = plant.GetModelInstanceName(joint.model_instance())
-    named = parents.get(("", joint.name()), parents.get((model, joint.name()), ""))
     if not named or not plant.HasFrameNamed(named, joint.model_instance()):
         return
     frame = plant.GetFrameByName(named, joint.model_instance())
-    places = [
-        one.GetFixedPoseInBodyFrame().translation() for one in (frame, joint.frame_on_parent())
-    ]
-    gap = float(np.linalg.norm(places[0] - places[1]))
+    meant, found = (one.GetFixedPoseInBodyFrame() for one in (frame, joint.frame_on_parent()))
+    gap = float(np.linalg.norm(meant.translation() - found.translation()))
     if frame.name() != frame.body().name() and gap > 1e-6:
         raise ModelError(
             f"joint '{name}' closes a loop at its child, {gap:.3g} m from the frame '{named}' that "
@@ -368,12 +369,12 @@ def loop_constraint(cut: CutJoint, plant: MultibodyPlant) -> Constraint:
         plant.world_frame(),
     )
     turning = [column[:3] for column in rates.T if np.linalg.norm(column[:3]) > 1e-9]
-    turning += [] if cut.slides else [rotation @ cut.axis]
-    sliding = [*rates[3:].T, *([rotation @ cut.axis] if cut.slides else [])]
+    sliding = [*rates[3:].T]
+    (sliding if cut.slides else turning).append(rotation @ cut.axis)
     normal = turning[-1] if turning else None
-    if normal is not None and any(
-        np.linalg.norm(np.cross(normal, axis)) > 1e-9 for axis in turning
-    ) | any(abs(normal @ axis) > 1e-9 for axis in sliding):
+    leans = [] if normal is None else [np.linalg.norm(np.cross(normal, axis)) for axis in turning]
+    leans += [] if normal is None else [abs(normal @ axis) for axis in sliding]
+    if any(lean > 1e-9 for lean in leans):
         normal = None
     if cut.slides and normal is not None:
         across = rotation.inverse() @ normal

@@ -5,10 +5,10 @@ read. What changed on the way is collected, and so is what is lost.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -21,20 +21,9 @@ from drake_dae.scenario.robot_file import mjcf
 from drake_dae.scenario.robot_file.files import RobotFiles, drawable
 from drake_dae.scenario.robot_file.read_by_drake import DRIVES, READ_BY_DRAKE, take_lost
 from drake_dae.scenario.robot_file.robot import Robot
-from drake_dae.scenario.robot_file.xml_tree import write_xml
-
-
-class Floating(NamedTuple):
-    """A floating joint that a copy lacks; its origin on the parent is a frame of the copy."""
-
-    model: str
-    name: str
-    child: str
-    origin: str
-
+from drake_dae.scenario.robot_file.xml_tree import check_included, read_xml, write_xml
 
 _ROUND = {"radius": 1, "length": 1}
-
 _SIZES = {"box": {"size": 3}, "sphere": {"radius": 1}, "cylinder": _ROUND, "capsule": _ROUND}
 _SIZES |= {"ellipsoid": {}, "mesh": {}}
 """Shape -> how many numbers its sizes have, in URDF and SDFormat."""
@@ -63,10 +52,11 @@ class Mender:
         self.told: dict[tuple[type[Warning], str], list[str]] = defaultdict(list)
         self.lost: dict[str, list[str]] = defaultdict(list)
         self.originals: dict[Path, Path] = {}  # Copy -> its file.
-        # "effort" limit, "armature", "follows" (leader, ratio, offset), position at which it
-        # "stands", "parent" of SDFormat -> (model, joint) -> value.
+        # "effort" limit, "armature", "follows" (leader, ratio, offset), "parent" of SDFormat ->
+        # (model, joint) -> value.
         self.joints: dict[str, dict[tuple[str, str], Any]] = defaultdict(dict)
-        self.floating: list[Floating] = []
+        # Joints that the copies lack: model, name, child, and the frame that is their origin.
+        self.floating: list[tuple[str, str, str, str]] = []
         self.crossed: set[tuple[str, str]] = set()  # (model, link) without a visual shape.
 
     def copy(
@@ -84,7 +74,8 @@ class Mender:
         kind = file.suffix
         if kind not in READ_BY_DRAKE:
             return file
-        root = mjcf.read_included(file, within)
+        check_included(file, within)
+        root = read_xml(file)
         if kind == ".xml":
             for servo in mjcf.expand(root, file):
                 text = "servos become motors without their gains: controls are efforts"
@@ -106,25 +97,23 @@ class Mender:
                 if "," in value and number_in(value.replace(",", ".", 1)) is not None:
                     raise ModelError(f"{place(node)}: '{value}': numbers have a point, no comma")
         # Only the armature of joints without motor is lost.
-        for part, value, node, is_told in take_lost(
-            root, kind, {*self.leave_out} - {mjcf.ARMATURE}
-        ):
-            if is_told:
-                self.tell("Drake does not read, and leaves out", f"{place(node)}: {part} {value}")
-            elif self.drives or not part.startswith(DRIVES):
-                self.lost[part].append(place(node))
+        for one in take_lost(root, kind, {*self.leave_out} - {mjcf.ARMATURE}):
+            where = place(one.owner)
+            if one.is_told:
+                self.tell("Drake does not read, and leaves out", f"{where}: {one.part} {one.value}")
+            else:
+                self.lose(one.part, where)
         for inertial in root.iter("inertial"):
-            if text := mend_inertia(inertial, kind, place(inertial)):
-                if "inertia" not in self.leave_out:
-                    self.lost["inertia"].append(text)
+            if text := _mend_inertia(inertial, kind, place(inertial)):
+                self.lose("inertia", text)
                 self.tell("moments of inertia of no body become possible ones", text)
         for joint in root.iter("joint"):
             self._mend_limits(joint, place(joint))
-            if kind == ".sdf":
-                self._mend_axes(joint, place(joint))
         if kind == ".urdf":
             self._mend_urdf(root, file, model, placed)
         elif kind == ".sdf":
+            for joint in root.iter("joint"):
+                self._mend_axes(joint, place(joint))
             self._mend_sdf(root, file, model, placed, (*within, file.resolve()))
         else:
             self._mend_mjcf(root, file, model, placed)
@@ -139,43 +128,43 @@ class Mender:
     def tell(self, kind: str, item: str, category: type[Warning] = RobotFileWarning) -> None:
         self.told[category, kind].append(item)
 
-    def _mend_axes(self, joint: Element, place: str) -> None:
-        """Writes axes of SDFormat as Drake has them: one damping, no motor, m for each turn."""
-        kind, pitch = joint.get("type"), joint.find("thread_pitch")
-        if kind == "screw" and pitch is not None:
-            joint.remove(pitch)  # Its unit is rad/m, and it turns left.
-            number = number_in(pitch.text or "")
-            if number == 0.0:
-                raise ModelError(f"{place}: with thread_pitch 0 it is no screw; mend the file")
-            if number is not None and joint.find("screw_thread_pitch") is None:
-                SubElement(joint, "screw_thread_pitch").text = repr(-2.0 * np.pi / number)
-        if kind not in _OF_MANY_AXES:
-            return
-        axes = [axis for axis in joint if axis.tag in ("axis", "axis2")]
-        dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
-        if len({*map(number_in, dampings)}) > 1:
-            if "axis2/damping" not in self.leave_out:
-                self.lost["axis2/damping"].append(f"{place}: {' and '.join(dampings)}")
-            for axis in axes[1:]:
-                _child(_child(axis, "dynamics"), "damping").text = dampings[0]
-        for axis in axes:
-            _child(_child(axis, "limit"), "effort").text = "0"
+    def lose(self, part: str, item: str) -> None:
+        if part not in self.leave_out and (self.drives or not part.startswith(DRIVES)):
+            self.lost[part].append(item)
 
     def _mend_limits(self, joint: Element, place: str) -> None:
         """Removes limits that Drake refuses, and those of joints that have none."""
         is_continuous = joint.get("type") == "continuous"
-        for owner in (joint, *(joint.find(way) for way in ("limit", "axis/limit", "axis2/limit"))):
-            if owner is None:
-                continue
+        for owner in (joint, *joint.iterfind("limit"), *joint.iterfind("*/limit")):
             sides = [owner.get(side) or owner.findtext(side) or "" for side in ("lower", "upper")]
             bounds = [number_in(word) for word in owner.get("range", "").split() or sides]
             low, high = bounds if len(bounds) == 2 else (None, None)
             is_reversed = low is not None and high is not None and low > high
-            if is_reversed and not is_continuous and "empty_limits" not in self.leave_out:
-                self.lost["empty_limits"].append(f"{place}: limits from {low:g} to {high:g}")
+            if is_reversed and not is_continuous:
+                self.lose("empty_limits", f"{place}: limits from {low:g} to {high:g}")
             for key in ("range", "lower", "upper") if is_reversed or is_continuous else ():
                 owner.attrib.pop(key, None)
                 _remove(owner, key)
+
+    def _follow(self, model: str, joint: Element, tag: str) -> None:
+        """Takes out what a joint follows, unless Drake reports what is wrong."""
+        name = joint.get("name", "")
+        for mimic in [part for part in joint if part.tag == tag]:
+            ratio = number_in(mimic.get("multiplier", "1"))
+            offset = number_in(mimic.get("offset", "0"))
+            if joint.get("type") in _OF_MANY_AXES:
+                self.lose(f"joint/{tag}", f"joint '{name}'")
+            elif ratio is not None and offset is not None and "joint" in mimic.attrib:
+                joint.remove(mimic)
+                self.joints["follows"][model, name] = (mimic.get("joint"), ratio, offset)
+                if ratio == 0.0:
+                    self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
+
+    # Geometry.
+
+    def _leave_out(self, why: str, item: str) -> None:
+        text = f"geometry that {why} is left out; no equation needs it"
+        self.tell(text, item, GeometryWarning)
 
     def _mesh(self, name: str, path: Path | None, collides: bool, kinds: tuple[str, ...]) -> str:
         """The file of a mesh as Drake reads it, of some kinds if any; "" if it is left out."""
@@ -199,18 +188,11 @@ class Mender:
             self._leave_out(why, f"'{name if path is None else Path(name).name}'")
         return "" if why else str(drawn)
 
-    def _leave_out(self, why: str, item: str) -> None:
-        text = f"geometry that {why} is left out; no equation needs it"
-        self.tell(text, item, GeometryWarning)
-
     def _mend_shapes(self, link: Element, file: Path, model: str) -> None:
         """Leaves out what of a link's geometry Drake cannot take, in URDF and SDFormat."""
-        name = link.get("name", "")
+        name, kinds = link.get("name", ""), (".obj", ".gltf") if self.drawn else ()
         for shape in [*link.iterfind("visual"), *link.iterfind("collision")]:
             is_visual = shape.tag == "visual"
-            if not self.has_geometry:
-                link.remove(shape)
-                continue
             faults = (_fault(form, file.suffix) for form in shape.iterfind("geometry/*"))
             if fault := next(filter(None, faults), ""):
                 self._leave_out(fault, f"of '{name}'")
@@ -218,41 +200,26 @@ class Mender:
                 continue
             for mesh in shape.iterfind("geometry/mesh"):
                 uri = mesh.find("uri")
-                owner, is_text = (mesh, False) if uri is None else (uri, True)
-                text = (owner.text or "").strip() if is_text else mesh.get("filename", "")
-                kinds = (".obj", ".gltf") if is_visual and self.drawn else ()
-                path = self._mesh(text, self.files.find(text, file), not is_visual, kinds)
-                if is_text:
-                    owner.text = path
+                text = mesh.get("filename", "") if uri is None else (uri.text or "").strip()
+                found = self.files.find(text, file)
+                path = self._mesh(text, found, not is_visual, kinds if is_visual else ())
+                if uri is None:
+                    mesh.set("filename", path)
                 else:
-                    owner.set("filename", path)
+                    uri.text = path
                 if not path:
                     link.remove(shape)
                     self.crossed |= {(model, name)} if is_visual else set()
             for material in shape.iterfind("material"):
-                for tag in ("texture", "drake:diffuse_map"):
-                    if _remove(material, tag):
-                        self.tell("textures are left out", f"of '{name}'", GeometryWarning)
+                if _remove(material, "texture") + _remove(material, "drake:diffuse_map"):
+                    self.tell("textures are left out", f"of '{name}'", GeometryWarning)
 
-    def _follow(self, model: str, joint: Element, tag: str) -> None:
-        """Notes whether a joint follows another one, unless Drake reports what is wrong."""
-        name = joint.get("name", "")
-        for mimic in [part for part in joint if part.tag == tag]:
-            ratio = number_in(mimic.get("multiplier", "1"))
-            offset = number_in(mimic.get("offset", "0"))
-            if joint.get("type") in _OF_MANY_AXES:
-                self.lost[f"joint/{tag}"].append(f"joint '{name}'")
-            elif ratio == 0.0 and offset is not None:
-                self.tell("joints that follow others with multiplier 0 stand", f"'{name}'")
-                self.joints["stands"][model, name] = offset
-                joint.remove(mimic)
-            elif ratio is not None and offset is not None:
-                self.joints["follows"][model, name] = (mimic.get("joint", ""), ratio, offset)
+    # URDF.
 
     def _mend_urdf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
         root.attrib.setdefault("name", file.stem)
         _remove(root, "mujoco")
-        for link in root.iterfind("link"):
+        for link in root.iterfind("link") if self.has_geometry else ():
             self._mend_shapes(link, file, model)
         # Drake refuses names of several colours, of none, or of one that is defined later.
         colours: dict[Any, list[Element]] = {}
@@ -264,8 +231,7 @@ class Mender:
                 material[:] = colours.get(material.get("name") or material, [])
                 if not len(material):
                     owner.remove(material)
-        moving: set[str | None] = set()
-        still: set[str | None] = set()  # Joints that Drake drives not.
+        moving, still = set[str | None](), set[str | None]()  # Still are those without a motor.
         for joint in (*root.findall("joint"), *root.findall("drake:joint")):
             name, kind = joint.get("name", ""), joint.get("type")
             ends = joint.find("parent"), joint.find("child")
@@ -274,29 +240,28 @@ class Mender:
                 _remove(joint, "mimic")
             else:
                 moving.add(name)
-            if parent == "world" and child in placed and kind in ("fixed", "floating"):
+            if kind == "floating" or (kind == "fixed" and parent == "world" and child in placed):
                 root.remove(joint)
-            elif kind == "floating":
-                root.remove(joint)
+            if kind == "floating" and not (parent == "world" and child in placed):
                 origin = joint.find("origin")
                 own = {"name": f"{name}_origin", "link": parent, "xyz": "0 0 0", "rpy": "0 0 0"}
                 SubElement(root, "frame", own | ({} if origin is None else origin.attrib))
-                self.floating.append(Floating(model, name, child, own["name"]))
+                self.floating.append((model, name, child, own["name"]))
             self._follow(model, joint, "mimic")
             still |= {name} if kind in _OF_MANY_AXES else set()
-            for limit in joint.iterfind("limit"):
+            for limit in joint.iterfind("limit[@effort]"):
                 effort = number_in(limit.get("effort", "")) or 0.0
                 if effort > 0.0:
                     self.joints["effort"][model, name] = effort
-                elif "effort" in limit.attrib:  # Many authors write 0 for an unknown limit.
+                else:  # Many authors write 0 for an unknown limit.
                     still.add(name)
         count = Counter[str]()
         for transmission in root.findall("transmission"):
             driven = {joint.get("name") for joint in transmission.iterfind("joint")}
             has_type = "type" in transmission.attrib or transmission.find("type") is not None
-            if driven & still and self.drives:
+            for one in driven & still:
                 why = "its effort is 0, or it has more than one axis"
-                self.lost["transmission/joint"] += [f"joint '{one}': {why}" for one in driven]
+                self.lose("transmission/joint", f"joint '{one}': {why}")
             if not has_type or not driven & moving or driven & still:
                 root.remove(transmission)
                 continue
@@ -304,6 +269,23 @@ class Mender:
                 name = actuator.get("name", "")
                 count[name] += 1
                 actuator.set("name", f"{name}_{count[name]}" if count[name] > 1 else name)
+
+    # SDFormat.
+
+    def _mend_axes(self, joint: Element, place: str) -> None:
+        """Refuses two dampings, of which Drake reads one; writes the pitch of a screw in m."""
+        axes = (part for part in joint if part.tag in ("axis", "axis2"))
+        dampings = [axis.findtext("dynamics/damping", "0") for axis in axes]
+        if len({*map(number_in, dampings)}) > 1:
+            self.lose("axis2/damping", f"{place}: {' and '.join(dampings)}")
+        pitch = joint.find("thread_pitch")
+        if pitch is not None:  # In rad/m, of a thread that turns left.
+            joint.remove(pitch)
+            number = number_in(pitch.text or "")
+            if number == 0.0:
+                raise ModelError(f"{place}: with thread_pitch 0 it is no screw; mend the file")
+            if number is not None and joint.find("screw_thread_pitch") is None:
+                SubElement(joint, "screw_thread_pitch").text = repr(-2.0 * np.pi / number)
 
     def _mend_sdf(
         self,
@@ -321,7 +303,7 @@ class Mender:
                 uri.text = self.copy(path, model, (), within).resolve().as_uri()
         for number, body in enumerate(root.iter("model")):
             body.attrib.setdefault("name", file.stem + f"_{number}" * bool(number))
-            for link in body.iterfind("link"):
+            for link in body.iterfind("link") if self.has_geometry else ():
                 self._mend_shapes(link, file, model)
             for joint in body.findall("joint"):
                 parent, child = (joint.findtext(end, "").strip() for end in ("parent", "child"))
@@ -330,7 +312,31 @@ class Mender:
                 self.joints["parent"][model, joint.get("name", "")] = parent
                 self._follow(model, joint, "drake:mimic")
 
+    # MJCF, which says all where it means it.
+
     def _mend_mjcf(self, root: Element, file: Path, model: str, placed: Collection[str]) -> None:
+        self._mend_geoms(root, file, model)
+        if not self.has_geometry:
+            _remove(root, "contact")
+        kinds = {one.get("name", ""): one.get("type", "hinge") for one in root.iter("joint")}
+        kinds |= {one.get("name", ""): "free" for one in root.iter("freejoint")}
+        for owner in root.iterfind("actuator"):
+            for motor in owner.findall("motor"):
+                if (kind := kinds.get(motor.get("joint", ""))) in _OF_MANY_AXES:
+                    owner.remove(motor)
+                    name = motor.get("name", motor.get("joint"))
+                    self.lose(f"{kind}/motor", f"{file.name}: motor '{name}'")
+        for joint in root.iter("joint"):
+            name, armature = joint.get("name", ""), number_in(joint.get("armature", ""))
+            if armature and name and joint.get("type", "hinge") in ("hinge", "slide"):
+                self.joints["armature"][model, name] = armature
+            elif armature:
+                self.lose(mjcf.ARMATURE, f"{file.name}: of a joint that no motor can drive")
+        for name, free in mjcf.floating_bodies(root, placed):
+            self.floating.append((model, free, name, "world"))
+
+    def _mend_geoms(self, root: Element, file: Path, model: str) -> None:
+        """Leaves out what of the geometry Drake cannot take, unless a body has its mass from it."""
         options = mjcf.compiler(root)
         folder = file.resolve().parent / options.get("meshdir", options.get("assetdir", ""))
         meshes, used, shells = dict[str, Element](), dict[str, str](), set[str]()
@@ -338,38 +344,29 @@ class Mender:
             if "file" in asset.attrib:
                 asset.attrib.setdefault("name", Path(asset.get("file", "")).stem)
                 meshes[asset.get("name", "")] = asset
-            is_shell = asset.attrib.pop("inertia", "") == "shell"
-            shells |= {asset.get("name", "")} if is_shell else set()
-        shapes = [
-            (geom, body, moves)
-            for world in root.iterfind("worldbody")
-            for body, moves in mjcf.bodies(world)
-            for geom in body.findall("geom")
-        ]
-        colliding = {geom.get("mesh") for geom, _, _ in shapes if mjcf.collides(geom)}
-        for geom, body, moves in shapes:
-            name, mesh = body.get("name", ""), geom.get("mesh", "")
+            if asset.attrib.pop("inertia", "") == "shell":
+                shells.add(asset.get("name", ""))
+        colliding = {geom.get("mesh") for geom in root.iter("geom") if mjcf.collides(geom)}
+        for geom, body, moves in mjcf.geoms(root):
+            name, mesh, fault = body.get("name", ""), geom.get("mesh", ""), mjcf.fault(geom)
             weighs = moves and number_in(geom.get("mass", "1")) != 0.0
             weighs &= mjcf.weighs_by_geometry(root) or body.find("inertial") is None
             is_seen = self.has_geometry and (self.drawn or mjcf.collides(geom))
-            fault = mjcf.fault(geom)
             if mesh in meshes and mesh not in used and (weighs or is_seen):
                 own = meshes[mesh].get("file", "")
                 is_hull = self.has_geometry and mesh in colliding
                 used[mesh] = self._mesh(own, folder / own, is_hull, (".obj",))
                 meshes[mesh].set("file", used[mesh])
             is_refused = mesh in used and not used[mesh]
-            if weighs and fault and (fault == mjcf.UNREAD or "mass" in geom.attrib):
-                raise ModelError(
-                    f"body '{name}' has its mass from geometry that {fault}; give the body an "
-                    "<inertial>"
+            why = "" if fault == mjcf.EMPTY and "mass" not in geom.attrib else fault
+            if is_refused or mesh in shells:
+                why = (
+                    f"is the mesh '{mesh}', which Drake cannot read, or not as a shell (trimesh "
+                    "reads more: pip install 'drake_dae[meshes]')"
                 )
-            if weighs and (is_refused or mesh in shells):
-                raise ModelError(
-                    f"body '{name}' has its mass from the mesh '{mesh}', which Drake cannot read, "
-                    "or not as a shell; give the body an <inertial>, or the mesh as .obj, or let "
-                    "trimesh read it, by pip install 'drake_dae[meshes]'"
-                )
+            if weighs and why:
+                text = f"body '{name}' has its mass from geometry that {why}"
+                raise ModelError(f"{text}; give the body an <inertial>")
             if is_seen and is_refused:
                 self.crossed.add((model, name))
             elif is_seen and fault:
@@ -380,27 +377,6 @@ class Mender:
             for asset in owner.findall("mesh"):
                 if "file" in asset.attrib and not used.get(asset.get("name", "")):
                     owner.remove(asset)
-        if not self.has_geometry:
-            _remove(root, "contact")
-        many = {one.get("name"): one.get("type", "") for one in root.iter("joint")}
-        many |= {one.get("name"): "free" for one in root.iter("freejoint")}
-        for owner in root.iterfind("actuator"):
-            for motor in owner.findall("motor"):
-                type_of_joint = many.get(motor.get("joint"), "")
-                if "joint" in motor.attrib and type_of_joint not in _OF_MANY_AXES:
-                    continue
-                owner.remove(motor)
-                part = f"{type_of_joint}/motor"
-                if "joint" in motor.attrib and self.drives and part not in self.leave_out:
-                    name = motor.get("name", motor.get("joint", ""))
-                    self.lost[part].append(f"{file.name}: motor '{name}'")
-        for joint, armature in mjcf.armatures(root):
-            if joint:
-                self.joints["armature"][model, joint] = armature
-            elif mjcf.ARMATURE not in self.leave_out:
-                self.lost[mjcf.ARMATURE].append(f"{file.name}: of a joint that no motor can drive")
-        for name, joint in mjcf.floating_bodies(root, placed):
-            self.floating.append(Floating(model, joint, name, "world"))
 
 
 def _fault(form: Element, kind: str) -> str:
@@ -429,12 +405,6 @@ def _has_hull(mesh: str, changed: int) -> bool:
     return True
 
 
-def _child(owner: Element, tag: str) -> Element:
-    """The first child of a tag, which is made if there is none."""
-    found = owner.find(tag)
-    return SubElement(owner, tag) if found is None else found
-
-
 def _remove(owner: Element, tag: str) -> int:
     """Removes the children of a tag; returns how many there were."""
     children = [child for child in owner if child.tag == tag]
@@ -461,9 +431,9 @@ def nearest_inertia(inertia: FloatArray) -> FloatArray:
     return np.asarray((axes * (second.sum() - second)) @ axes.T)
 
 
-def mend_inertia(inertial: Element, kind: str, place: str) -> str:
+def _mend_inertia(inertial: Element, kind: str, place: str) -> str:
     """Replaces an impossible inertia by the nearest possible one; says what it replaced, or ""."""
-    words = list(_mass_and_entries(inertial, kind))
+    words = _mass_and_entries(inertial, kind)
     numbers = [number_in(word) for word in words]
     if None in numbers:
         raise ModelError(f"{place}: mass and inertia are numbers, got {', '.join(words)}")
@@ -504,17 +474,17 @@ def mend_inertia(inertial: Element, kind: str, place: str) -> str:
     return f"{place}: ({was}) kg m^2, nearest possible ({now}), changed by {change:.2g} %"
 
 
-def _mass_and_entries(inertial: Element, kind: str) -> Iterator[str]:
-    """Mass in kg, and xx, yy, zz, xy, xz and yz in kg m^2; fewer if some are missing."""
+def _mass_and_entries(inertial: Element, kind: str) -> list[str]:
+    """Mass in kg, and xx, yy, zz, xy, xz and yz in kg m^2; none if entries are missing."""
     matrix = inertial.find("inertia")
     if kind == ".xml":
         entries = inertial.get("fullinertia", inertial.get("diaginertia", "")).split()
-        yield from [inertial.get("mass", "0"), *entries, *["0"] * 3][: 7 if entries[2:] else 0]
-    elif kind == ".urdf" and matrix is not None:
+        return [inertial.get("mass", "0"), *entries, *["0"] * 3][: 7 if entries[2:] else 0]
+    if matrix is None:
+        return []
+    if kind == ".urdf":
         mass = inertial.find("mass")
-        yield "0" if mass is None else mass.get("value", "0")
-        yield from (matrix.get(key, "0") for key in _ENTRIES)
-    elif matrix is not None:  # The defaults of SDFormat are those of the unit matrix.
-        yield inertial.findtext("mass", "1")
-        for key, default in zip(_ENTRIES, "111000", strict=True):
-            yield matrix.findtext(key, default)
+        weight = "0" if mass is None else mass.get("value", "0")
+        return [weight, *(matrix.get(key, "0") for key in _ENTRIES)]
+    own = zip(_ENTRIES, "111000", strict=True)  # The defaults of SDFormat are a unit matrix.
+    return [inertial.findtext("mass", "1"), *(matrix.findtext(key, zero) for key, zero in own)]

@@ -7,7 +7,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 from drake_dae.arrays import number_in
 from drake_dae.errors import ModelError
-from drake_dae.scenario.robot_file.xml_tree import Node, read_xml
+from drake_dae.scenario.robot_file.xml_tree import check_included, read_xml
 
 ARMATURE = "joint/armature"
 """Rotor inertia. Drake gives it to motors only."""
@@ -35,14 +35,6 @@ _LAW = ("dyntype", "gaintype", "biastype")
 
 _OF_GENERAL = {"dyntype", "gaintype", "biastype", "dynprm", "gainprm", "biasprm"}
 """What motors and servos set themselves, whatever is the default."""
-
-
-def read_included(file: Path, within: tuple[Path, ...]) -> Node:
-    """The root of a file that others include, none of which it is."""
-    if file.resolve() in within:
-        names = " -> ".join(path.name for path in (*within, file))
-        raise ModelError(f"'{file.name}' includes itself: {names}")
-    return read_xml(file)
 
 
 def expand(root: Element, file: Path) -> list[str]:
@@ -110,7 +102,8 @@ def _include(owner: Element, main: Path, within: tuple[Path, ...], number: Itera
         if next(number) > _MOST_INCLUDED:
             raise ModelError(f"'{main.name}' includes more than {_MOST_INCLUDED} files")
         file = main.parent / node.get("file", "")
-        included = read_included(file, within)
+        check_included(file, within)
+        included = read_xml(file)
         _include(included, main, (*within, file.resolve()), number)
         for part in included.iter():
             part.line = 0  # type: ignore[attr-defined]
@@ -177,20 +170,18 @@ def fault(geom: Element) -> str:
     return EMPTY if is_empty or (ends and ends[:3] == ends[3:]) else ""
 
 
-def bodies(owner: Element, moves: bool = False) -> Iterator[tuple[Element, bool]]:
-    """The bodies of a world, itself the first, and whether joints can move them."""
-    yield owner, moves
-    for body in owner.iterfind("body"):
-        has_joint = body.find("joint") is not None or body.find("freejoint") is not None
-        yield from bodies(body, moves or has_joint)
+def geoms(root: Element) -> Iterator[tuple[Element, Element, bool]]:
+    """Geometries, their bodies, and whether joints can move these."""
 
+    def below(body: Element, moves: bool) -> Iterator[tuple[Element, Element, bool]]:
+        for geom in body.findall("geom"):
+            yield geom, body, moves
+        for inner in body.iterfind("body"):
+            has_joint = any(part.tag in ("joint", "freejoint") for part in inner)
+            yield from below(inner, moves or has_joint)
 
-def armatures(root: Element) -> Iterator[tuple[str, float]]:
-    """Joint -> its rotor inertia, kg m^2 or kg; "" for joints that no motor can drive."""
-    for joint in root.iter("joint"):
-        if armature := number_in(joint.get("armature", "")):
-            can_be_driven = joint.get("type", "hinge") in ("hinge", "slide")
-            yield joint.get("name", "") if can_be_driven else "", armature
+    for world in root.iterfind("worldbody"):
+        yield from below(world, False)
 
 
 def floating_bodies(root: Element, placed: Collection[str]) -> Iterator[tuple[str, str]]:

@@ -37,6 +37,7 @@ from drake_dae.scenario.robot_file.files import RobotFiles
 from drake_dae.scenario.robot_file.mending import Mender
 from drake_dae.scenario.robot_file.read_by_drake import DRIVES
 from drake_dae.scenario.robot_file.robot import Payload, Robot
+from drake_dae.scenario.robot_file.xml_tree import check_included
 
 RobotLinks = tuple[MultibodyExpressions, list[Constraint]]
 """The links of a robot, and its loop-closing joints as constraints."""
@@ -47,7 +48,8 @@ _REMEDIES = {
     "equality/joint": "constraints has joints that move together as a !JointCoupler",
     "equality/weld": "constraints has it as a !WeldedFrames",
     "equality/connect": "constraints has it as a !CoincidentPoints",
-}
+    "inertia": "it takes the nearest possible moments of inertia",
+} | dict.fromkeys(DRIVES, "or name the driven joints under robot.actuators")
 """What the name of a lost part contains -> what to do besides."""
 
 _RED = [0.8, 0.1, 0.1, 1.0]
@@ -97,11 +99,11 @@ def _check_mass(plant: MultibodyPlant) -> None:
     plant.SetPositions(context, plant.GetPositions(context) + step)
     values, modes = np.linalg.eigh(plant.CalcMassMatrix(context))
     null = modes[:, values <= _MASSLESS * np.max(values, initial=0.0)]
-    massless = {}
-    for name, joint in joint_names(plant).items():
-        velocities = slice(joint.velocity_start(), joint.velocity_start() + joint.num_velocities())
-        if np.any(np.abs(null[velocities]) > 0.1):
-            massless[name] = joint.child_body().name()
+    massless = {
+        name: joint.child_body().name()
+        for name, joint in joint_names(plant).items()
+        if np.any(np.abs(null[joint.velocity_start() :][: joint.num_velocities()]) > 0.1)
+    }
     if massless:
         raise ModelError(
             f"joints that move no mass: {', '.join(massless)}. Links without it, which no force "
@@ -147,15 +149,8 @@ def read_robot(
         for axis in range(3):
             bar = Box(*np.where(np.arange(3) == axis, 0.06, 0.004))
             plant.RegisterVisualGeometry(body, RigidTransform(), bar, f"left_out_{axis}", _RED)
-    unlimited = np.full(1, np.inf)  # Many authors write 0 for an unknown limit.
-    for joint in joints_of(plant):
-        if joint.num_positions() == 1:
-            low, high = joint.position_lower_limits(), joint.position_upper_limits()
-            if "empty_limits" in robot.leave_out and low == high:
-                joint.set_position_limits(-unlimited, unlimited)
-            if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
-                joint.set_velocity_limits(-unlimited, unlimited)
     with drake_errors():
+        _free_limits(robot, plant)
         change_robot(robot, plant, mender.joints)
         add_payloads("plant.payloads", payloads, plant)
         return plant, cut_loops(plant, mender.joints["parent"])
@@ -189,13 +184,47 @@ def _mended(robot: Robot, files: RobotFiles, mender: Mender) -> Path | ModelDire
 
 def _find_packages(files: RobotFiles, file: Path, within: tuple[Path, ...]) -> None:
     """Finds the packages of directives that others include."""
-    if file in within:
-        names = " -> ".join(path.name for path in (*within, file))
-        raise ModelError(f"'{file.name}' includes itself: {names}")
+    check_included(file, within)
     for directive in LoadModelDirectives(str(file)).directives:
         if directive.add_directives is not None:
             inner = files.needed(directive.add_directives.file, file)
-            _find_packages(files, inner, (*within, file))
+            _find_packages(files, inner, (*within, file.resolve()))
+
+
+def _free_limits(robot: Robot, plant: MultibodyPlant) -> None:
+    """Takes away limits that leave no room: speeds of 0, and positions if the scenario says so."""
+    unlimited = np.full(1, np.inf)  # Many authors write 0 for an unknown limit.
+    for joint in joints_of(plant):
+        if joint.num_positions() == 1:
+            low, high = joint.position_lower_limits(), joint.position_upper_limits()
+            if "empty_limits" in robot.leave_out and low == high:
+                joint.set_position_limits(-unlimited, unlimited)
+            if joint.velocity_lower_limits() == joint.velocity_upper_limits() == 0.0:
+                joint.set_velocity_limits(-unlimited, unlimited)
+
+
+def _add_floating_joints(plant: MultibodyPlant, mender: Mender) -> None:
+    """Adds floating joints in roll, pitch and yaw: Drake has a quaternion in their place.
+
+    No constraint force keeps the length of a quaternion at 1.
+    """
+    kind = (
+        "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place of "
+        "a quaternion, and must not pitch by 90 degrees"
+    )
+    for model, name, child, origin in mender.floating:
+        models, is_world = _instance(plant, model), origin == "world"
+        body = plant.GetBodyByName(child, *models)
+        start = plant.GetDefaultFloatingBaseBodyPose(body)
+        frame = plant.world_frame() if is_world else plant.GetFrameByName(origin, *models)
+        joint = plant.AddJoint(RpyFloatingJoint(name, frame, body.body_frame()))
+        if is_world:
+            joint.SetDefaultPose(start)
+        mender.tell(kind, f"'{name}'")
+
+
+def _instance(plant: MultibodyPlant, model: str) -> list[ModelInstanceIndex]:
+    return [plant.GetModelInstanceByName(model)] if model else []
 
 
 @contextmanager
@@ -217,8 +246,8 @@ def _remarks(mender: Mender) -> Iterator[None]:
     def passes(record: logging.LogRecord) -> bool:
         is_remark = record.thread == here and record.levelno >= logging.WARNING
         if is_remark:
-            text = _of_originals(record.getMessage(), mender.originals)
-            mender.tell("Drake reads the file with remarks", text.replace(" warning:", ""))
+            text = _of_originals(record.getMessage(), mender.originals).replace(" warning:", "")
+            mender.tell("Drake reads the file with remarks", text[:200])
         return not is_remark
 
     logger.addFilter(passes)
@@ -239,13 +268,10 @@ def _told(lost: Mapping[str, list[str]]) -> str:
     """The message for what Drake does not read of the files."""
     text = "; ".join(f"{part} ({_listed(places)})" for part, places in lost.items())
     ways = [f"leave_out: [{', '.join(lost)}] under robot"]
-    ways += ["it takes the nearest possible moments of inertia"] if "inertia" in lost else []
     ways += [hint for word, hint in _REMEDIES.items() if any(word in part for part in lost)]
-    if any(part.startswith(DRIVES) for part in lost):
-        ways.append("or name the driven joints under robot.actuators")
     return (
         f"the equations would lack what Drake does not read of the file: {text}. Mend it, or write "
-        f"{'; '.join(ways)}"
+        f"{'; '.join(dict.fromkeys(ways))}"
     )
 
 
@@ -253,28 +279,3 @@ def _listed(items: Iterable[str], most: int = 8) -> str:
     every = list(dict.fromkeys(items))
     more = f" and {len(every) - most} more" if len(every) > most else ""
     return ", ".join(every[:most]) + more
-
-
-def _instance(plant: MultibodyPlant, model: str) -> list[ModelInstanceIndex]:
-    return [plant.GetModelInstanceByName(model)] if model else []
-
-
-def _add_floating_joints(plant: MultibodyPlant, mender: Mender) -> None:
-    """Adds floating joints in roll, pitch and yaw: Drake has a quaternion in their place.
-
-    No constraint force keeps the length of a quaternion at 1.
-    """
-    for model, name, child, origin in mender.floating:
-        models = _instance(plant, model)
-        body = plant.GetBodyByName(child, *models)
-        start = plant.GetDefaultFloatingBaseBodyPose(body)
-        is_world = origin == "world"
-        frame = plant.world_frame() if is_world else plant.GetFrameByName(origin, *models)
-        joint = plant.AddJoint(RpyFloatingJoint(name, frame, body.body_frame()))
-        if is_world:
-            joint.SetDefaultPose(start)
-        kind = (
-            "floating joints have positions in roll, pitch and yaw, _qx, _qy and _qz, in the place "
-            "of a quaternion, and must not pitch by 90 degrees"
-        )
-        mender.tell(kind, f"'{name}'")

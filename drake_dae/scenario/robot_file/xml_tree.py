@@ -18,6 +18,13 @@ class Node(Element):
     line = 0
 
 
+def check_included(file: Path, within: tuple[Path, ...]) -> None:
+    """Refuses a file that others include, if it is one of them."""
+    if file.resolve() in within:
+        names = " -> ".join(path.name for path in (*within, file))
+        raise ModelError(f"'{file.name}' includes itself: {names}")
+
+
 def read_xml(file: Path) -> Node:
     """The root of an XML file.
 

@@ -279,7 +279,7 @@ class Automaton:
         lost = ca.if_else(can_lose, task.patience - (TIME - felt), 1.0)
         causes = []
         for phase in self.phases:
-            ends = [(now.margin(guard), GUARD + i) for i, guard in enumerate(phase.guards)]
+            ends = [(phase.margin(now, guard), GUARD + i) for i, guard in enumerate(phase.guards)]
             success = phase.success(now, task.contact_force)
             ends.append((ca.if_else(self.waits, 1.0, success), SUCCESS))
             ends += [(lost, LOST)] * phase.holds_contact

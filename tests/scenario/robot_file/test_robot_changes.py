@@ -10,7 +10,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from vendors import joint, link, mobile_arm, panda, robot, write_panda
+from vendors import joint, link, panda, robot, write_panda
 
 from drake_dae import load_scenario
 from drake_dae.errors import RobotFileWarning, ScenarioError
@@ -21,12 +21,12 @@ from drake_dae.scenario.robot_file.robot import Robot
 # The collision meshes of the panda are left out.
 pytestmark = pytest.mark.filterwarnings("ignore::drake_dae.errors.GeometryWarning")
 
-# The hand on a wall, the fingers locked, the base on a table that is turned.
+# The hand on a wall, the fingers and the wrist locked, the base on a table that is turned.
 PANDA = """
 robot:
   file: panda_description/urdf/panda.urdf
-  base: {weld: panda_link0, pose: {translation: [0.1, 0.0, 0.2], rpy_deg: [0.0, 0.0, 10.0]}}
-  locked: {panda_finger_joint1: 0.03}
+  base: {weld: panda_link0, pose: {translation: [0.1, 0.0, 0.2], rpy_deg: [5.0, -3.0, 10.0]}}
+  locked: {panda_finger_joint1: 0.03, panda_joint7: 0.4}
   actuators: all
 constraints:
 - name: wall
@@ -34,7 +34,7 @@ constraints:
   surface: !Plane {point: [0.8, 0.0, 0.0], normal: [-1.0, 0.0, 0.0]}
 outputs:
 - !PointCoordinates {frame: panda_hand, axes: yz}
-- !JointPositions {joints: [panda_joint3, panda_joint5, panda_joint6, panda_joint7]}
+- !JointPositions {joints: [panda_joint3, panda_joint5, panda_joint6]}
 law:
   gains: !Poles {all: [-4.0]}
 references:
@@ -43,7 +43,6 @@ references:
   panda_joint3: 0.2
   panda_joint5: 0.1
   panda_joint6: 1.3
-  panda_joint7: 0.4
   wall.force: !Sinusoids {offset: 20.0, amplitudes: [5.0], frequencies: [2.0]}
 start:
   positions: {panda_joint2: 0.5, panda_joint4: -1.1, panda_joint6: 1.3}
@@ -52,32 +51,9 @@ duration: 1.0
 integrator: {accuracy: 1.0e-8}
 """
 
-# An arm on a base whose wheels stand still, slanted.
-MOBILE = """
-robot:
-  file: mobile_arm.urdf
-  base: {weld: base_footprint, pose: {translation: [0.3, 0.2, 0.1], rpy_deg: [5.0, -10.0, 90.0]}}
-  locked: {left_axle: 0.4, right_axle: -0.7}
-  actuators: {shoulder: 60.0, elbow: null}
-constraints:
-- name: ceiling
-  frame: forearm
-  point: [0.0, 0.0, 0.3]
-  surface: !Plane {point: [0.0, 0.0, 1.1], normal: [0.0, 0.0, -1.0]}
-outputs: [!JointPositions {joints: [shoulder]}]
-law:
-  gains: !Poles {all: [-4.0]}
-references:
-  shoulder: !Sinusoids {offset: 0.35, amplitudes: [0.05], frequencies: [2.0]}
-  ceiling.force: 10.0
-start: {errors: {shoulder: 0.02}}
-duration: 1.0
-"""
-
 
 def files(folder: Path, text: str) -> Path:
     write_panda(folder)
-    (folder / "mobile_arm.urdf").write_text(mobile_arm())
     (folder / "scenario.yaml").write_text(text)
     return folder / "scenario.yaml"
 
@@ -106,27 +82,14 @@ def standing(text: str, base: str, pose: RigidTransform) -> MultibodyPlant:
     return plant
 
 
-def expected_panda() -> MultibodyPlant:
+def test_accelerations_are_those_of_a_robot_whose_file_says_the_same(tmp_path):
+    """Fixed joints at other places, and a weld, by hand; what is left is round-off."""
+    links = scenario_model(load_scenario(files(tmp_path, PANDA))).links
     text = fixed(panda(), "panda_finger_joint1", "0 0.03 0.06")
     text = fixed(text, "panda_finger_joint2", "0 -0.03 0.06")
-    pose = RigidTransform(RollPitchYaw(0, 0, np.deg2rad(10)), [0.1, 0, 0.2])
-    return standing(text, "panda_link0", pose)
-
-
-def expected_mobile() -> MultibodyPlant:
-    text = fixed(mobile_arm(), "left_axle", "0 0.2 0.1", "0 0.4 0")
-    text = fixed(text, "right_axle", "0 -0.2 0.1", "0 -0.7 0")
-    pose = RigidTransform(RollPitchYaw(np.deg2rad([5, -10, 90])), [0.3, 0.2, 0.1])
-    return standing(text, "base_footprint", pose)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"), [(PANDA, expected_panda), (MOBILE, expected_mobile)], ids=["arm", "cart"]
-)
-def test_accelerations_are_those_of_a_robot_whose_file_says_the_same(text, expected, tmp_path):
-    """Fixed joints at other places, and welds, by hand; what is left is round-off."""
-    links = scenario_model(load_scenario(files(tmp_path, text))).links
-    plant = expected()
+    text = fixed(text, "panda_joint7", "0 0 0.25", "0 0 0.4")
+    pose = RigidTransform(RollPitchYaw(np.deg2rad([5, -3, 10])), [0.1, 0, 0.2])
+    plant = standing(text, "panda_link0", pose)
     assert [signal.name for signal in links.position_signals] == list(
         plant.GetPositionNames(add_model_instance_prefix=False, always_add_suffix=False)
     )
@@ -161,7 +124,7 @@ def test_accelerations_are_those_of_a_robot_whose_file_says_the_same(text, expec
         (["robot.locked={panda_hand_joint: 0}"], ["robot.locked: ", "'panda_hand_joint'", "there"]),
         (["robot.locked={panda_joint1: 3}"], ["robot.locked: ", "3", "-2.9", "2.9"]),
         (["robot.locked.panda_finger_joint2=0"], ["robot.locked: "]),
-        (["robot.locked.panda_joint7=0"], ["outputs.1: ", "'panda_joint7'"]),
+        (["robot.locked.panda_joint6=0"], ["outputs.1: ", "'panda_joint6'"]),
         (["robot.actuators=null"], ["robot.actuators: ", "'panda.urdf'", "all"]),
         (["robot.actuators=[panda_joint0]"], ["robot.actuators: ", "panda_joint"]),
         (["robot.actuators=[panda_finger_joint1]"], ["robot.actuators: ", "'panda_finger_joint1'"]),
@@ -189,13 +152,24 @@ def test_either_of_two_coupled_joints_locks_the_other(name, tmp_path):
     assert plant.num_constraints() == 0
 
 
-def test_an_effort_limit_of_0_is_unknown(tmp_path):
-    file = tmp_path / "robot.urdf"
+@pytest.mark.parametrize(
+    ("effort", "actuators", "wanted"),
+    [
+        ("0", "all", np.inf),
+        ("87.0", ["j"], 87.0),
+        ("87.0", {"j": None}, 87.0),
+        ("0", {"j": 6}, 6.0),
+    ],
+)
+def test_effort_limits_are_those_of_the_scenario_or_of_the_file(
+    effort, actuators, wanted, tmp_path
+):
+    """One of 0 is unknown."""
     text = robot("one", link("a", 1), link("b", 1), joint("j", "a", "b", "0 0 1"))
-    file.write_text(text.replace("87.0", "0"))
-    plant, _ = read_robot(Robot(str(file), actuators="all"))
+    (tmp_path / "robot.urdf").write_text(text.replace("87.0", effort))
+    plant, _ = read_robot(Robot(str(tmp_path / "robot.urdf"), actuators=actuators))
     finalize(plant)
-    assert plant.GetEffortUpperLimits() == [np.inf]
+    assert plant.GetEffortUpperLimits() == [wanted]
 
 
 FRICTION = """

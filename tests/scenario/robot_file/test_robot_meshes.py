@@ -92,30 +92,6 @@ def test_geometry_stops_no_robot(kind: str, name: str, prepare, tmp_path: Path):
     assert count(scene_graph, Role.kIllustration) == 3
 
 
-@pytest.mark.parametrize("kind", ["urdf", "sdf", "xml"])
-@pytest.mark.parametrize("shape", ["box", "sphere", "cylinder"])
-def test_shapes_of_size_0_are_left_out(kind: str, shape: str, tmp_path: Path):
-    sizes = {"box": {"size": "0 0 0"}, "sphere": {"radius": "0"}}
-    own = sizes.get(shape, {"radius": "0.1", "length": "0"})
-    attributes = " ".join(f'{key}="{value}"' for key, value in own.items())
-    parts = "".join(f"<{key}>{value}</{key}>" for key, value in own.items())
-    form = f"<geometry><{shape} {attributes}/></geometry>"
-    tagged = f"<geometry><{shape}>{parts}</{shape}></geometry>"
-    texts = {
-        "urdf": f'<robot><link name="a"><visual>{form}</visual><collision>{form}</collision>'
-        "</link></robot>",
-        "sdf": f'<sdf version="1.9"><model><link name="a"><visual name="v">{tagged}</visual>'
-        f'<collision name="c">{tagged}</collision></link></model></sdf>',
-        "xml": '<mujoco><worldbody><body name="a"><geom size="0 0 0" mass="0" '
-        f'type="{shape}"/></body></worldbody></mujoco>',
-    }
-    (tmp_path / f"robot.{kind}").write_text(texts[kind])
-    scene_graph = SceneGraph()
-    with pytest.warns(GeometryWarning, match="'a'"):
-        read(tmp_path / f"robot.{kind}", scene_graph)
-    assert scene_graph.model_inspector().num_geometries() == 0
-
-
 def box_of_collada(file: Path, unit: float) -> None:
     """A red box of 100 x 200 x 300 units as CAD programs write it."""
     collada = pytest.importorskip("collada")

@@ -60,21 +60,13 @@ LIGHT = '<inertial pos="0 0 0" mass="1e-12" diaginertia="0 0 0"/>'
 NOTHING = '<inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/>'
 
 
-@pytest.mark.parametrize(
-    "parts",
-    [
-        {"base": NOTHING, "mark": LIGHT},
-        {
-            "base": "",
-            "mark": '<inertial pos="1 0 0" mass="0.0" diaginertia="0 0 0" quat="1 0 0 0"/>',
-        },
-        {"base": NOTHING, "mark": NOTHING},
-    ],
-    ids=["base", "carried", "both"],
-)
-def test_an_mjcf_body_of_mass_0_weighs_nothing_and_neither_does_its_geometry(parts, tmp_path):
+CARRIED = '<inertial pos="1 0 0" mass="0.0" diaginertia="0 0 0" quat="1 0 0 0"/>'
+
+
+@pytest.mark.parametrize(("base", "mark"), [(NOTHING, LIGHT), ("", CARRIED), (NOTHING, NOTHING)])
+def test_an_mjcf_body_of_mass_0_weighs_nothing_and_neither_does_its_geometry(base, mark, tmp_path):
     """A body of 1e-12 kg is the other route; it is below round-off of 1 kg."""
-    plant = plant_of(written(tmp_path, MJCF.format(**parts), "arm.xml"))
+    plant = plant_of(written(tmp_path, MJCF.format(base=base, mark=mark), "arm.xml"))
     other = drakes(MJCF.format(base=LIGHT, mark=LIGHT), ".xml")
     np.testing.assert_allclose(mass_matrix(plant), mass_matrix(other), rtol=1e-10, atol=1e-12)
 
@@ -105,40 +97,31 @@ def test_a_joint_that_moves_no_mass_is_named(name, tmp_path):
 # Limits.
 
 
+NONE = (-np.inf, np.inf)
+
+
 @pytest.mark.parametrize(
-    ("kind", "limit", "wanted"),
+    ("kind", "low", "high", "leave_out", "wanted"),
     [
-        ("continuous", 'lower="0" upper="0"', (-np.inf, np.inf)),
-        ("continuous", 'lower="-1" upper="1"', (-np.inf, np.inf)),
-        ("revolute", 'lower="-1" upper="1"', (-1.0, 1.0)),
-        ("revolute", 'lower="0" upper="0"', (0.0, 0.0)),
-        ("prismatic", 'lower="0" upper="0"', (0.0, 0.0)),
+        ("continuous", 0, 0, [], NONE),
+        ("continuous", -1, 1, [], NONE),
+        ("revolute", -1, 1, [], (-1.0, 1.0)),
+        ("revolute", 0, 0, [], (0.0, 0.0)),
+        ("prismatic", 0, 0, [], (0.0, 0.0)),
+        ("revolute", 1, -1, ["empty_limits"], NONE),
+        ("prismatic", -2, -2, ["empty_limits"], NONE),
     ],
 )
-def test_a_continuous_joint_has_no_limits_and_a_speed_limit_of_0_is_none(
-    kind, limit, wanted, tmp_path
+def test_limits_without_room_go_where_a_joint_or_the_scenario_says_so(
+    kind, low, high, leave_out, wanted, tmp_path
 ):
-    one = joint("j", "base", "arm", "0 1 0", kind=kind)
-    one = one.replace('lower="-2.9" upper="2.9"', limit).replace('velocity="2"', 'velocity="0"')
-    assert limit in one
-    assert 'velocity="0"' in one
-    plant = plant_of(written(tmp_path, robot("one", link("base", 1), link("arm", 1), one)))
-    found = plant.GetJointByName("j")
+    """A speed limit of 0 is none."""
+    one = joint("j", "base", "arm", "0 1 0", kind=kind).replace('velocity="2"', 'velocity="0"')
+    one = one.replace('lower="-2.9" upper="2.9"', f'lower="{low}" upper="{high}"')
+    file = written(tmp_path, robot("one", link("base", 1), link("arm", 1), one))
+    found = plant_of(file, leave_out=leave_out).GetJointByName("j")
     assert (found.position_lower_limits()[0], found.position_upper_limits()[0]) == wanted
     assert found.velocity_upper_limits()[0] == np.inf
-
-
-@pytest.mark.parametrize("bounds", [("0", "0"), ("1", "-1"), ("-2", "-2")])
-@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
-def test_limits_that_leave_no_room_are_left_out_where_the_scenario_says_so(kind, bounds, tmp_path):
-    low, high = bounds
-    one = joint("j", "base", "arm", "0 1 0", kind=kind).replace(
-        'lower="-2.9" upper="2.9"', f'lower="{low}" upper="{high}"'
-    )
-    file = written(tmp_path, robot("one", link("base", 1), link("arm", 1), one))
-    found = plant_of(file, leave_out=["empty_limits"]).GetJointByName("j")
-    assert found.position_lower_limits()[0] == -np.inf
-    assert found.position_upper_limits()[0] == np.inf
     if low > high:
         with pytest.raises(ModelError, match=r"'j'.*1 .*-1.*empty_limits"):
             plant_of(file)

@@ -18,19 +18,8 @@ from pydrake.systems.primitives import (
 from pydrake.trajectories import PiecewisePolynomial
 from runs import some
 
-from drake_dae import (
-    ConstantReference,
-    DaePlant,
-    DaeSystem,
-    ForceSensor,
-    ReferenceGenerator,
-    RobotPlant,
-    SinusoidReference,
-    TrackingController,
-    TrackingLaw,
-    make_closed_loop,
-    poles,
-)
+import drake_dae as dd
+from drake_dae import poles
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, NonFiniteError, SingularityError
 from drake_dae.systems import TrajectoryReference
@@ -45,13 +34,13 @@ def plant_of(name):
     random = np.random.default_rng(1)
     if name in PROBLEMS:
         problem = PROBLEMS[name]()
-        plant, state = DaePlant(problem.system), problem.consistent(random)
+        plant, state = dd.DaePlant(problem.system), problem.consistent(random)
     elif " " in name:
         robot, kind = name.split(maxsplit=1)
         plant = robot_plant(robot, kind)
         state = states(robot, kind, 1)[0]
     else:
-        plant = RobotPlant(arm(name).model, structure=arm(name).structure)
+        plant = dd.RobotPlant(arm(name).model, structure=arm(name).structure)
         state = consistent_states(name, 1)[0]
     return plant, state, random.standard_normal(plant.dae.num_controls)
 
@@ -61,7 +50,7 @@ PLANTS = [*PROBLEMS, "two_link", "seven_joint", "two_link flexible motor", "two_
 
 def robot_plant(name, kind):
     found = actuated(name, kind)
-    return RobotPlant(found.model, structure=found.structure)
+    return dd.RobotPlant(found.model, structure=found.structure)
 
 
 def all_parameters(system):
@@ -133,7 +122,7 @@ def test_plants(name):
 @pytest.mark.parametrize("name", some(PLANTS, of=3))
 def test_controllers(name):
     plant, state, _ = plant_of(name)
-    system = TrackingController(TrackingLaw(plant.dae, poles(-3.0)))
+    system = dd.TrackingController(dd.TrackingLaw(plant.dae, poles(-3.0)))
     reference = np.random.default_rng(3).standard_normal(len(system.law.reference_signals))
     inputs = {"estimated_state": state, "reference": reference}
     check_gradient(system, inputs)
@@ -141,7 +130,7 @@ def test_controllers(name):
 
 def test_a_controller_with_measured_force():
     found = arm("two_link")
-    feedback = TrackingLaw(
+    feedback = dd.TrackingLaw(
         found.model.dae, poles(-3.0), structure=found.structure, measured_force=True, force_gain=2.0
     )
     inputs = {
@@ -149,11 +138,11 @@ def test_a_controller_with_measured_force():
         "reference": np.array([0.2, 0.1, -0.3, 17.0]),
         "measured_force": np.array([12.0]),
     }
-    check_gradient(TrackingController(feedback), inputs)
+    check_gradient(dd.TrackingController(feedback), inputs)
 
 
 def test_a_force_sensor():
-    sensor = ForceSensor(2, 0.05, bias=[1.0, -2.0], noise_deviation=0.3, drift=[0.2, 0.1])
+    sensor = dd.ForceSensor(2, 0.05, bias=[1.0, -2.0], noise_deviation=0.3, drift=[0.2, 0.1])
     check_gradient(sensor, {"force": [3.0, 4.0], "noise": [0.1, 0.2]}, [1.0, 2.0])
 
 
@@ -162,9 +151,9 @@ def test_a_force_sensor():
     [
         lambda: plant_of("two_link hydraulic")[0],
         lambda: plant_of("pendulum_tension")[0],
-        lambda: TrackingController(law("seven_joint")),
-        lambda: ReferenceGenerator([ConstantReference([1.0, 2.0])], [2, 0]),
-        lambda: ForceSensor(1, time_constant=0.1, noise_deviation=1.0),
+        lambda: dd.TrackingController(law("seven_joint")),
+        lambda: dd.ReferenceGenerator([dd.ConstantReference([1.0, 2.0])], [2, 0]),
+        lambda: dd.ForceSensor(1, time_constant=0.1, noise_deviation=1.0),
     ],
 )
 def test_ports_parameters_and_feedthrough_are_kept(make):
@@ -193,7 +182,7 @@ def test_references_move_with_the_time():
         np.linspace(0, 1, 5), (np.linspace(0, 1, 5) ** 4)[None]
     )
     quartic = TrajectoryReference(line)
-    generator = ReferenceGenerator([quartic, SinusoidReference(0.0, 1.0, 2.0)], [2, 1])
+    generator = dd.ReferenceGenerator([quartic, dd.SinusoidReference(0.0, 1.0, 2.0)], [2, 1])
     converted = generator.ToAutoDiffXd()
     context = converted.CreateDefaultContext()
     context.SetTime(AutoDiffXd(t, [3.0]))
@@ -212,7 +201,7 @@ def test_references_move_with_the_time():
 
 def test_linearize_a_hanging_pendulum():
     """v = -(vx^2 + vy^2 + x u - g y) / (2 x^2 + 2 y^2): x'' = -g x + u, y'' = 0, z = x."""
-    plant = DaePlant(hanging_pendulum())
+    plant = dd.DaePlant(hanging_pendulum())
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, [0.0])
     linear = Linearize(
@@ -246,16 +235,16 @@ def assert_poles(loop, context, poles, zeros, tolerance):
 
 def resting_loop(model, structure, gains, sensor=None, **force_feedback):
     """A loop at rest at its reference, pressing with 20 N, and its context."""
-    plant = RobotPlant(model, structure=structure)
+    plant = dd.RobotPlant(model, structure=structure)
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, np.zeros(model.dae.num_controls))
     q = model.configuration(None, model.dae.nominal_state[: model.links.q.numel()])
     plant.set_state(context, model.rest_state(q, [20.0]))
     outputs = plant.GetOutputPort("controlled_output").Eval(context)
-    loop = make_closed_loop(
+    loop = dd.make_closed_loop(
         plant,
-        TrackingLaw(model.dae, gains, structure=structure, **force_feedback),
-        [ConstantReference(outputs[:-1]), ConstantReference(20.0)],
+        dd.TrackingLaw(model.dae, gains, structure=structure, **force_feedback),
+        [dd.ConstantReference(outputs[:-1]), dd.ConstantReference(20.0)],
         LoopSettings(sensor=sensor),
     )
     whole = loop.diagram.CreateDefaultContext()
@@ -293,8 +282,8 @@ def test_a_closed_loop_keeps_its_zero_dynamics():
     problem = PROBLEMS["pendulum_tension"]()
     mass, length, gravity, angle = 2.0, 0.8, 9.81, 0.6
     force = -mass * gravity / (length * np.cos(angle))
-    design = TrackingLaw(problem.system, poles(-1.0))
-    loop = make_closed_loop(DaePlant(problem.system), design, [ConstantReference(force)])
+    design = dd.TrackingLaw(problem.system, poles(-1.0))
+    loop = dd.make_closed_loop(dd.DaePlant(problem.system), design, [dd.ConstantReference(force)])
     context = loop.diagram.CreateDefaultContext()
     context.SetContinuousState([length * np.sin(angle), -length * np.cos(angle), 0.0, 0.0])
     swing = 1j * np.sqrt(-force / mass)
@@ -303,7 +292,7 @@ def test_a_closed_loop_keeps_its_zero_dynamics():
 
 def test_failures_name_time_and_state():
     found = arm("two_link")
-    controller = TrackingController(law("two_link")).ToAutoDiffXd()
+    controller = dd.TrackingController(law("two_link")).ToAutoDiffXd()
     context = controller.CreateDefaultContext()
     context.SetTime(1.5)
     controller.GetInputPort("estimated_state").FixValue(context, np.zeros(4))
@@ -312,7 +301,7 @@ def test_failures_name_time_and_state():
         controller.GetOutputPort("control").Eval(context)
     np.testing.assert_array_equal(info.value.state, np.zeros(4))
 
-    plant = RobotPlant(found.model, structure=found.structure).ToAutoDiffXd()
+    plant = dd.RobotPlant(found.model, structure=found.structure).ToAutoDiffXd()
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, [0.0, np.nan])
     with pytest.raises(NonFiniteError, match="joint2_motor") as info:
@@ -322,7 +311,7 @@ def test_failures_name_time_and_state():
 
 def test_a_function_without_derivative_is_named():
     """x' = sqrt(x) + u is 0 at x = 0, where its derivative is infinite."""
-    system = DaeSystem.from_functions(
+    system = dd.DaeSystem.from_functions(
         1,
         f=lambda x: ca.sqrt(x),
         h=lambda x: 1,
@@ -330,7 +319,7 @@ def test_a_function_without_derivative_is_named():
         nominal_state=[1.0],
         name="root",
     )
-    plant = DaePlant(system)
+    plant = dd.DaePlant(system)
     context = plant.CreateDefaultContext()
     context.SetContinuousState([0.0])
     plant.GetInputPort("control").FixValue(context, [0.0])
@@ -340,7 +329,7 @@ def test_a_function_without_derivative_is_named():
 
 
 def test_what_does_not_convert_says_why():
-    class Watched(DaePlant):
+    class Watched(dd.DaePlant):
         def __init__(self, system):
             super().__init__(system)
             self.DeclareVectorOutputPort("energy", 1, lambda context, output: None)

@@ -39,25 +39,7 @@ from pydrake.systems.primitives import (
 )
 from runs import some
 
-from drake_dae import (
-    Approach,
-    CompliantPlant,
-    DaePlant,
-    ExpressionReference,
-    ForceSensor,
-    Press,
-    ReferenceGenerator,
-    Release,
-    RobotModel,
-    RobotPlant,
-    SinusoidReference,
-    StateEstimator,
-    Task,
-    TaskController,
-    TrackingController,
-    TrackingLaw,
-    poles,
-)
+import drake_dae as dd
 from drake_dae.blocks.block import BlockFunction
 from drake_dae.blocks.compose import compose
 from drake_dae.dae import with_disturbance
@@ -70,8 +52,8 @@ from drake_dae.systems.sensing.encoders import Encoders, StateSensor
 
 def measured_law(integral, gain=0.5):
     found = arm("two_link")
-    gains = poles(-4.0)
-    return TrackingLaw(
+    gains = dd.poles(-4.0)
+    return dd.TrackingLaw(
         found.model.dae,
         gains,
         structure=found.structure,
@@ -82,8 +64,8 @@ def measured_law(integral, gain=0.5):
 
 
 def references():
-    height, force = SinusoidReference(0.3, 0.3, 1.5), SinusoidReference(20.0, 5.0, 2.0)
-    return ReferenceGenerator([height, force], law("two_link").degrees)
+    height, force = dd.SinusoidReference(0.3, 0.3, 1.5), dd.SinusoidReference(20.0, 5.0, 2.0)
+    return dd.ReferenceGenerator([height, force], law("two_link").degrees)
 
 
 def commanded():
@@ -96,14 +78,14 @@ def references_with_parameters():
     def push(t, level, wave):
         return level + wave[0] * ca.sin(wave[1] * t)
 
-    height = SinusoidReference(0.3, 0.3, 1.5)
-    force = ExpressionReference(push, {"level": 20.0, "wave": [5.0, 2.0]})
-    return ReferenceGenerator([height, force], law("two_link").degrees)
+    height = dd.SinusoidReference(0.3, 0.3, 1.5)
+    force = dd.ExpressionReference(push, {"level": 20.0, "wave": [5.0, 2.0]})
+    return dd.ReferenceGenerator([height, force], law("two_link").degrees)
 
 
 def robot(kind):
     found = arm("two_link") if kind is None else actuated("two_link", kind)
-    return RobotPlant(found.model, structure=found.structure)
+    return dd.RobotPlant(found.model, structure=found.structure)
 
 
 def found_friction(is_measured=True):
@@ -111,21 +93,21 @@ def found_friction(is_measured=True):
     found = arm("two_link")
     smooth = found.model.constraints[0]
     wall = replace(smooth, friction=0.2, stiction_tolerance=0.1)
-    model = RobotModel(found.model.links, [wall], found.model.outputs, [1.2, -1.6])
+    model = dd.RobotModel(found.model.links, [wall], found.model.outputs, [1.2, -1.6])
     names = [signal.name for signal in model.links.velocity_signals]
     dae = with_disturbance(model.dae, names, ["wall.friction"])
-    return TrackingLaw(dae, poles(-4.0), measured_force=is_measured)
+    return dd.TrackingLaw(dae, dd.poles(-4.0), measured_force=is_measured)
 
 
 def observer(**more):
     """Of a contact that sticks, is lost, or neither."""
     rates = Observing(20.0, force_rate=30.0, **more)
-    return StateEstimator(found_friction(), rates, 0.01, 0.5, 0.02)
+    return dd.StateEstimator(found_friction(), rates, 0.01, 0.5, 0.02)
 
 
 def estimator(lag, law=None, **more):
     rates = Observing(10.0, force_rate=15.0, state_rate=30.0, **more)
-    return StateEstimator(
+    return dd.StateEstimator(
         law or found_friction(), rates, 0.01, lag, 0.02, lag * 0.01, 1e-3, [1e-2, 0.0]
     )
 
@@ -133,7 +115,7 @@ def estimator(lag, law=None, **more):
 def observer_behind_springs():
     system = actuated("two_link", "flexible").model.dae
     dae = with_disturbance(system, [signal.name for signal in system.state_signals[2:4]])
-    return StateEstimator(TrackingLaw(dae, poles(-4.0)), Observing(20.0), 0.01)
+    return dd.StateEstimator(dd.TrackingLaw(dae, dd.poles(-4.0)), Observing(20.0), 0.01)
 
 
 BLOCKS = {
@@ -141,29 +123,31 @@ BLOCKS = {
     "RobotPlant with springs": lambda: robot("flexible"),
     "RobotPlant with motors": lambda: robot("motor"),
     "RobotPlant with hydraulic servos": lambda: robot("hydraulic"),
-    "CompliantPlant": lambda: CompliantPlant(arm("two_link").model, PointMaterial(0.01)),
-    "CompliantPlant that is continuous": lambda: CompliantPlant(
+    "CompliantPlant": lambda: dd.CompliantPlant(arm("two_link").model, PointMaterial(0.01)),
+    "CompliantPlant that is continuous": lambda: dd.CompliantPlant(
         arm("two_link").model, PointMaterial(0.0, dissipation=1.0)
     ),
-    "CompliantPlant with springs": lambda: CompliantPlant(
+    "CompliantPlant with springs": lambda: dd.CompliantPlant(
         actuated("two_link", "flexible").model, PointMaterial(0.01, friction=0.3)
     ),
     "ReferenceGenerator": references,
     "CommandedReferences": commanded,
     "ReferenceGenerator with parameters": references_with_parameters,
-    "TrackingController": lambda: TrackingController(law("two_link")),
-    "TrackingController of a measured force": lambda: TrackingController(measured_law(())),
-    "TrackingController with the integral of a force": lambda: TrackingController(
+    "TrackingController": lambda: dd.TrackingController(law("two_link")),
+    "TrackingController of a measured force": lambda: dd.TrackingController(measured_law(())),
+    "TrackingController with the integral of a force": lambda: dd.TrackingController(
         measured_law(("wall.force",), 0.0)
     ),
-    "TrackingController with a sampled integral": lambda: TrackingController(
+    "TrackingController with a sampled integral": lambda: dd.TrackingController(
         measured_law(("tool.z", "wall.force"), 0.0), sample_period=0.01
     ),
     "ControlLimits": lambda: ControlLimits([0.5, 2.0]),
-    "ForceSensor with a lag": lambda: ForceSensor(2, 0.01, bias=0.1),
-    "ForceSensor with samples": lambda: ForceSensor(2, sample_period=0.01, bias=[0.1, 0.2]),
-    "TaskController": lambda: TaskController(
-        Task([Approach(), Press(20.0), Release()]), *polishing.laws(), sample_period=0.01
+    "ForceSensor with a lag": lambda: dd.ForceSensor(2, 0.01, bias=0.1),
+    "ForceSensor with samples": lambda: dd.ForceSensor(2, sample_period=0.01, bias=[0.1, 0.2]),
+    "TaskController": lambda: dd.TaskController(
+        dd.Task([dd.Approach(), dd.Press(20.0), dd.Release()]),
+        *polishing.laws(),
+        sample_period=0.01,
     ),
     "ControlHold": lambda: ControlHold(2, Sampling(0.01)),
     "ControlHold that acts late": lambda: ControlHold(2, Sampling(0.01, 0.02)),
@@ -185,7 +169,7 @@ BLOCKS = {
     "StateSensor with noise": lambda: StateSensor(
         4, 2, Encoders(position_noise=0.1, velocity_noise=0.2), 0.01
     ),
-    "ForceSensor with all of it": lambda: ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2], 0.4),
+    "ForceSensor with all of it": lambda: dd.ForceSensor(2, 0.02, 0.01, 0.3, [0.1, 0.2], 0.4),
 }
 
 
@@ -235,9 +219,9 @@ def in_context(name):
     system = (BLOCKS | SYSTEMS)[name]()
     diagram, context = alone(system)
     own = system.GetMyMutableContextFromRoot(context)
-    if isinstance(system, DaePlant):
+    if isinstance(system, dd.DaePlant):
         system.set_consistent_state(own, system.structure.states[1])
-    elif isinstance(system, TrackingController):
+    elif isinstance(system, dd.TrackingController):
         diagram.GetInputPort("in 0").FixValue(context, system.law.structure.states[1])
     return system, diagram, context, compose(diagram, context=context)
 

@@ -12,41 +12,28 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from runs import scenario, some
 
-from drake_dae import (
-    Approach,
-    ClosedLoop,
-    ConstantReference,
-    ForceSensor,
-    RobotPlant,
-    Task,
-    TaskController,
-    TrackingController,
-    build_scenario,
-    make_closed_loop,
-    simulate,
-    start_meshcat,
-)
+import drake_dae as dd
 from drake_dae.running import compiled_run
 from drake_dae.systems.control.references import ReferenceGenerator
 
 
-def plant() -> RobotPlant:
+def plant() -> dd.RobotPlant:
     arm = arms.arm("two_link")
-    return RobotPlant(arm.model, structure=arm.structure)
+    return dd.RobotPlant(arm.model, structure=arm.structure)
 
 
-def loop() -> ClosedLoop:
-    return make_closed_loop(plant(), arms.law("two_link"), [ConstantReference([0.3, 15.0])])
+def loop() -> dd.ClosedLoop:
+    return dd.make_closed_loop(plant(), arms.law("two_link"), [dd.ConstantReference([0.3, 15.0])])
 
 
 SYSTEMS = {
     "plant": plant,
-    "controller": lambda: TrackingController(arms.law("two_link")),
-    "task": lambda: TaskController(
-        Task([Approach()]), *polishing.laws(), sample_period=polishing.PERIOD
+    "controller": lambda: dd.TrackingController(arms.law("two_link")),
+    "task": lambda: dd.TaskController(
+        dd.Task([dd.Approach()]), *polishing.laws(), sample_period=polishing.PERIOD
     ),
-    "references": lambda: ReferenceGenerator([ConstantReference([0.3, 15.0])], (2, 0)),
-    "sensor": lambda: ForceSensor(1, 0.01, 0.001, noise_deviation=0.1),
+    "references": lambda: ReferenceGenerator([dd.ConstantReference([0.3, 15.0])], (2, 0)),
+    "sensor": lambda: dd.ForceSensor(1, 0.01, 0.001, noise_deviation=0.1),
     "converted": lambda: plant().ToAutoDiffXd(),
 }
 
@@ -72,8 +59,8 @@ def test_a_system_is_freed_after_it_was_part_of_a_diagram(make: Callable[[], Lea
 def test_a_loop_on_drakes_contact_is_freed_after_it_ran_with_one_call_a_sample(monkeypatch):
     monkeypatch.setattr(compiled_run, "WORTH", 1)  # Short runs, too.
     chosen = scenario("wall_point_contact", "compiled=false")
-    made, context = build_scenario(chosen)
-    simulate(made.diagram, context, 0.01, chosen.integrator)
+    made, context = dd.build_scenario(chosen)
+    dd.simulate(made.diagram, context, 0.01, chosen.integrator)
     made.record(context)
     lasts = [ref(each) for each in (made, made.diagram, made.log, made.plant, made.plant.model)]
     del made, context
@@ -82,9 +69,9 @@ def test_a_loop_on_drakes_contact_is_freed_after_it_ran_with_one_call_a_sample(m
 
 
 def test_a_drawn_scenario_is_freed_with_its_model_and_its_geometry():
-    meshcat = start_meshcat()
-    made, context = build_scenario(scenario("two_link_wall"), meshcat)
-    simulate(made.diagram, context, 0.02, arms.fixed_step())
+    meshcat = dd.start_meshcat()
+    made, context = dd.build_scenario(scenario("two_link_wall"), meshcat)
+    dd.simulate(made.diagram, context, 0.02, arms.fixed_step())
     links = made.plant.model.links
     forces = made.diagram.GetSubsystemByName("constraint_force_visualizer")
     lasts = [ref(each) for each in (made.plant, forces, made.plant.model, links.plant)]

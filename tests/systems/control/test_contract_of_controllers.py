@@ -6,21 +6,7 @@ from arms import arm, fixed_step, law
 from members import RestingController
 from polishing import PERIOD, laws, soft_wall
 
-from drake_dae import (
-    Approach,
-    ConstantReference,
-    ForceSensor,
-    Press,
-    ReferenceGenerator,
-    RobotPlant,
-    Sampling,
-    Task,
-    TaskController,
-    TrackingController,
-    TrackingLaw,
-    poles,
-    simulate,
-)
+import drake_dae as dd
 from drake_dae.diagrams import LoopSettings, wire_loop
 from drake_dae.errors import ModelError, WiringError
 from drake_dae.systems import Observing
@@ -31,18 +17,20 @@ GOALS, SAMPLE = [0.3, 20.0], 0.01
 
 def integrating():
     found = arm("two_link")
-    chosen = TrackingLaw(
-        found.model.dae, poles(-4.0), structure=found.structure, integral=["tool.z"]
+    chosen = dd.TrackingLaw(
+        found.model.dae, dd.poles(-4.0), structure=found.structure, integral=["tool.z"]
     )
-    return TrackingController(chosen)
+    return dd.TrackingController(chosen)
 
 
 def task():
-    return TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=PERIOD)
+    return dd.TaskController(
+        dd.Task([dd.Approach(), dd.Press(20.0)]), *laws(), sample_period=PERIOD
+    )
 
 
 MEMBERS = {
-    "law": lambda: TrackingController(law("two_link")),
+    "law": lambda: dd.TrackingController(law("two_link")),
     "with integral": integrating,
     "task": task,
     "resting": lambda: RestingController(law("two_link")),
@@ -55,15 +43,15 @@ def robot(controller):
         return soft_wall(), None
     q = arm("two_link").model.configuration([0.3], [1.2, -1.6])
     found, state = arm("two_link"), [*q, 0.0, 0.0]
-    return RobotPlant(found.model, structure=found.structure), state
+    return dd.RobotPlant(found.model, structure=found.structure), state
 
 
 def wired(controller, **settings):
     """A loop of a controller, at rest where it begins."""
     (plant, state), generator = robot(controller), None
     if controller.HasInputPort("reference"):
-        generator = ReferenceGenerator(
-            [ConstantReference(goal) for goal in GOALS], controller.law.degrees
+        generator = dd.ReferenceGenerator(
+            [dd.ConstantReference(goal) for goal in GOALS], controller.law.degrees
         )
     loop = wire_loop(plant, controller, generator, LoopSettings(**settings))
     context = loop.diagram.CreateDefaultContext()
@@ -105,16 +93,16 @@ def test_rule_3_laws(controller):
     assert values.shape == controller.law.all_parameters().shape
     if controller.takes_over or isinstance(controller, RestingController):
         with pytest.raises(ModelError, match=type(controller).__name__):
-            controller.set_gains(context, poles(-9.0))
+            controller.set_gains(context, dd.poles(-9.0))
     else:
-        controller.set_gains(context, poles(-9.0))
+        controller.set_gains(context, dd.poles(-9.0))
         assert not np.array_equal(controller.all_parameters(context), values)
 
 
 def test_rule_4_plants(controller):
     with pytest.raises(WiringError, match=r"14.*7"):
         controller.check_plant(
-            RobotPlant(arm("seven_joint").model, structure=arm("seven_joint").structure)
+            dd.RobotPlant(arm("seven_joint").model, structure=arm("seven_joint").structure)
         )
 
 
@@ -129,7 +117,7 @@ def test_references_are_where_the_controller_takes_them(controller):
         with pytest.raises(WiringError, match="ReferenceGenerator"):
             wire_loop(plant, controller)
     else:
-        generator = ReferenceGenerator([ConstantReference(g) for g in GOALS], [2, 0])
+        generator = dd.ReferenceGenerator([dd.ConstantReference(g) for g in GOALS], [2, 0])
         with pytest.raises(WiringError, match="reference"):
             wire_loop(plant, controller, generator)
 
@@ -137,7 +125,7 @@ def test_references_are_where_the_controller_takes_them(controller):
 def test_a_sensor_that_nothing_reads_is_refused(controller):
     if not controller.HasInputPort("measured_force"):
         with pytest.raises(WiringError, match=r"measured.force"):
-            wired(controller, sensor=ForceSensor(1, 0.01))
+            wired(controller, sensor=dd.ForceSensor(1, 0.01))
 
 
 @pytest.mark.slow
@@ -145,7 +133,7 @@ def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
     """At rest at its goals a law has no error: round-off, and that of steps of 1 ms."""
     loop, context = wired(controller)
     config = fixed_step()
-    simulate(loop.diagram, context, 0.05, config)
+    dd.simulate(loop.diagram, context, 0.05, config)
     record = loop.record(context)
     assert {"desired_output", "tracking_error", "control"} <= {*record.signals}
     outputs, desired = record["controlled_output"], record["desired_output"]
@@ -169,9 +157,11 @@ def test_rules_5_and_6_its_record_has_what_follows_and_theory(controller):
 @pytest.mark.slow
 def test_a_controller_that_is_sampled_is_logged(controller):
     if controller.takes_over:
-        controller = TaskController(Task([Approach(), Press(20.0)]), *laws(), sample_period=SAMPLE)
-    loop, context = wired(controller, sampling=Sampling(SAMPLE, delay=SAMPLE))
-    simulate(loop.diagram, context, 0.02, fixed_step())
+        controller = dd.TaskController(
+            dd.Task([dd.Approach(), dd.Press(20.0)]), *laws(), sample_period=SAMPLE
+        )
+    loop, context = wired(controller, sampling=dd.Sampling(SAMPLE, delay=SAMPLE))
+    dd.simulate(loop.diagram, context, 0.02, fixed_step())
     assert np.isfinite(loop.record(context)["control"]).all()
 
 

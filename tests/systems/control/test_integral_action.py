@@ -5,30 +5,19 @@ import pytest
 from arms import arm, error_controlled, law, numbers, touching
 from numpy.testing import assert_allclose
 
-from drake_dae import (
-    ConstantReference,
-    RobotModel,
-    RobotPlant,
-    SinusoidReference,
-    TrackingController,
-    TrackingLaw,
-    find_structure,
-    make_closed_loop,
-    poles,
-    simulate,
-)
+import drake_dae as dd
 from drake_dae.dae import linearize_loop
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import GainError, ModelError
 from drake_dae.robots import KnownForce
 
-WANTED = [SinusoidReference(0.3, 0.2, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
+WANTED = [dd.SinusoidReference(0.3, 0.2, 1.5), dd.SinusoidReference(20.0, 5.0, 2.0)]
 
 
 def follow(model, tracking, duration, *, start=None, change=None, wanted=WANTED, sensor=None):
     """The closed loop and its record, from rest with errors, or with other plant parameters."""
-    plant = RobotPlant(model, structure=tracking.structure)
-    loop = make_closed_loop(plant, tracking, wanted, LoopSettings(sensor=sensor))
+    plant = dd.RobotPlant(model, structure=tracking.structure)
+    loop = dd.make_closed_loop(plant, tracking, wanted, LoopSettings(sensor=sensor))
     context = loop.diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
     q = model.configuration([0.28], [1.2, -1.6])
@@ -38,7 +27,7 @@ def follow(model, tracking, duration, *, start=None, change=None, wanted=WANTED,
     if start is not None:
         controller = loop.controller.GetMyMutableContextFromRoot(context)
         loop.controller.set_integral(controller, start)
-    simulate(loop.diagram, context, duration, error_controlled(1e-9))
+    dd.simulate(loop.diagram, context, duration, error_controlled(1e-9))
     return loop, loop.record(context)
 
 
@@ -48,9 +37,9 @@ def test_errors_are_those_of_one_more_pole():
     e_2(0) = -6 sigma(0), and the integrals are those of the recorded errors.
     """
     model, structure = arm("two_link").model, arm("two_link").structure
-    tracking = TrackingLaw(
+    tracking = dd.TrackingLaw(
         model.dae,
-        poles({"tool.z": -4.0, "wall.force": -6.0}),
+        dd.poles({"tool.z": -4.0, "wall.force": -6.0}),
         structure=structure,
         measured_force=True,
         integral=["tool.z", "wall.force"],
@@ -73,13 +62,13 @@ def test_a_push_that_the_law_does_not_know_is_integrated_away():
     """At rest A_h F / w^2 off without, with A_h by MultibodyPlant; nothing with it."""
     push = KnownForce("tool", name="push")
     smooth = touching("two_link")
-    model = RobotModel(
+    model = dd.RobotModel(
         smooth.links, smooth.constraints, smooth.outputs, [1.2, -1.6], known_forces=[push]
     )
-    structure = find_structure(model.dae)
-    wanted, ends = [ConstantReference(0.3), ConstantReference(20.0)], {}
+    structure = dd.find_structure(model.dae)
+    wanted, ends = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)], {}
     for names in ([], ["tool.z"]):
-        tracking = TrackingLaw(model.dae, poles(-8.0), structure=structure, integral=names)
+        tracking = dd.TrackingLaw(model.dae, dd.poles(-8.0), structure=structure, integral=names)
         _, record = follow(
             model, tracking, 4.0, change={"push.force": [0.0, 0.0, 6.0]}, wanted=wanted
         )
@@ -96,10 +85,10 @@ def test_a_push_that_the_law_does_not_know_is_integrated_away():
 
 def controller_of():
     found = arm("two_link")
-    tracking = TrackingLaw(
-        found.model.dae, poles(-4.0), structure=found.structure, integral=["tool.z"]
+    tracking = dd.TrackingLaw(
+        found.model.dae, dd.poles(-4.0), structure=found.structure, integral=["tool.z"]
     )
-    controller = TrackingController(tracking)
+    controller = dd.TrackingController(tracking)
     context = controller.CreateDefaultContext()
     state = found.structure.states[1]
     controller.GetInputPort("estimated_state").FixValue(context, state)
@@ -126,12 +115,12 @@ def test_what_makes_no_sense_is_refused():
     found = arm("two_link")
     system, known = found.model.dae, {"structure": found.structure}
     with pytest.raises(GainError, match=r"wall\.force"):
-        TrackingLaw(system, poles(-4.0), integral=["wall.force"], **known)
+        dd.TrackingLaw(system, dd.poles(-4.0), integral=["wall.force"], **known)
     with pytest.raises(GainError, match=r"'tool\.z'"):
-        TrackingLaw(system, poles(-4.0), integral=["tool.z", "tool.z"], **known)
+        dd.TrackingLaw(system, dd.poles(-4.0), integral=["tool.z", "tool.z"], **known)
     with pytest.raises(GainError, match=r"integral: .*tool\.y"):
-        TrackingLaw(system, poles(-4.0), integral=["tool.y"], **known)
-    controller = TrackingController(law("two_link"))
+        dd.TrackingLaw(system, dd.poles(-4.0), integral=["tool.y"], **known)
+    controller = dd.TrackingController(law("two_link"))
     with pytest.raises(ModelError, match="integral"):
         controller.set_integral(controller.CreateDefaultContext(), [0.0])
     controller, context = controller_of()

@@ -9,19 +9,7 @@ from members import subclasses
 from pydrake.trajectories import PiecewisePolynomial
 from runs import some
 
-from drake_dae import (
-    CircleReference,
-    ConstantReference,
-    CsvReference,
-    ExpressionReference,
-    LineReference,
-    PointToPointReference,
-    PolylineReference,
-    Reference,
-    ReferenceGenerator,
-    SinusoidReference,
-    WaypointsReference,
-)
+import drake_dae as dd
 from drake_dae.errors import ReferenceSignalError
 from drake_dae.references import PathLimits, ReferenceRows
 from drake_dae.systems import TrajectoryReference
@@ -35,37 +23,39 @@ EDGES = [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5]]
 
 
 MEMBERS = {
-    "constant": ConstantReference([0.3, -2.0]),
-    "sinusoids": SinusoidReference(1.0, [0.5, -0.2], [1.3, 2.1], [0.1, 0.7]),
-    "point to point": PointToPointReference([0.0, 2.0], [1.0, -1.0], 0.3, 1.7, order=3),
-    "expression": ExpressionReference(lambda t: [ca.exp(-t) * ca.cos(2 * t), t**3]),
-    "parameters": ExpressionReference(
+    "constant": dd.ConstantReference([0.3, -2.0]),
+    "sinusoids": dd.SinusoidReference(1.0, [0.5, -0.2], [1.3, 2.1], [0.1, 0.7]),
+    "point to point": dd.PointToPointReference([0.0, 2.0], [1.0, -1.0], 0.3, 1.7, order=3),
+    "expression": dd.ExpressionReference(lambda t: [ca.exp(-t) * ca.cos(2 * t), t**3]),
+    "parameters": dd.ExpressionReference(
         lambda t, rise, sway: [rise * ca.sin(2 * t), ca.dot(sway, ca.vertcat(t, t**2))],
         {"rise": 0.3, "sway": [0.5, -0.2]},
     ),
     "trajectory": TrajectoryReference(PATH),
-    "line": LineReference([0.0, 1.0], [0.8, 0.4], LIMITS, 0.2),
-    "circle": CircleReference([0.0, 1.0], 0.3, period=2.0),
-    "turn": CircleReference([0.0, 1.0], 0.1, limits=LIMITS),
-    "polyline": PolylineReference(EDGES, LIMITS, 0.2),
-    "polyline of many pieces": PolylineReference(EDGES, LIMITS, 0.01),
-    "waypoints": WaypointsReference([[0.0, 0.0], [0.3, 0.2], [0.5, 0.0]], [0.1, 0.8, 1.9]),
-    "file": CsvReference(
+    "line": dd.LineReference([0.0, 1.0], [0.8, 0.4], LIMITS, 0.2),
+    "circle": dd.CircleReference([0.0, 1.0], 0.3, period=2.0),
+    "turn": dd.CircleReference([0.0, 1.0], 0.1, limits=LIMITS),
+    "polyline": dd.PolylineReference(EDGES, LIMITS, 0.2),
+    "polyline of many pieces": dd.PolylineReference(EDGES, LIMITS, 0.01),
+    "waypoints": dd.WaypointsReference([[0.0, 0.0], [0.3, 0.2], [0.5, 0.0]], [0.1, 0.8, 1.9]),
+    "file": dd.CsvReference(
         str(Path(__file__).parent / "steps.csv"), ["x"], smoothing=0.3, tolerance=0.2
     ),
-    "rows": ReferenceRows(ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)),
+    "rows": ReferenceRows(
+        dd.ExpressionReference(lambda t: [t**3, ca.sin(3 * t), ca.cos(t)]), (2, 0)
+    ),
     "rows of a trajectory": ReferenceRows(TrajectoryReference(PATH), (1,)),
 }
 
 TIMES = (0.41, 0.93, 1.62)
 
 ROUGH = {
-    "waypoints": WaypointsReference([[0.0], [1.0]], [0.0, 1.0], order=2),
-    "line": LineReference(0.0, 1.0, LIMITS, order=2),
-    "polyline": PolylineReference([[0.0], [1.0]], LIMITS, 0.1, order=2),
-    "rows": ReferenceRows(ExpressionReference(lambda t: [t, ca.fabs(t - 1.0)]), (1,)),
-    "point to point": PointToPointReference(0.0, 1.0, 0.0, 1.0, order=1),
-    "expression": ExpressionReference(lambda t: ca.fabs(t - 1.0)),
+    "waypoints": dd.WaypointsReference([[0.0], [1.0]], [0.0, 1.0], order=2),
+    "line": dd.LineReference(0.0, 1.0, LIMITS, order=2),
+    "polyline": dd.PolylineReference([[0.0], [1.0]], LIMITS, 0.1, order=2),
+    "rows": ReferenceRows(dd.ExpressionReference(lambda t: [t, ca.fabs(t - 1.0)]), (1,)),
+    "point to point": dd.PointToPointReference(0.0, 1.0, 0.0, 1.0, order=1),
+    "expression": dd.ExpressionReference(lambda t: ca.fabs(t - 1.0)),
     "trajectory": TrajectoryReference(PiecewisePolynomial.FirstOrderHold([0, 1, 2], [[0, 1, 0]])),
 }
 
@@ -77,7 +67,7 @@ def table(reference, degree, time):
 
 
 def test_no_member_is_left_out():
-    assert subclasses(Reference) <= {type(member) for member in MEMBERS.values()}
+    assert subclasses(dd.Reference) <= {type(member) for member in MEMBERS.values()}
 
 
 def rules_1_and_2_size_and_layout(reference):
@@ -154,7 +144,7 @@ def rule_6_traced_together_the_values_are_the_same(reference):
     time = ca.SX.sym("t")
     rows = reference.expression(degrees, time)
     traced = None if rows is None else ca.Function("rows", [time], [rows])
-    generator = ReferenceGenerator([ConstantReference(7.0), reference], [1, *degrees])
+    generator = dd.ReferenceGenerator([dd.ConstantReference(7.0), reference], [1, *degrees])
     for moment in TIMES:
         stacked = generator.reference(moment)
         np.testing.assert_array_equal(stacked[:2], [7.0, 0.0])

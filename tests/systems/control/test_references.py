@@ -8,26 +8,20 @@ import pytest
 from pydrake.math import BsplineBasis
 from pydrake.trajectories import BsplineTrajectory, PiecewisePolynomial
 
-from drake_dae import (
-    ConstantReference,
-    ExpressionReference,
-    PointToPointReference,
-    ReferenceGenerator,
-    SinusoidReference,
-)
+import drake_dae as dd
 from drake_dae.errors import NonFiniteError, ReferenceSignalError, SimulationError
 from drake_dae.systems import TrajectoryReference
 
 
 def table(signal, degree, time):
     """(outputs, derivatives) of one signal at a time."""
-    generator = ReferenceGenerator([signal], [degree] * signal.size)
+    generator = dd.ReferenceGenerator([signal], [degree] * signal.size)
     return generator.reference(time).reshape(signal.size, degree + 1)
 
 
 def test_sums_of_sinusoids():
     t, a, w, p = 0.7, np.array([0.5, -2.0]), np.array([3.0, 0.4]), np.array([0.1, 1.0])
-    found = table(SinusoidReference(4.0, a, w, p), 4, t)[0]
+    found = table(dd.SinusoidReference(4.0, a, w, p), 4, t)[0]
     angle = w * t + p
     expected = [
         4.0 + np.sum(a * np.sin(angle)),
@@ -41,7 +35,7 @@ def test_sums_of_sinusoids():
 
 def test_quintic():
     """Order 2 is 10 s^3 - 15 s^4 + 6 s^5."""
-    signal = PointToPointReference(1.0, 3.0, 2.0, 4.0)
+    signal = dd.PointToPointReference(1.0, 3.0, 2.0, 4.0)
     for time in (2.3, 3.0, 3.9):
         s = (time - 2.0) / 2.0
         expected = [
@@ -54,7 +48,7 @@ def test_quintic():
 
 @pytest.mark.parametrize("order", [2, 4, 6])
 def test_moves_are_smooth_at_both_ends_and_held_outside(order):
-    signal = PointToPointReference([0.0, 5.0], [1.0, 4.0], 1.0, 2.0, order)
+    signal = dd.PointToPointReference([0.0, 5.0], [1.0, 4.0], 1.0, 2.0, order)
     for time, value in ((0.5, [0.0, 5.0]), (2.5, [1.0, 4.0])):
         found = table(signal, order, time)
         np.testing.assert_array_equal(found[:, 0], value)
@@ -87,7 +81,7 @@ def test_drake_trajectories():
 def test_functions_of_casadi(symbol):
     time = symbol.sym("t")
     function = ca.Function("f", [time], [ca.sin(time), time**3])
-    signal = ExpressionReference(function)
+    signal = dd.ExpressionReference(function)
     expected = [[np.sin(0.7), np.cos(0.7), -np.sin(0.7)], [0.343, 1.47, 4.2]]
     np.testing.assert_allclose(table(signal, 2, 0.7), expected, rtol=1e-14)
 
@@ -100,23 +94,23 @@ def hold(values):
     ("make", "message"),
     [
         (
-            lambda: ReferenceGenerator([ConstantReference(1.0)], [2, 2]),
+            lambda: dd.ReferenceGenerator([dd.ConstantReference(1.0)], [2, 2]),
             r"1.*2",
         ),
         (
-            lambda: ReferenceGenerator([PointToPointReference(0, 1, 0, 1)], [4]),
+            lambda: dd.ReferenceGenerator([dd.PointToPointReference(0, 1, 0, 1)], [4]),
             "order=4",
         ),
         (
-            lambda: ReferenceGenerator([TrajectoryReference(hold([0, 1, 0]))], [2]),
+            lambda: dd.ReferenceGenerator([TrajectoryReference(hold([0, 1, 0]))], [2]),
             r"row 0.*-2.*t = 1 s",
         ),
-        (lambda: PointToPointReference(0, 1, 1, 1), r"end_time.*1"),
-        (lambda: PointToPointReference([1, 2, 3], [1, 2], 0, 1), r"start.*3.*end.*2"),
-        (lambda: PointToPointReference(0, 1, 0, 1, order=600), "order"),
-        (lambda: SinusoidReference(0.0, "a", 1.0), "amplitudes"),
-        (lambda: SinusoidReference(0.0, [1, 2], [1, 2, 3]), r"amplitudes.*2.*frequencies.*3"),
-        (lambda: ExpressionReference(lambda t: ca.SX.sym("a") * t), r"\ba\b"),
+        (lambda: dd.PointToPointReference(0, 1, 1, 1), r"end_time.*1"),
+        (lambda: dd.PointToPointReference([1, 2, 3], [1, 2], 0, 1), r"start.*3.*end.*2"),
+        (lambda: dd.PointToPointReference(0, 1, 0, 1, order=600), "order"),
+        (lambda: dd.SinusoidReference(0.0, "a", 1.0), "amplitudes"),
+        (lambda: dd.SinusoidReference(0.0, [1, 2], [1, 2, 3]), r"amplitudes.*2.*frequencies.*3"),
+        (lambda: dd.ExpressionReference(lambda t: ca.SX.sym("a") * t), r"\ba\b"),
         (
             lambda: TrajectoryReference(PiecewisePolynomial(np.eye(2))),
             "2 x 2",
@@ -129,13 +123,13 @@ def test_refusals(make, message):
 
 
 def test_a_time_outside_a_trajectory_is_refused():
-    generator = ReferenceGenerator([TrajectoryReference(hold([0, 1]))], [1])
+    generator = dd.ReferenceGenerator([TrajectoryReference(hold([0, 1]))], [1])
     with pytest.raises(SimulationError, match=r"t = 1\.5 s.* 0 to 1 s"):
         generator.reference(1.5)
 
 
 def test_a_reference_that_is_not_finite_raises():
-    generator = ReferenceGenerator([ExpressionReference(lambda t: ca.log(t))], [1])
+    generator = dd.ReferenceGenerator([dd.ExpressionReference(lambda t: ca.log(t))], [1])
     with pytest.raises(NonFiniteError, match="t = 0 s"):
         generator.GetOutputPort("reference").Eval(generator.CreateDefaultContext())
 
@@ -151,43 +145,43 @@ NOT_SMOOTH = {
 @pytest.mark.parametrize("what", NOT_SMOOTH)
 def test_kinks_and_steps_are_refused_where_derivatives_are_needed(what):
     """CasADi would take the derivatives of one side, and the error would leave its prediction."""
-    signal = ExpressionReference(NOT_SMOOTH[what])
+    signal = dd.ExpressionReference(NOT_SMOOTH[what])
     message = rf"row 0 .*{what}"
     with pytest.raises(ReferenceSignalError, match=message):
-        ReferenceGenerator([ConstantReference(0.0), signal], [0, 1])
+        dd.ReferenceGenerator([dd.ConstantReference(0.0), signal], [0, 1])
     # A force that is met at once may jump.
-    generator = ReferenceGenerator([signal], [0])
+    generator = dd.ReferenceGenerator([signal], [0])
     assert np.isfinite(generator.reference(0.5)).all()
 
 
 def test_the_function_of_the_real_numbers_is_no_reference():
-    signal = ExpressionReference(lambda t: math.sin(t))
+    signal = dd.ExpressionReference(lambda t: math.sin(t))
     with pytest.raises(ReferenceSignalError, match=r"nan.*casadi\.sin"):
-        ReferenceGenerator([signal], [2])
+        dd.ReferenceGenerator([signal], [2])
 
 
 @pytest.mark.parametrize("value", [None, "a", [None], {}])
 def test_what_is_no_expression_is_refused(value):
     with pytest.raises(ReferenceSignalError, match="expression"):
-        ExpressionReference(lambda t: value)
+        dd.ExpressionReference(lambda t: value)
 
 
 def test_what_is_no_reference_is_refused():
     with pytest.raises(ReferenceSignalError, match=r"values.*'a'"):
-        ConstantReference("a")
+        dd.ConstantReference("a")
     message = r"references\[1\].*0\.5"
     with pytest.raises(ReferenceSignalError, match=message):
-        ReferenceGenerator([ConstantReference(0.3), 0.5], [0, 0])
+        dd.ReferenceGenerator([dd.ConstantReference(0.3), 0.5], [0, 0])
 
 
 def pushing():
     """Two references that share a parameter, and one with two entries."""
-    rise = ExpressionReference(lambda t, rise: rise * ca.sin(2 * t), {"rise": 0.3})
-    push = ExpressionReference(
+    rise = dd.ExpressionReference(lambda t, rise: rise * ca.sin(2 * t), {"rise": 0.3})
+    push = dd.ExpressionReference(
         lambda t, rise, push: rise + ca.dot(push, ca.vertcat(1, t)),
         {"rise": 0.3, "push": [5.0, 1.0]},
     )
-    return ReferenceGenerator([rise, push], [1, 0])
+    return dd.ReferenceGenerator([rise, push], [1, 0])
 
 
 def test_parameters_stand_in_the_context():
@@ -212,11 +206,11 @@ def test_wrong_parameters_are_refused():
     with pytest.raises(ReferenceSignalError, match="nan"):
         generator.set_parameter(context, "rise", np.nan)
     with pytest.raises(ReferenceSignalError, match="'a'"):
-        ExpressionReference(lambda t, a: a * t, {"a": [np.inf]})
+        dd.ExpressionReference(lambda t, a: a * t, {"a": [np.inf]})
     with pytest.raises(ReferenceSignalError, match="TypeError"):
-        ExpressionReference(lambda t: t, {"a": 1.0})
+        dd.ExpressionReference(lambda t: t, {"a": 1.0})
     with pytest.raises(ReferenceSignalError, match=r"\bb\b"):
-        ExpressionReference(lambda t, a: a * t + ca.SX.sym("b"), {"a": 1.0})
-    one, two = (ExpressionReference(lambda t, a: a * t, {"a": a}) for a in (1.0, 2.0))
+        dd.ExpressionReference(lambda t, a: a * t + ca.SX.sym("b"), {"a": 1.0})
+    one, two = (dd.ExpressionReference(lambda t, a: a * t, {"a": a}) for a in (1.0, 2.0))
     with pytest.raises(ReferenceSignalError, match="'a'"):
-        ReferenceGenerator([one, two], [0, 0])
+        dd.ReferenceGenerator([one, two], [0, 0])

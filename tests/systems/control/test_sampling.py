@@ -11,21 +11,7 @@ from numpy.testing import assert_allclose
 from pydrake.systems.analysis import Simulator
 from runs import run, run_scenario, scenario
 
-from drake_dae import (
-    ConstantReference,
-    ControlLimits,
-    DaePlant,
-    DaeSystem,
-    ForceSensor,
-    RobotPlant,
-    Sampling,
-    SinusoidReference,
-    TrackingLaw,
-    build_scenario,
-    make_closed_loop,
-    poles,
-    simulate,
-)
+import drake_dae as dd
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError, WiringError
 
@@ -33,18 +19,21 @@ STEP = error_controlled(1e-10)
 K, T = 3.0, 0.05
 
 
-def integrator() -> DaeSystem:
+def integrator() -> dd.DaeSystem:
     """x' = u, z = x."""
     x, none = ca.SX.sym("x"), ca.SX(0, 1)
-    return DaeSystem(x, 0 * x, ca.SX(1, 0), ca.SX(1), none, x, ca.SX(1, 0), nominal_state=[1.0])
+    return dd.DaeSystem(x, 0 * x, ca.SX(1, 0), ca.SX(1), none, x, ca.SX(1, 0), nominal_state=[1.0])
 
 
 def pursue(reference, sampling, duration, **more):
     """x' = u behind u = r' - K (x - r), from x = 1."""
     system = integrator()
-    plant = DaePlant(system)
-    loop = make_closed_loop(
-        plant, TrackingLaw(system, poles(-K)), [reference], LoopSettings(sampling=sampling, **more)
+    plant = dd.DaePlant(system)
+    loop = dd.make_closed_loop(
+        plant,
+        dd.TrackingLaw(system, dd.poles(-K)),
+        [reference],
+        LoopSettings(sampling=sampling, **more),
     )
     context = loop.diagram.CreateDefaultContext()
     return loop, context, run(loop, context, duration, STEP)
@@ -60,8 +49,8 @@ def at(record, name, times):
 @pytest.mark.parametrize(("period", "delay"), [(1e-3, 1e6), (1e-12, 1.0), (1.0, 1e300)])
 def test_a_delay_of_more_samples_than_are_kept_is_refused(period, delay):
     with pytest.raises(ModelError, match="10000"):
-        Sampling(period, delay)
-    assert Sampling(period, 9_999.5 * period).late_samples == 10_000
+        dd.Sampling(period, delay)
+    assert dd.Sampling(period, 9_999.5 * period).late_samples == 10_000
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.3 * T, T, 1.3 * T, 2.0 * T])
@@ -76,13 +65,13 @@ def test_held_control_is_that_of_the_map_by_hand(delay):
     for k in range(20):
         u.append(-K * x[k])
         x.append(x[k] + rest * u[max(k - whole - 1, 0)] + (T - rest) * u[max(k - whole, 0)])
-    _, _, record = pursue(ConstantReference(0.0), Sampling(T, delay), 20 * T)
+    _, _, record = pursue(dd.ConstantReference(0.0), dd.Sampling(T, delay), 20 * T)
     assert_allclose(at(record, "state", T * np.arange(20)), x[:20], atol=1e-12)
 
 
 def test_state_reference_and_log_belong_to_one_instant():
     """The control of [t_k, t_(k+1)) is r'(t_k) - K (x(t_k) - r(t_k)) of what is logged for t_k."""
-    _, _, record = pursue(SinusoidReference(0.2, 0.4, 5.0), Sampling(T), 1.0)
+    _, _, record = pursue(dd.SinusoidReference(0.2, 0.4, 5.0), dd.Sampling(T), 1.0)
     times = T * np.arange(20)
     r = 0.2 + 0.4 * np.sin(5.0 * times)
     assert_allclose(at(record, "reference", times), r, atol=1e-14)
@@ -92,12 +81,12 @@ def test_state_reference_and_log_belong_to_one_instant():
 
 def test_run_that_goes_on_keeps_what_is_held():
     """Drake makes the events of the moment where a run ends once more when the next one begins."""
-    half, whole = Sampling(T, 0.3 * T), 20 * T
-    loop, context, _ = pursue(ConstantReference(0.0), half, 9.9 * T)
+    half, whole = dd.Sampling(T, 0.3 * T), 20 * T
+    loop, context, _ = pursue(dd.ConstantReference(0.0), half, 9.9 * T)
     on = error_controlled(1e-10)
     on.start_time = context.get_time()
-    simulate(loop.diagram, context, 10.1 * T, on)
-    _, _, record = pursue(ConstantReference(0.0), half, whole)
+    dd.simulate(loop.diagram, context, 10.1 * T, on)
+    _, _, record = pursue(dd.ConstantReference(0.0), half, whole)
     assert_allclose(loop.record(context)["state"][-1], record["state"][-1], atol=1e-12)
 
 
@@ -124,7 +113,7 @@ def test_error_falls_with_the_period(periods):
 
 def test_limits_cut_and_tell_when():
     """x' = -1 from 1 until K x = 1, then exp(-K t): cut off for 1 - 1/K seconds."""
-    _, _, record = pursue(ConstantReference(0.0), None, 2.0, control_limits=[1.0])
+    _, _, record = pursue(dd.ConstantReference(0.0), None, 2.0, control_limits=[1.0])
     end = 1.0 - 1.0 / K
     assert np.all(np.abs(record["control"]) <= 1.0)
     cut = record.time[record["excess"][:, 0] != 0.0]
@@ -139,9 +128,12 @@ def test_limits_cut_and_tell_when():
 def test_integrals_stand_still_while_a_drive_is_at_its_limit():
     """x' = 1 - K x cannot be held by |u| <= 0.5: without the hold the integral runs away."""
     system = integrator()
-    tracking = TrackingLaw(system, poles(-K), integral=[system.output_signals[0].name])
-    loop = make_closed_loop(
-        DaePlant(system), tracking, [ConstantReference(5.0)], LoopSettings(control_limits=[0.5])
+    tracking = dd.TrackingLaw(system, dd.poles(-K), integral=[system.output_signals[0].name])
+    loop = dd.make_closed_loop(
+        dd.DaePlant(system),
+        tracking,
+        [dd.ConstantReference(5.0)],
+        LoopSettings(control_limits=[0.5]),
     )
     context = loop.diagram.CreateDefaultContext()
     record = run(loop, context, 1.0, STEP)
@@ -152,27 +144,27 @@ def test_integrals_stand_still_while_a_drive_is_at_its_limit():
 @pytest.mark.parametrize(
     ("gain", "sensor", "sampling"),
     [
-        (1.1, None, Sampling(0.01)),
-        (1.1, None, Sampling(0.01, 0.02)),
-        (2.0, (0.01, 0.0), Sampling(0.01, 0.02)),
+        (1.1, None, dd.Sampling(0.01)),
+        (1.1, None, dd.Sampling(0.01, 0.02)),
+        (2.0, (0.01, 0.0), dd.Sampling(0.01, 0.02)),
     ],
 )
 def test_sampled_force_loop_that_diverges_is_refused(gain, sensor, sampling):
     found = arm("two_link")
-    tracking = TrackingLaw(
+    tracking = dd.TrackingLaw(
         found.model.dae,
-        poles(-4.0),
+        dd.poles(-4.0),
         structure=found.structure,
         measured_force=True,
         force_gain=gain,
     )
-    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
+    wanted = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
     with pytest.raises(WiringError, match="force_gain"):
-        make_closed_loop(
-            RobotPlant(found.model, structure=found.structure),
+        dd.make_closed_loop(
+            dd.RobotPlant(found.model, structure=found.structure),
             tracking,
             wanted,
-            LoopSettings(sensor=sensor and ForceSensor(1, *sensor), sampling=sampling),
+            LoopSettings(sensor=sensor and dd.ForceSensor(1, *sensor), sampling=sampling),
         )
 
 
@@ -180,21 +172,21 @@ def test_a_law_that_reads_the_force_of_its_own_first_control_is_reported():
     """A sensor that samples has a force at the start."""
     arms = arm("two_link")
     more = {"structure": arms.structure, "measured_force": True, "force_gain": 0.4}
-    tracking = TrackingLaw(arms.model.dae, poles(-4.0), **more)
-    wanted, sampling = [ConstantReference(0.3), ConstantReference(20.0)], Sampling(0.01)
+    tracking = dd.TrackingLaw(arms.model.dae, dd.poles(-4.0), **more)
+    wanted, sampling = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)], dd.Sampling(0.01)
 
     def pressed(sensor):
-        plant = RobotPlant(arms.model, structure=arms.structure)
-        loop = make_closed_loop(
+        plant = dd.RobotPlant(arms.model, structure=arms.structure)
+        loop = dd.make_closed_loop(
             plant, tracking, wanted, LoopSettings(sensor=sensor, sampling=sampling)
         )
         context = loop.diagram.CreateDefaultContext()
-        simulate(loop.diagram, context, 0.3, error_controlled(1e-6))
+        dd.simulate(loop.diagram, context, 0.3, error_controlled(1e-6))
         return loop.record(context)["constraint_force"][-1]
 
     with pytest.raises(WiringError, match="sample_period"):
         pressed(None)
-    assert pressed(ForceSensor(1, sample_period=0.01)) == pytest.approx(20.0, abs=0.5)
+    assert pressed(dd.ForceSensor(1, sample_period=0.01)) == pytest.approx(20.0, abs=0.5)
 
 
 @pytest.mark.parametrize(
@@ -202,14 +194,14 @@ def test_a_law_that_reads_the_force_of_its_own_first_control_is_reported():
 )
 def test_sampling_refuses_times_that_are_none(numbers, name):
     with pytest.raises(ModelError, match=name):
-        Sampling(*numbers)
+        dd.Sampling(*numbers)
 
 
 def test_limits_that_are_none_are_refused():
     with pytest.raises(ModelError, match=r"\b0\b"):
-        ControlLimits([1.0, 0.0])
+        dd.ControlLimits([1.0, 0.0])
     with pytest.raises(WiringError, match=r"2.*1"):
-        pursue(ConstantReference(0.0), None, 1.0, control_limits=[1.0, 1.0])
+        pursue(dd.ConstantReference(0.0), None, 1.0, control_limits=[1.0, 1.0])
 
 
 def grown(gain, a, late):
@@ -232,14 +224,14 @@ def test_what_a_sampled_sensor_takes_is_read_a_sample_later(gain, late):
     a = np.exp(-period / lag)
     radius = grown(gain, a, late + 1)
     assert grown(gain, a, late) < 0.99 < 1.01 < radius
-    found, sampling = arm("two_link"), Sampling(period, late * period)
+    found, sampling = arm("two_link"), dd.Sampling(period, late * period)
     more = {"structure": found.structure, "measured_force": True, "force_gain": gain}
-    tracking = TrackingLaw(found.model.dae, poles(-4.0), **more)
-    wanted = [ConstantReference(0.3), ConstantReference(20.0)]
-    settings = LoopSettings(sensor=ForceSensor(1, lag, period), sampling=sampling)
-    plant = RobotPlant(found.model, structure=found.structure)
+    tracking = dd.TrackingLaw(found.model.dae, dd.poles(-4.0), **more)
+    wanted = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
+    settings = LoopSettings(sensor=dd.ForceSensor(1, lag, period), sampling=sampling)
+    plant = dd.RobotPlant(found.model, structure=found.structure)
     with pytest.raises(WiringError, match="force_gain") as told:
-        make_closed_loop(plant, tracking, wanted, settings)
+        dd.make_closed_loop(plant, tracking, wanted, settings)
     number = float(re.search(r"force error by ([0-9.]*[0-9])", str(told.value))[1])
     assert number == pytest.approx(radius, rel=5e-3)
 
@@ -258,7 +250,7 @@ def test_force_of_a_sampled_sensor_follows_the_control_of_two_samples_before():
         "law.force_gain=5",
         "sampling={period: 0.01, delay: 0.0}",
     )
-    loop, context = build_scenario(found)
+    loop, context = dd.build_scenario(found)
     loop.sensor.set_force(loop.sensor.GetMyMutableContextFromRoot(context), [19.0])
     simulator, errors, a = Simulator(loop.diagram, context), [], np.exp(-0.2)
     for k in range(12):

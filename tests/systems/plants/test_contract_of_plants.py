@@ -12,23 +12,7 @@ from members import SpringyPlant
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from drake_dae import (
-    CompliantPlant,
-    ConstantReference,
-    ContactMaterial,
-    ContactPlant,
-    DaePlant,
-    RobotPlant,
-    TrackingLaw,
-    build_scenario,
-    load_scenario,
-    make_animation,
-    make_closed_loop,
-    poles,
-    simulate,
-    start_meshcat,
-    sweep,
-)
+import drake_dae as dd
 from drake_dae.diagrams.record import Record
 from drake_dae.diagrams.wiring import log_steps
 from drake_dae.errors import ModelError, ScenarioError
@@ -41,23 +25,23 @@ from drake_dae.systems.plants.contract import Plant
 
 def contact():
     found = arm("two_link")
-    robot = load_scenario(find_scenario("two_link_wall")).robot
-    return ContactPlant(
+    robot = dd.load_scenario(find_scenario("two_link_wall")).robot
+    return dd.ContactPlant(
         found.model,
         lambda plant, scene_graph: read_robot(robot, plant, scene_graph),
-        ContactMaterial(),
+        dd.ContactMaterial(),
         structure=found.structure,
     )
 
 
 MEMBERS = {
-    "dae": lambda: DaePlant(arm("two_link").model.dae, structure=arm("two_link").structure),
-    "robot": lambda: RobotPlant(arm("two_link").model, structure=arm("two_link").structure),
+    "dae": lambda: dd.DaePlant(arm("two_link").model.dae, structure=arm("two_link").structure),
+    "robot": lambda: dd.RobotPlant(arm("two_link").model, structure=arm("two_link").structure),
     "contact": contact,
-    "compliant": lambda: CompliantPlant(
+    "compliant": lambda: dd.CompliantPlant(
         arm("two_link").model, PointMaterial(), structure=arm("two_link").structure
     ),
-    "compliant, continuous": lambda: CompliantPlant(
+    "compliant, continuous": lambda: dd.CompliantPlant(
         arm("two_link").model, PointMaterial(0.0), structure=arm("two_link").structure
     ),
     "springy": lambda: SpringyPlant(arm("two_link").model, arm("two_link").structure),
@@ -101,7 +85,7 @@ def run_of(plant, duration=0.02):
     context = diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
     plant.set_consistent_state(own, plant.dae.nominal_state)
-    simulate(diagram, context, duration, fixed_step())
+    dd.simulate(diagram, context, duration, fixed_step())
     return own, Record.from_log(log, ports, context)
 
 
@@ -153,7 +137,7 @@ def test_rule_6_parameters(plant):
     with pytest.raises(ModelError, match="nothing"):
         plant.set_parameter(context, "nothing", 1.0)
     place = plant.dae.parameter_slice("link2.mass")
-    if isinstance(plant, ContactPlant | SpringyPlant):  # A test knows its members.
+    if isinstance(plant, dd.ContactPlant | SpringyPlant):  # A test knows its members.
         with pytest.raises(ModelError, match=type(plant).__name__):
             plant.set_parameter(context, "link2.mass", 6.0)
         np.testing.assert_array_equal(plant.parameters(context), before)
@@ -184,12 +168,14 @@ def test_rules_3_and_8_projection_and_contact(plant):
 
 @cache
 def arm_law():
-    return TrackingLaw(arm("two_link").model.dae, poles(-4.0), structure=arm("two_link").structure)
+    return dd.TrackingLaw(
+        arm("two_link").model.dae, dd.poles(-4.0), structure=arm("two_link").structure
+    )
 
 
 @pytest.fixture(scope="module")
 def meshcat():
-    return start_meshcat()
+    return dd.start_meshcat()
 
 
 @pytest.mark.slow
@@ -198,13 +184,13 @@ def test_every_member_goes_through_a_loop(plant, meshcat):
 
     From N* on, with steps of 1 ms, RK5 leaves less than 1e-8 of errors of 5 cm.
     """
-    references = [ConstantReference(0.3), ConstantReference(20.0)]
-    loop = make_closed_loop(plant, arm_law(), references, meshcat=meshcat)
+    references = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
+    loop = dd.make_closed_loop(plant, arm_law(), references, meshcat=meshcat)
     context = loop.diagram.CreateDefaultContext()
     q = arm("two_link").model.configuration([0.35], [1.2, -1.6])
     own = plant.GetMyMutableContextFromRoot(context)
     plant.set_consistent_state(own, [*q, 0.0, 0.0])
-    simulate(loop.diagram, context, 0.1, fixed_step())
+    dd.simulate(loop.diagram, context, 0.1, fixed_step())
     record = loop.record(context)
     assert {"state", "constraint_force", "reference", "control", "tracking_error"} <= {
         *record.signals
@@ -216,18 +202,20 @@ def test_every_member_goes_through_a_loop(plant, meshcat):
     is_drawn = loop.diagram.HasSubsystemNamed("constraint_force_visualizer")
     assert is_drawn is (plant.model is not None)
     if plant.model is not None:
-        assert "<html" in make_animation(loop, record, context)
+        assert "<html" in dd.make_animation(loop, record, context)
 
 
 def test_a_plant_from_outside_springs_back_as_its_equation_says():
     """k = k_0 (1 + a t) exp(-a t) from k' = 0; RK5 with 1 ms leaves 1e-9 of it."""
     plant = MEMBERS["springy"]()
-    loop = make_closed_loop(plant, arm_law(), [ConstantReference(0.3), ConstantReference(20.0)])
+    loop = dd.make_closed_loop(
+        plant, arm_law(), [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
+    )
     context = loop.diagram.CreateDefaultContext()
     own = plant.GetMyMutableContextFromRoot(context)
     state = plant.set_consistent_state(own, plant.dae.nominal_state)
     plant.set_state(own, state + np.array([1e-3, 0.0, 0.0, 0.0]))
-    simulate(loop.diagram, context, 0.2, fixed_step())
+    dd.simulate(loop.diagram, context, 0.2, fixed_step())
     record = loop.record(context)
     k, at = record["constraint_residual"][:, 0], 40.0 * record.time
     np.testing.assert_allclose(k, k[0] * (1.0 + at) * np.exp(-at), atol=1e-6 * abs(k[0]))
@@ -251,8 +239,8 @@ def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monk
     changes = [{"start.errors": {"tool.z": 0.05}}, {"start.errors": {"tool.z": 0.02}}]
     found = []
     for kind in ("!OwnPlant {maker: 'members:SpringyPlant'}", "!IdealConstraints {}"):
-        scenario = load_scenario(path, [*settings, f"plant={kind}"])
-        study = sweep(scenario, changes, tmp_path / f"{len(found)}.db", workers=1)
+        scenario = dd.load_scenario(path, [*settings, f"plant={kind}"])
+        study = dd.sweep(scenario, changes, tmp_path / f"{len(found)}.db", workers=1)
         assert {run.outcome for run in study.results} == {Outcome.FINISHED}, study.results
         found.append([run.figures["largest error of tool.z [m]"] for run in study.results])
     np.testing.assert_allclose(found[0], found[1], rtol=1e-5)
@@ -271,6 +259,8 @@ def test_a_plant_from_outside_is_run_by_a_scenario_and_by_a_sweep(tmp_path, monk
 )
 def test_a_plant_that_cannot_be_loaded_is_refused_with_its_key(maker, told):
     with pytest.raises(ScenarioError, match=told):
-        build_scenario(
-            load_scenario(find_scenario("two_link_wall"), [f"plant=!OwnPlant {{maker: '{maker}'}}"])
+        dd.build_scenario(
+            dd.load_scenario(
+                find_scenario("two_link_wall"), [f"plant=!OwnPlant {{maker: '{maker}'}}"]
+            )
         )

@@ -9,18 +9,7 @@ from numpy.testing import assert_allclose
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_dae import (
-    DaePlant,
-    DaeSystem,
-    ExpressionReference,
-    Parameter,
-    ReferenceGenerator,
-    TrackingLaw,
-    find_structure,
-    linearize,
-    make_closed_loop,
-    poles,
-)
+import drake_dae as dd
 from drake_dae.dae import find_constraint_structure
 from drake_dae.diagrams import LoopSettings
 from drake_dae.errors import ModelError
@@ -40,7 +29,7 @@ def rod(exogenous=("length",), **fields):
         "nominal_state": [0.1, -1.0, 0.0, 0.0],
         "name": "rod",
     }
-    return DaeSystem.from_functions(
+    return dd.DaeSystem.from_functions(
         ["x", "y", "vx", "vy"],
         **(given | fields),
         parameters={"length": 1.0},
@@ -48,7 +37,7 @@ def rod(exogenous=("length",), **fields):
     )
 
 
-LENGTH = ExpressionReference(lambda t: 1 + 0.3 * ca.sin(3 * t))
+LENGTH = dd.ExpressionReference(lambda t: 1 + 0.3 * ca.sin(3 * t))
 
 
 def length(t):
@@ -60,7 +49,7 @@ def moving(plant, control):
     """A simulator of a plant whose rod moves, its context and the plant's."""
     builder = DiagramBuilder()
     builder.AddSystem(plant)
-    generator = ReferenceGenerator([LENGTH], plant.exogenous_layout.degrees)
+    generator = dd.ReferenceGenerator([LENGTH], plant.exogenous_layout.degrees)
     builder.AddSystem(generator)
     builder.Connect(generator.get_output_port(), plant.GetInputPort("exogenous"))
     diagram = builder.Build()
@@ -76,7 +65,7 @@ def moving(plant, control):
 def test_the_multiplier_is_that_of_the_moving_constraint():
     """x . x' = w w' and its derivative, by hand; to round-off of numbers of size 10."""
     system = rod()
-    structure = find_structure(system)
+    structure = dd.find_structure(system)
     assert (structure.constraint_degrees, structure.output_degrees) == ((2,), (2, 0))
     values = system.parameter_values
     w, rate, acceleration = 1.3, -0.4, 0.7
@@ -87,7 +76,7 @@ def test_the_multiplier_is_that_of_the_moving_constraint():
     position, velocity = x[:2], x[2:]
     assert_allclose(position @ position, w**2, rtol=1e-14)
     assert_allclose(position @ velocity, w * rate, rtol=1e-14)
-    plant = DaePlant(system, structure=structure)
+    plant = dd.DaePlant(system, structure=structure)
     context = plant.CreateDefaultContext()
     plant.GetInputPort("exogenous").FixValue(context, [w, rate, acceleration])
     plant.GetInputPort("control").FixValue(context, [2.0, -3.0])
@@ -101,7 +90,7 @@ def test_the_multiplier_is_that_of_the_moving_constraint():
 
 def test_a_motion_is_that_of_the_angle():
     """w a'' + 2 w' a' + g sin a = control along the circle, by DOP853; both at 1e-11 per step."""
-    plant = DaePlant(rod())
+    plant = dd.DaePlant(rod())
     simulator, own = moving(plant, [0.5, 0.2])
     start = plant.set_consistent_state(own, [0.4, -0.9, 0.0, 0.0])
     angle = np.arctan2(start[0], -start[1])
@@ -128,9 +117,9 @@ def test_a_motion_is_that_of_the_angle():
 def test_the_law_keeps_its_prediction_while_the_constraint_moves():
     """Off (30) by the integrator's accuracy alone; a law that takes the rod for rigid is not."""
     system = rod()
-    law = TrackingLaw(system, poles(-4.0))
-    goal = ExpressionReference(lambda t: [0.5 + 0.2 * ca.sin(t), 3 + ca.cos(2 * t)])
-    loop = make_closed_loop(DaePlant(system), law, [goal], LoopSettings(exogenous=[LENGTH]))
+    law = dd.TrackingLaw(system, dd.poles(-4.0))
+    goal = dd.ExpressionReference(lambda t: [0.5 + 0.2 * ca.sin(t), 3 + ca.cos(2 * t)])
+    loop = dd.make_closed_loop(dd.DaePlant(system), law, [goal], LoopSettings(exogenous=[LENGTH]))
     simulator = Simulator(loop.diagram)
     config = error_controlled(1e-10)
     config.integration_scheme = "runge_kutta5"
@@ -149,7 +138,7 @@ def test_the_law_keeps_its_prediction_while_the_constraint_moves():
 
 def test_without_a_wire_nothing_moves():
     """The same rates as where the length is an ordinary parameter, also after it was changed."""
-    still, held = DaePlant(rod()), DaePlant(rod(exogenous=()))
+    still, held = dd.DaePlant(rod()), dd.DaePlant(rod(exogenous=()))
     assert (still.num_input_ports(), held.num_input_ports()) == (2, 1)
     rates = []
     for plant in (still, held):
@@ -168,8 +157,8 @@ def test_the_linear_model_knows_what_moves():
     values = system.parameter_values
     values[system.exogenous.places([2])] = 1.3, -0.4, 0.7
     x, u = structure.manifold.project([0.5, -1.2, 0.3, 0.4], values), np.array([2.0, -3.0])
-    found = linearize(system, x, u, structure=structure, parameters=values)
-    plant = DaePlant(system, structure=structure)
+    found = dd.linearize(system, x, u, structure=structure, parameters=values)
+    plant = dd.DaePlant(system, structure=structure)
     context = plant.CreateDefaultContext()
     plant.GetInputPort("exogenous").FixValue(context, [1.3, -0.4, 0.7])
     plant.GetInputPort("control").FixValue(context, u)
@@ -191,8 +180,8 @@ def test_what_moves_must_be_a_parameter():
 
 
 def test_chains_that_need_too_many_derivatives_are_refused():
-    x, w = ca.SX.sym("x", 12), Parameter("w", 0.0, exogenous=True)
-    system = DaeSystem(
+    x, w = ca.SX.sym("x", 12), dd.Parameter("w", 0.0, exogenous=True)
+    system = dd.DaeSystem(
         state=x,
         f=ca.vertcat(x[1:], 0),
         g=ca.vertcat(ca.SX(11, 1), 1),

@@ -9,27 +9,14 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, RandomSource, Sine
 from runs import some
 
-from drake_dae import (
-    ConstantReference,
-    DcMotors,
-    ElectrohydraulicServos,
-    FlexibleJoints,
-    ForceSensor,
-    ReferenceGenerator,
-    RobotPlant,
-    SinusoidReference,
-    TrackingController,
-    TrackingLaw,
-    poles,
-    rollout,
-)
+import drake_dae as dd
 from drake_dae.errors import GainError, ModelError
 from drake_dae.running import start_values
 
-MOTORS = DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
-SERVOS = ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)
-MOVE = [SinusoidReference(0.3, 0.1, 1.5), SinusoidReference(20.0, 5.0, 2.0)]
-HOLD = [ConstantReference(0.3), ConstantReference(20.0)]
+MOTORS = dd.DcMotors(torque_constant=0.5, inductance=1e-2, resistance=1.0, gear_ratio=100.0)
+SERVOS = dd.ElectrohydraulicServos(stiffness=1e6, leakage=1e-6, geometry=0.05)
+MOVE = [dd.SinusoidReference(0.3, 0.1, 1.5), dd.SinusoidReference(20.0, 5.0, 2.0)]
+HOLD = [dd.ConstantReference(0.3), dd.ConstantReference(20.0)]
 
 
 def run(
@@ -49,11 +36,11 @@ def run(
 
     Returns the times, the errors z - r (k, 2), and the last plant state and reference.
     """
-    chosen = TrackingLaw(model.dae, poles(-10.0), measured_force=measured, force_gain=gain)
+    chosen = dd.TrackingLaw(model.dae, dd.poles(-10.0), measured_force=measured, force_gain=gain)
     builder = DiagramBuilder()
-    plant = builder.AddSystem(RobotPlant(model, structure=chosen.structure))
-    controller = builder.AddSystem(TrackingController(chosen))
-    reference = builder.AddSystem(ReferenceGenerator(references, chosen.degrees))
+    plant = builder.AddSystem(dd.RobotPlant(model, structure=chosen.structure))
+    controller = builder.AddSystem(dd.TrackingController(chosen))
+    reference = builder.AddSystem(dd.ReferenceGenerator(references, chosen.degrees))
     builder.Connect(plant.GetOutputPort("state"), controller.GetInputPort("estimated_state"))
     builder.Connect(reference.GetOutputPort("reference"), controller.GetInputPort("reference"))
     builder.Connect(controller.GetOutputPort("control"), plant.GetInputPort("control"))
@@ -80,7 +67,7 @@ def run(
     if sensor is not None:
         sensor.set_force(sensor.GetMyMutableContextFromRoot(context), [r[second] + felt])
     times = np.linspace(0.0, duration, round(100 * duration) + 1)
-    (found,) = rollout(diagram, *start_values(diagram, context), times, config=fixed_step())
+    (found,) = dd.rollout(diagram, *start_values(diagram, context), times, config=fixed_step())
     assert found.failure is None
     wanted = np.array([reference.reference(t)[[0, second]] for t in times])
     errors = found.record["controlled_output"] - wanted
@@ -94,7 +81,10 @@ def run(
 def test_rigid_force_error_shrinks_to_1_over_1_plus_g(gain):
     """(61) with a wrong mass: within 5 %, of which the lag takes about 1 %; position untouched."""
     model = arm("two_link").model
-    slow, sensor = [MOVE[0], SinusoidReference(20.0, 5.0, 0.5)], ForceSensor(1, time_constant=2e-3)
+    slow, sensor = (
+        [MOVE[0], dd.SinusoidReference(20.0, 5.0, 0.5)],
+        dd.ForceSensor(1, time_constant=2e-3),
+    )
     times, without, *_ = run(model, slow)
     _, feedback, *_ = run(model, slow, measured=True, gain=gain, sensor=sensor)
     later = times > 1.0
@@ -121,11 +111,13 @@ def test_measured_force_removes_the_static_error_behind_motors(stage):
 
 def test_with_a_right_model_measured_force_changes_nothing():
     """lambda is the model's lambda then: the law is the same to round-off."""
-    for stages in ([MOTORS], [FlexibleJoints(8000.0, inertia=1.0)]):
+    for stages in ([MOTORS], [dd.FlexibleJoints(8000.0, inertia=1.0)]):
         model = touching("two_link", stages)
-        plain = TrackingLaw(model.dae, poles(-4.0))
-        fed = TrackingLaw(model.dae, poles(-4.0), structure=plain.structure, measured_force=True)
-        plant = RobotPlant(model, structure=plain.structure)
+        plain = dd.TrackingLaw(model.dae, dd.poles(-4.0))
+        fed = dd.TrackingLaw(
+            model.dae, dd.poles(-4.0), structure=plain.structure, measured_force=True
+        )
+        plant = dd.RobotPlant(model, structure=plain.structure)
         context = plant.CreateDefaultContext()
         random = np.random.default_rng(5)
         for state in plain.structure.states[:4]:
@@ -143,9 +135,9 @@ def test_with_a_right_model_measured_force_changes_nothing():
 def test_law_59_with_measured_force():
     """u of (59) less u without Gbar is J^T Gbar (lambda - r_2)."""
     found, gain = arm("two_link"), 3.0
-    fed = TrackingLaw(
+    fed = dd.TrackingLaw(
         found.model.dae,
-        poles(-4.0),
+        dd.poles(-4.0),
         structure=found.structure,
         measured_force=True,
         force_gain=gain,
@@ -164,7 +156,7 @@ def test_law_59_with_measured_force():
 @pytest.mark.parametrize("gain", [0.5, 1.5])
 def test_a_sampled_loop_multiplies_the_error_by_minus_g(gain):
     """One-sample delay: stable below 1, as `largest_stable_gain` says."""
-    sensor = ForceSensor(1, sample_period=0.02)
+    sensor = dd.ForceSensor(1, sample_period=0.02)
     assert sensor.largest_stable_gain() == 1.0
     model = arm("two_link").model
     given = {"wrong": 1.0, "felt": 1.0, "duration": 0.2}
@@ -179,7 +171,7 @@ def test_the_lagged_loop_decays_at_1_plus_g_over_tau():
     gain, tau = 3.0, 0.2
     model = arm("two_link").model
     given = {"wrong": 1.0, "felt": 2.0, "duration": 0.3}
-    sensor = ForceSensor(1, tau)
+    sensor = dd.ForceSensor(1, tau)
     times, error, *_ = run(model, HOLD, measured=True, gain=gain, sensor=sensor, **given)
     # RK5 at 1 ms, (1 + G) / tau = 20 1/s: about 1e-12.
     expected = -gain * 2.0 * np.exp(-(1 + gain) / tau * times)
@@ -211,7 +203,7 @@ def sensed(sensor, source, duration, generator=None, step=1e-3):
 def test_lag_and_bias():
     """A step of 8 N: 8 (1 - exp(-t / tau)) + bias, to the integrator's 1e-12."""
     times, values = sensed(
-        ForceSensor(1, time_constant=0.1, bias=0.5), ConstantVectorSource([8.0]), 0.5
+        dd.ForceSensor(1, time_constant=0.1, bias=0.5), ConstantVectorSource([8.0]), 0.5
     )
     np.testing.assert_allclose(values[0], 8.0 * (1 - np.exp(-times / 0.1)) + 0.5, atol=1e-10)
 
@@ -219,7 +211,7 @@ def test_lag_and_bias():
 @pytest.mark.parametrize(("lag", "period"), [(0.1, 0.0), (0.0, 0.1), (0.1, 0.1)])
 def test_a_sensor_starts_as_if_it_had_felt_a_constant_force(lag, period):
     """It shows that force and its bias from the start on, as long as the force stays."""
-    sensor, force = ForceSensor(2, lag, period, [0.5, -0.2]), [8.0, 3.0]
+    sensor, force = dd.ForceSensor(2, lag, period, [0.5, -0.2]), [8.0, 3.0]
     builder = DiagramBuilder()
     builder.AddSystem(sensor)
     source = builder.AddSystem(ConstantVectorSource(force))
@@ -235,7 +227,7 @@ def test_a_sensor_starts_as_if_it_had_felt_a_constant_force(lag, period):
 
 
 def test_sampling_holds():
-    times, values = sensed(ForceSensor(1, sample_period=0.1), Sine(1.0, 3.0, 0.0, 1), 1.0)
+    times, values = sensed(dd.ForceSensor(1, sample_period=0.1), Sine(1.0, 3.0, 0.0, 1), 1.0)
     # Between its samples, at the middle of each period, it shows the last one.
     middle = np.isclose(times % 0.1, 0.05)
     np.testing.assert_allclose(values[0, middle], np.sin(3.0 * (times[middle] - 0.05)), atol=1e-9)
@@ -243,7 +235,7 @@ def test_sampling_holds():
 
 @pytest.mark.slow
 def test_noise_has_its_deviation_and_its_seed():
-    sensor = lambda: ForceSensor(2, 0.01, noise_deviation=[0.5, 2.0])  # noqa: E731
+    sensor = lambda: dd.ForceSensor(2, 0.01, noise_deviation=[0.5, 2.0])  # noqa: E731
 
     def noisy(duration, seed):
         still = ConstantVectorSource([0.0, 0.0])
@@ -257,7 +249,7 @@ def test_noise_has_its_deviation_and_its_seed():
 
 
 def test_the_drift_of_a_sensor_is_set_in_a_context():
-    sensor = ForceSensor(2, sample_period=0.1)
+    sensor = dd.ForceSensor(2, sample_period=0.1)
     context = sensor.CreateDefaultContext()
     context.SetTime(3.0)
     sensor.set_errors(context, 1.0, 0.0, [0.5, -0.5])
@@ -267,30 +259,34 @@ def test_the_drift_of_a_sensor_is_set_in_a_context():
 
 
 def test_sensor_has_no_direct_feedthrough_from_force():
-    for sensor in (ForceSensor(1, 0.01), ForceSensor(1, 0.0, 0.01), ForceSensor(1, 0.01, 0.01)):
+    for sensor in (
+        dd.ForceSensor(1, 0.01),
+        dd.ForceSensor(1, 0.0, 0.01),
+        dd.ForceSensor(1, 0.01, 0.01),
+    ):
         assert not sensor.HasAnyDirectFeedthrough()
 
 
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: ForceSensor(1), ModelError, "close"),
-        (lambda: ForceSensor(1, -0.1), ModelError, "-0.1"),
+        (lambda: dd.ForceSensor(1), ModelError, "close"),
+        (lambda: dd.ForceSensor(1, -0.1), ModelError, "-0.1"),
         (
-            lambda: TrackingLaw(
-                arm("two_link").model.dae, poles(-4.0), measured_force=True, force_gain=-0.5
+            lambda: dd.TrackingLaw(
+                arm("two_link").model.dae, dd.poles(-4.0), measured_force=True, force_gain=-0.5
             ),
             GainError,
             "force_gain",
         ),
         (
-            lambda: TrackingLaw(arm("two_link").model.dae, poles(-4.0), force_gain=1.0),
+            lambda: dd.TrackingLaw(arm("two_link").model.dae, dd.poles(-4.0), force_gain=1.0),
             GainError,
             "measured_force",
         ),
         (
-            lambda: TrackingLaw(
-                arm("two_link").model.dae, poles(-4.0), measured_force=True, force_gain=np.eye(2)
+            lambda: dd.TrackingLaw(
+                arm("two_link").model.dae, dd.poles(-4.0), measured_force=True, force_gain=np.eye(2)
             ),
             GainError,
             r"shape \(1, 1\)",

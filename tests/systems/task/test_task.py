@@ -21,20 +21,7 @@ from polishing import (
     task_loop,
 )
 
-from drake_dae import (
-    Approach,
-    ConstantReference,
-    Dwell,
-    Move,
-    Press,
-    Release,
-    Retreat,
-    RobotPlant,
-    Task,
-    TaskController,
-    TrackingLaw,
-    poles,
-)
+import drake_dae as dd
 from drake_dae.diagrams import wire_loop
 from drake_dae.diagrams.record import phase_spans, phases_at
 from drake_dae.errors import ModelError, WiringError
@@ -62,8 +49,8 @@ def test_phases_follow_each_other_and_say_why(whole):
     assert [change.phase for change in found] == names
     assert [change.place for change in found] == list(range(6))
     assert [change.in_contact for change in found] == [False, True, True, True, False, False]
-    assert found[1].reason == "after a force of 0.5 N"
-    assert str(found[1]).startswith(f"{found[1].time:.6g} s: Press, after a force of 0.5 N; ")
+    assert found[1].reason == "after a force above 0.5 N"
+    assert str(found[1]).startswith(f"{found[1].time:.6g} s: Press, after a force above 0.5 N; ")
     # A sample at the moment of a change shows what was before.
     places = np.searchsorted([c.time for c in found[1:]], record.time)
     assert_allclose(np.argmax(record["phase"], axis=1), places)
@@ -105,8 +92,8 @@ def test_control_jumps_by_what_the_laws_explain_otherwise():
     All outputs are at their references, and the free law presses with lambda.
     """
     system, pressed = arm("two_link").model.dae, 7.0
-    law = TrackingLaw(system, poles(POLE))
-    free = TrackingLaw(open_contact(system, "wall.force"), poles(POLE))
+    law = dd.TrackingLaw(system, dd.poles(POLE))
+    free = dd.TrackingLaw(open_contact(system, "wall.force"), dd.poles(POLE))
     state = np.array([1.1, -1.5, 0.4, -0.7])
     found = numbers("two_link", *np.split(state, 2))
     J, P = found.constraint_jacobian, found.output_jacobian
@@ -128,11 +115,11 @@ def test_outputs_stay_at_their_references(whole):
     assert_allclose(record["controlled_output"][-1, [0, 2]], [0.4, 0.03], atol=1e-4)
 
 
-HOLDING = Approach(0.1, over=0.1)
+HOLDING = dd.Approach(0.1, over=0.1)
 
 
 def test_a_task_that_may_not_try_again_ends():
-    phases = (HOLDING, Press(10.0, over=0.1), Dwell(5.0, if_lost="approach"))
+    phases = (HOLDING, dd.Press(10.0, over=0.1), dd.Dwell(5.0, if_lost="approach"))
     loop = task_loop(phases, patience=0.02, retries=0)
     context = started(loop, distance=0.01)
     run_on(loop, context, 0.4)
@@ -144,8 +131,8 @@ def test_a_task_that_may_not_try_again_ends():
 
 def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
     """A reference below zero pulls it off, and it has gone when the last phase ends."""
-    pulled = Move({"wall.force": -5.0}, 0.05, over=0.01)
-    loop = task_loop([HOLDING, Press(10.0, over=0.1), pulled])
+    pulled = dd.Move({"wall.force": -5.0}, 0.05, over=0.01)
+    loop = task_loop([HOLDING, dd.Press(10.0, over=0.1), pulled])
     context = started(loop, distance=0.01)
     run_on(loop, context, 1.5)
     last = loop.changes(loop.record(context))[-1]
@@ -155,7 +142,7 @@ def test_robot_that_has_left_at_the_end_of_a_task_rests_as_a_free_one():
 
 def test_guard_that_never_fires_is_reported():
     """The wall is 20 mm away, and 0.2 s are not enough."""
-    loop = task_loop([Approach(SPEED, within=0.2), Press(20.0)])
+    loop = task_loop([dd.Approach(SPEED, within=0.2), dd.Press(20.0)])
     context = started(loop)
     run_on(loop, context, 1.0)
     record = loop.record(context)
@@ -165,7 +152,9 @@ def test_guard_that_never_fires_is_reported():
 
 
 def test_task_may_begin_in_contact():
-    loop = task_loop([Press(5.0, over=0.05), Release(over=0.05), Retreat(0.001, over=0.05)])
+    loop = task_loop(
+        [dd.Press(5.0, over=0.05), dd.Release(over=0.05), dd.Retreat(0.001, over=0.05)]
+    )
     context = started(loop, distance=0.0)
     run_on(loop, context, 0.17)
     record = loop.record(context)
@@ -204,7 +193,7 @@ def test_fade_begins_as_given_and_ends_at_rest():
 
 def test_free_member_is_the_robot_without_the_wall():
     """v' by MultibodyPlant alone: z'' and phi'' are as the law wants them."""
-    law = TrackingLaw(open_contact(arm("two_link").model.dae, "wall.force"), poles(POLE))
+    law = dd.TrackingLaw(open_contact(arm("two_link").model.dae, "wall.force"), dd.poles(POLE))
     assert [signal.name for signal in law.system.output_signals] == ["tool.z", "wall.distance"]
     q, v = np.array([1.1, -1.5]), np.array([0.4, -0.7])
     reference = np.array([0.2, 0.1, -0.3, 0.05, 0.2, 0.4])
@@ -222,25 +211,27 @@ def test_free_member_is_the_robot_without_the_wall():
 
 
 def controller_of(phases, law, free_law, period=PERIOD):
-    return TaskController(Task(phases), law, free_law, sample_period=period)
+    return dd.TaskController(dd.Task(phases), law, free_law, sample_period=period)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Approach(-0.1), "Approach: speed"),
-        (lambda: Approach(over=0.0), "Approach: over"),
-        (lambda: Press(0.0), "Press: force"),
-        (lambda: Move({}, -1.0), "Move: duration"),
-        (lambda: Task([Approach()], contact_force=0.0), "contact_force"),
-        (lambda: controller_of([Approach()], laws()[0], laws()[0]), "contact"),
-        (lambda: controller_of([Approach()], *laws(), 0.0), "sample_period"),
+        (lambda: dd.Approach(-0.1), "Approach: speed"),
+        (lambda: dd.Approach(over=0.0), "Approach: over"),
+        (lambda: dd.Press(0.0), "Press: force"),
+        (lambda: dd.Move({}, -1.0), "Move: duration"),
+        (lambda: dd.Task([dd.Approach()], contact_force=0.0), "contact_force"),
+        (lambda: controller_of([dd.Approach()], laws()[0], laws()[0]), "contact"),
+        (lambda: controller_of([dd.Approach()], *laws(), 0.0), "sample_period"),
         (
-            lambda: controller_of([Move({"tool.x": 1.0}, 1.0)], *laws()),
+            lambda: controller_of([dd.Move({"tool.x": 1.0}, 1.0)], *laws()),
             r"Move: .*'tool\.x'",
         ),
         (
-            lambda: task_loop([Approach(), Move({"wall.distance": ConstantReference(1.0)}, 1.0)]),
+            lambda: task_loop(
+                [dd.Approach(), dd.Move({"wall.distance": dd.ConstantReference(1.0)}, 1.0)]
+            ),
             r"'wall\.distance'",
         ),
         (
@@ -256,9 +247,9 @@ def test_wrong_numbers_and_names_are_refused(make, message):
 
 def test_a_task_on_ideal_constraints_is_refused():
     """They neither open nor strike."""
-    plant = RobotPlant(arm("two_link").model)
+    plant = dd.RobotPlant(arm("two_link").model)
     with pytest.raises(WiringError, match="CompliantPlant"):
-        wire_loop(plant, TaskController(Task([Approach()]), *laws(), sample_period=PERIOD))
+        wire_loop(plant, dd.TaskController(dd.Task([dd.Approach()]), *laws(), sample_period=PERIOD))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import (
@@ -21,7 +22,6 @@ from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import (
     BodyIndex,
-    Frame,
     ModelInstanceIndex,
     RigidBody,
     SpatialInertia,
@@ -38,7 +38,6 @@ from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.errors import ModelError
 from drake_dae.robots import (
     Constraint,
-    ConstraintWrenches,
     PosedShape,
     RobotModel,
     frame_named,
@@ -50,7 +49,7 @@ from drake_dae.systems.plants.contact.contact_forces import (
     contact_block,
     contact_force_signals,
 )
-from drake_dae.systems.plants.contact.contact_laws import touching
+from drake_dae.systems.plants.contact.contact_laws import ball_normals, touching
 from drake_dae.systems.plants.contact.contact_material import (
     ContactMaterial,
     ball_properties,
@@ -178,10 +177,16 @@ class ContactPlant(Diagram, Plant):
         self, plant: MultibodyPlant, scene_graph: SceneGraph, material: ContactMaterial
     ) -> list[tuple[list[GeometryId], list[GeometryId]]]:
         """Balls on the robot and solids in the world for each constraint, and nothing else."""
-        pairs = []
-        for constraint, (frame, center, point) in zip(
-            self.model.constraints, self._balls(plant, material), strict=True
-        ):
+        model, pairs = self.model, []
+        touches = touching(model)
+        at = [model.links.position(touch.frame, touch.point) for _, touch in touches]
+        outputs = {"normals": ball_normals(model), "points": ca.vertcat(*at)}
+        nominal = self.structure.manifold.project(self.dae.nominal_state, self._values)
+        placed = self.dae.trace("balls", outputs, often=False)(nominal, self._values)
+        rows = (np.reshape(each, (-1, 3)) for each in placed)
+        for (constraint, touch), normal, point in zip(touches, *rows, strict=True):
+            frame = GetScopedFrameByName(plant, touch.frame)
+            center = touch.point + material.radius * normal
             values = own_values(constraint, self.dae, self._values)
             solids = solids_of(constraint, values, point, material)
             friction, name = material.friction or 0.0, constraint.friction_parameter
@@ -212,26 +217,6 @@ class ContactPlant(Diagram, Plant):
         for pair in pairs:
             manager.Apply(CollisionFilterDeclaration().AllowBetween(*map(GeometrySet, pair)))
         return pairs
-
-    def _balls(
-        self, plant: MultibodyPlant, material: ContactMaterial
-    ) -> list[tuple[Frame, FloatArray, FloatArray]]:
-        """For each constraint its frame, the center of its ball in it, and its contact point."""
-        model, values, drawn = self.model, self._values, self.model.links.plant
-        assert drawn is not None  # check_model.
-        state = self.structure.manifold.project(self.dae.nominal_state, values)
-        # A unit force without sliding gives the normal.
-        state[model.links.q.numel() :] = 0.0
-        context = drawn.CreateDefaultContext()
-        drawn.SetPositionsAndVelocities(context, state[: drawn.num_multibody_states()])
-        loads = ConstraintWrenches(model, values)
-        wrenches = loads(state, np.ones(self.dae.num_constraints))
-        balls = []
-        for name, point, normal in zip(loads.frames, wrenches.points, wrenches.forces, strict=True):
-            pose = GetScopedFrameByName(drawn, name).CalcPoseInWorld(context)
-            center = pose.inverse() @ (point + material.radius * normal)
-            balls.append((GetScopedFrameByName(plant, name), center, point))
-        return balls
 
     def parameters(self, context: Context) -> FloatArray:
         return self._values.copy()

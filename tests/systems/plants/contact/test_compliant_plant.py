@@ -37,19 +37,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPortSelection
 from pydrake.systems.primitives import ConstantVectorSource, FirstOrderTaylorApproximation
 from runs import some
 
-from drake_dae import (
-    CoincidentPoints,
-    CompliantPlant,
-    Cylinder,
-    Ellipsoid,
-    Plane,
-    PointCoordinates,
-    PointOnSurface,
-    RobotModel,
-    Sphere,
-    rollout,
-    simulate,
-)
+import drake_dae as dd
 from drake_dae.errors import ModelError, SimulationError
 from drake_dae.running import start_values
 from drake_dae.scenario.shipped import FOLDER
@@ -61,7 +49,7 @@ MATERIAL = {"stiffness": 1e5, "dissipation": 2.0, "friction": 0.3, "radius": 0.0
 class Pair(NamedTuple):
     """A CompliantPlant, and the same robot in a MultibodyPlant."""
 
-    plant: CompliantPlant
+    plant: dd.CompliantPlant
     diagram: object
     drake: MultibodyPlant
 
@@ -79,27 +67,27 @@ def drawn(shape: str):
     if shape == "plane":
         tilt = np.array([-1.0, 0.1, 0.2]) / np.linalg.norm([-1.0, 0.1, 0.2])
         solid = HalfSpace(), HalfSpace.MakePose(tilt, point)
-        return Plane(point=point, normal=tilt), solid
+        return dd.Plane(point=point, normal=tilt), solid
     center = point + np.array([radius, 0.0, 0.0])
     if shape == "cylinder":
-        surface = Cylinder(point=center, axis=(0.0, 0.0, 1.0), radius=radius)
+        surface = dd.Cylinder(point=center, axis=(0.0, 0.0, 1.0), radius=radius)
         return surface, (Rod(radius, 10.0), RigidTransform(center))
-    return Sphere(center=center, radius=radius), (Ball(radius), RigidTransform(center))
+    return dd.Sphere(center=center, radius=radius), (Ball(radius), RigidTransform(center))
 
 
 @cache
 def pair(shape: str, time_step: float, dissipation: float = 2.0) -> Pair:
     surface, (form, pose) = drawn(shape)
     links = arm("seven_joint").model
-    model = RobotModel(
+    model = dd.RobotModel(
         links.links,
-        [PointOnSurface("tool", surface, name="wall", friction=0.3)],
+        [dd.PointOnSurface("tool", surface, name="wall", friction=0.3)],
         links.outputs,
         links.nominal_positions,
         forces=["wall.force"],
     )
     material = PointMaterial(time_step, **{**MATERIAL, "dissipation": dissipation})
-    plant = CompliantPlant(model, material)
+    plant = dd.CompliantPlant(model, material)
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(time_step=time_step, contact_model="point")
     drake, scene = AddMultibodyPlant(config, builder)
@@ -203,14 +191,14 @@ def stepped(plant, state, control):
     return plant.state(context), plant.GetOutputPort("contact_force").Eval(context)
 
 
-def on_arm(surface, radius: float) -> CompliantPlant:
+def on_arm(surface, radius: float) -> dd.CompliantPlant:
     """The seven-joint arm on a surface."""
     links = arm("seven_joint").model
-    wall = PointOnSurface("tool", surface, name="wall", friction=0.3)
-    model = RobotModel(
+    wall = dd.PointOnSurface("tool", surface, name="wall", friction=0.3)
+    model = dd.RobotModel(
         links.links, [wall], links.outputs, links.nominal_positions, forces=["wall.force"]
     )
-    return CompliantPlant(model, PointMaterial(0.0, **{**MATERIAL, "radius": radius}))
+    return dd.CompliantPlant(model, PointMaterial(0.0, **{**MATERIAL, "radius": radius}))
 
 
 @pytest.mark.slow
@@ -222,8 +210,8 @@ def test_a_distance_that_is_exact_on_the_surface_alone_will_do(inside):
     leaves k d^2 / (2 R) = 0.05 N; at the center of the ball it would be 0.4 mm off, or 40 N.
     """
     center = (0.7 - 0.1, 0.0, 0.6) if inside else (0.7 + 0.1, 0.0, 0.6)
-    sphere = on_arm(Sphere(center, 0.1, inside=inside), 0.01)
-    ellipsoid = on_arm(Ellipsoid(center, (0.1, 0.1, 0.1), inside=inside), 0.01)
+    sphere = on_arm(dd.Sphere(center, 0.1, inside=inside), 0.01)
+    ellipsoid = on_arm(dd.Ellipsoid(center, (0.1, 0.1, 0.1), inside=inside), 0.01)
     found = []
     for state, _ in near_contact(sphere, 50, 3):
         for plant in (sphere, ellipsoid):
@@ -236,7 +224,7 @@ def test_a_distance_that_is_exact_on_the_surface_alone_will_do(inside):
 
 @pytest.mark.slow
 def test_a_ball_that_its_surface_has_no_room_for_is_refused():
-    hollow = Ellipsoid((0.7 - 0.05, 0.0, 0.6), (0.05, 0.05, 0.05), inside=True)
+    hollow = dd.Ellipsoid((0.7 - 0.05, 0.0, 0.6), (0.05, 0.05, 0.05), inside=True)
     plant = on_arm(hollow, 0.04)
     with pytest.raises(ModelError, match=r"0.06.*'wall'"):
         on_arm(hollow, 0.06)
@@ -245,7 +233,7 @@ def test_a_ball_that_its_surface_has_no_room_for_is_refused():
         plant.set_contact(context, replace(plant.material, radius=0.06))
 
 
-def sled(stop: float = np.inf) -> RobotModel:
+def sled(stop: float = np.inf) -> dd.RobotModel:
     """A block that slides along x and z, on a floor at z = 0, pulled along x and pressed by u."""
     plant = MultibodyPlant(0.0)
     inertia = SpatialInertia(2.0, np.zeros(3), UnitInertia.SolidCube(0.1))
@@ -259,9 +247,9 @@ def sled(stop: float = np.inf) -> RobotModel:
         plant.AddJointActuator(f"{joint.name()}_motor", joint, 1e3)
     plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
     plant.Finalize()
-    floor = Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
-    contact = PointOnSurface("block", floor, name="floor", friction=0.5)
-    return RobotModel.from_multibody(plant, [contact], [], forces=[])
+    floor = dd.Plane(point=[0.0, 0.0, 0.0], normal=[0.0, 0.0, 1.0])
+    contact = dd.PointOnSurface("block", floor, name="floor", friction=0.5)
+    return dd.RobotModel.from_multibody(plant, [contact], [], forces=[])
 
 
 PRESSED = [0.0, -1e-3, 0.0, 0.0]
@@ -285,9 +273,9 @@ def driven(plant, state, **inputs):
 
 def run_sled(time_step, pull, duration, **material):
     """The state of the sled under a pull and a press of 10 N, after a time."""
-    plant = CompliantPlant(sled(), PointMaterial(time_step, stiffness=1e4, **material))
+    plant = dd.CompliantPlant(sled(), PointMaterial(time_step, stiffness=1e4, **material))
     diagram, context, own = driven(plant, PRESSED, control=[pull, -10.0])
-    simulate(diagram, context, duration, fixed_step(1e-4))
+    dd.simulate(diagram, context, duration, fixed_step(1e-4))
     return plant.state(own)
 
 
@@ -309,12 +297,12 @@ def test_a_contact_opens_and_strikes_with_the_restitution_of_hunt_and_crossley()
 
     Steps of 1e-5 s of RK5 leave 1e-6 of it.
     """
-    plant = CompliantPlant(sled(), PointMaterial(0.0, stiffness=1e4, friction=0.0))
+    plant = dd.CompliantPlant(sled(), PointMaterial(0.0, stiffness=1e4, friction=0.0))
     diagram, context, own = driven(plant, [0.0, 0.05, 0.0, 0.0], control=[0.0, -20.0])
     fall = np.sqrt(2 * 0.05 / 10.0)
-    simulate(diagram, context, fall, fixed_step(1e-5))
+    dd.simulate(diagram, context, fall, fixed_step(1e-5))
     assert_allclose(plant.state(own)[3], -np.sqrt(2 * 10.0 * 0.05), rtol=1e-6)
-    simulate(diagram, context, 0.1, fixed_step(1e-5))
+    dd.simulate(diagram, context, 0.1, fixed_step(1e-5))
     state = plant.state(own)
     assert state[3] > 0.0
     energy = 0.5 * 2.0 * state[3] ** 2 + 20.0 * state[1]
@@ -325,10 +313,14 @@ def test_a_contact_opens_and_strikes_with_the_restitution_of_hunt_and_crossley()
 @pytest.mark.parametrize("time_step", [0.0, 1e-3])
 def test_a_moving_floor_takes_the_sled_along(time_step):
     """A floor at 0.2 m/s pulls the sled with mu N = 5 N until it is as fast, to within v_s."""
-    plant = CompliantPlant(
-        RobotModel(
+    plant = dd.CompliantPlant(
+        dd.RobotModel(
             sled().links,
-            [PointOnSurface("block", Plane([0, 0, 0], [0, 0, 1]), name="floor", friction=0.5)],
+            [
+                dd.PointOnSurface(
+                    "block", dd.Plane([0, 0, 0], [0, 0, 1]), name="floor", friction=0.5
+                )
+            ],
             [],
             forces=[],
             exogenous=["floor.position"],
@@ -338,18 +330,18 @@ def test_a_moving_floor_takes_the_sled_along(time_step):
     moving = np.zeros(plant.exogenous_layout.reference_size)
     moving[1] = 0.2  # x, x', ...
     diagram, context, own = driven(plant, PRESSED, control=[0.0, -10.0], exogenous=moving)
-    simulate(diagram, context, 0.05, fixed_step(1e-4))
+    dd.simulate(diagram, context, 0.05, fixed_step(1e-4))
     assert_allclose(plant.state(own)[2], 0.05 * 5.0 / 2.1, rtol=0.03)
-    simulate(diagram, context, 0.2, fixed_step(1e-4))
+    dd.simulate(diagram, context, 0.2, fixed_step(1e-4))
     assert_allclose(plant.state(own)[2], 0.2, atol=1e-4)
 
 
 def test_numbers_of_the_contact_change_in_a_context():
     """As if the plant had been made with them."""
     model = arm("two_link").model
-    plant = CompliantPlant(model, PointMaterial(friction=0.2))
+    plant = dd.CompliantPlant(model, PointMaterial(friction=0.2))
     other = PointMaterial(friction=0.6, stiffness=3e4, radius=0.02)
-    made = CompliantPlant(model, other)
+    made = dd.CompliantPlant(model, other)
     context = plant.CreateDefaultContext()
     plant.set_contact(context, other)
     wanted = made.CreateDefaultContext().get_numeric_parameter(0).value()
@@ -360,30 +352,30 @@ def test_numbers_of_the_contact_change_in_a_context():
 
 def test_a_joint_at_its_limit_ends_the_run_with_a_reason():
     """The sled slides up to the stop of its rail."""
-    plant = CompliantPlant(sled(stop=0.2), PointMaterial(1e-3, stiffness=1e4))
+    plant = dd.CompliantPlant(sled(stop=0.2), PointMaterial(1e-3, stiffness=1e4))
     diagram, context, _ = driven(plant, [0.0, -1e-3, 0.5, 0.0], control=[6.0, -10.0])
     with pytest.raises(SimulationError, match="!MultibodyPlant") as found:
-        simulate(diagram, context, 1.0)
+        dd.simulate(diagram, context, 1.0)
     assert 0.15 < found.value.state[0] < 0.2
     assert 0.0 < found.value.time < 1.0
     context = diagram.CreateDefaultContext()
     plant.set_state(plant.GetMyMutableContextFromRoot(context), [0.0, -1e-3, 0.5, 0.0])
-    (run,) = rollout(diagram, *start_values(diagram, context), [0.0, 1.0], compiled=False)
+    (run,) = dd.rollout(diagram, *start_values(diagram, context), [0.0, 1.0], compiled=False)
     assert str(run.failure) == str(found.value)
     assert_allclose(run.failure.state, found.value.state, atol=1e-12)
 
 
 def test_a_constraint_that_is_no_contact_is_refused():
     links = arm("two_link").model.links
-    pin = CoincidentPoints("world", (1.2, 0.0, 0.0), "tool", (0.0, 0.0, 0.0), "x")
-    model = RobotModel(links, [pin], [PointCoordinates("tool", "z")])
+    pin = dd.CoincidentPoints("world", (1.2, 0.0, 0.0), "tool", (0.0, 0.0, 0.0), "x")
+    model = dd.RobotModel(links, [pin], [dd.PointCoordinates("tool", "z")])
     with pytest.raises(ModelError, match="'pin'"):
-        CompliantPlant(model, PointMaterial())
+        dd.CompliantPlant(model, PointMaterial())
 
 
 def test_the_continuous_plant_has_the_linear_model_of_differences():
     """Central differences of 1e-7 in contact at rest leave 1e-5 of slopes up to k / m."""
-    plant = CompliantPlant(sled(), PointMaterial(0.0, stiffness=1e4, dissipation=1.0))
+    plant = dd.CompliantPlant(sled(), PointMaterial(0.0, stiffness=1e4, dissipation=1.0))
     context = plant.CreateDefaultContext()
     start, control = np.array([0.0, -1e-3, 3e-4, 1e-3]), np.array([1.0, -10.0])
     plant.set_state(context, start)

@@ -14,14 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from runs import run_scenario, scenario
 from two_arms import NOMINAL, add_two_arms, two_arms_plant
 
-from drake_dae import (
-    ContactMaterial,
-    ContactPlant,
-    Plane,
-    PointOnSurface,
-    RobotModel,
-    build_scenario,
-)
+import drake_dae as dd
 from drake_dae.dae import find_constraint_structure
 from drake_dae.errors import ScenarioError, WiringError
 from drake_dae.scenario.scenario import Scenario
@@ -90,12 +83,12 @@ def test_contact_forces_of_several_model_instances_are_those_of_drakes_results()
     tables = []
     for side in ("left", "right"):
         tool = links.GetFrameByName("tool", links.GetModelInstanceByName(side))
-        table = Plane(point=tool.CalcPoseInWorld(at).translation(), normal=(0, 0, 1))
-        tables.append(PointOnSurface(f"{side}::tool", table, name=side, friction=0.3))
-    model = RobotModel.from_multibody(links, tables, nominal_positions=NOMINAL)
+        table = dd.Plane(point=tool.CalcPoseInWorld(at).translation(), normal=(0, 0, 1))
+        tables.append(dd.PointOnSurface(f"{side}::tool", table, name=side, friction=0.3))
+    model = dd.RobotModel.from_multibody(links, tables, nominal_positions=NOMINAL)
     structure = find_constraint_structure(model.dae)
-    material = ContactMaterial(time_step=1e-3, stiffness=1e5)
-    plant = ContactPlant(model, add_two_arms, material, structure=structure)
+    material = dd.ContactMaterial(time_step=1e-3, stiffness=1e5)
+    plant = dd.ContactPlant(model, add_two_arms, material, structure=structure)
     context = plant.CreateDefaultContext()
     plant.GetInputPort("control").FixValue(context, 3.0 * np.sin(np.arange(14)))
     plant.set_consistent_state(context, model.dae.nominal_state)
@@ -178,7 +171,7 @@ def test_the_stiffness_of_a_hydroelastic_contact_is_drakes(sphere):
 
     A mesh with edges of 3 mm: the forces are 8 % off those of the round bodies at most.
     """
-    material = ContactMaterial(1e-3, contact_model="hydroelastic", modulus=1e6, radius=0.02)
+    material = dd.ContactMaterial(1e-3, contact_model="hydroelastic", modulus=1e6, radius=0.02)
     depth = 1e-3
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, 0.0)
@@ -269,9 +262,9 @@ def test_wall_may_stand_elsewhere_than_the_law_believes():
 )
 def test_what_drakes_contact_cannot_be_is_refused(settings, message):
     with pytest.raises(ScenarioError, match=message):
-        build_scenario(two_link(*settings))
+        dd.build_scenario(two_link(*settings))
 
 
 def test_delay_below_a_step_of_the_plant_is_refused():
     with pytest.raises((ScenarioError, WiringError), match=r"delay.*0\.001"):
-        build_scenario(two_link("sampling={period: 1.0e-3}"))
+        dd.build_scenario(two_link("sampling={period: 1.0e-3}"))

@@ -14,19 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 from runs import some
 
-from drake_dae import (
-    CompliantPlant,
-    DcMotors,
-    ElectrohydraulicServos,
-    FlexibleJoints,
-    Plane,
-    PointCoordinates,
-    PointOnSurface,
-    RobotModel,
-    RobotPlant,
-    find_structure,
-    simulate,
-)
+import drake_dae as dd
 from drake_dae.errors import ModelError
 from drake_dae.systems import PointMaterial
 
@@ -48,25 +36,25 @@ def add_slider(plant: MultibodyPlant) -> None:
 
 
 @cache
-def slider(*stages) -> tuple[RobotModel, object]:
+def slider(*stages) -> tuple[dd.RobotModel, object]:
     plant = MultibodyPlant(0.0)
     add_slider(plant)
     plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
     plant.Finalize()
-    wall = PointOnSurface("y", Plane((0.0, 0, 0), (-1, 0, 0)), name="wall")
-    model = RobotModel.from_multibody(
-        plant, [wall], [PointCoordinates("y", "y")], name="slider", actuation=stages
+    wall = dd.PointOnSurface("y", dd.Plane((0.0, 0, 0), (-1, 0, 0)), name="wall")
+    model = dd.RobotModel.from_multibody(
+        plant, [wall], [dd.PointCoordinates("y", "y")], name="slider", actuation=stages
     )
-    return model, find_structure(model.dae)
+    return model, dd.find_structure(model.dae)
 
 
-def contact_plant(step: float, *stages, **parameters) -> CompliantPlant:
+def contact_plant(step: float, *stages, **parameters) -> dd.CompliantPlant:
     model, structure = slider(*stages)
     material = PointMaterial(time_step=step, friction=0.0)
-    return CompliantPlant(model, material, structure=structure, parameters=parameters)
+    return dd.CompliantPlant(model, material, structure=structure, parameters=parameters)
 
 
-def run(plant: CompliantPlant, start, control, duration: float):
+def run(plant: dd.CompliantPlant, start, control, duration: float):
     """x at the steps under a constant control, from a state that touches without a force."""
     builder = DiagramBuilder()
     builder.AddSystem(plant)
@@ -82,7 +70,7 @@ def run(plant: CompliantPlant, start, control, duration: float):
     return log.FindLog(context).data().T
 
 
-SPRINGS = FlexibleJoints(STIFFNESS)
+SPRINGS = dd.FlexibleJoints(STIFFNESS)
 
 
 @pytest.mark.slow
@@ -108,10 +96,10 @@ def test_spring_without_damping_swings_as_symplectic_euler_does(share):
     some(
         [
             pytest.param((SPRINGS,), id="springs"),
-            pytest.param((FlexibleJoints(STIFFNESS, damping=4.0),), id="damped springs"),
-            pytest.param((DcMotors(2.0, 0.01, 3.0),), id="motors"),
-            pytest.param((ElectrohydraulicServos(2e3, 0.02),), id="valves"),
-            pytest.param((SPRINGS, DcMotors(0.5, 0.01, 5.0)), id="springs and motors"),
+            pytest.param((dd.FlexibleJoints(STIFFNESS, damping=4.0),), id="damped springs"),
+            pytest.param((dd.DcMotors(2.0, 0.01, 3.0),), id="motors"),
+            pytest.param((dd.ElectrohydraulicServos(2e3, 0.02),), id="valves"),
+            pytest.param((SPRINGS, dd.DcMotors(0.5, 0.01, 5.0)), id="springs and motors"),
         ],
         of=3,
         first=1,
@@ -125,13 +113,13 @@ def test_stages_tend_to_those_of_the_ideal_plant(stages):
     """
     model, structure = slider(*stages)
     start, control = np.zeros(model.dae.num_states), np.array([0.0, 5.0])
-    ideal = RobotPlant(model, structure=structure)
+    ideal = dd.RobotPlant(model, structure=structure)
     context = ideal.CreateDefaultContext()
     ideal.set_state(context, start)
     ideal.GetInputPort("control").FixValue(context, control)
     exact = []
     for _ in range(10):
-        simulate(ideal, context, 0.01, error_controlled(1e-9))
+        dd.simulate(ideal, context, 0.01, error_controlled(1e-9))
         exact.append(context.get_continuous_state_vector().CopyToVector())
     sizes = []
     for count in (50, 100, 200):
@@ -162,10 +150,10 @@ def test_step_that_is_too_long_is_refused_with_one_that_would_do():
     with pytest.raises(ModelError, match=r"0\.025.*100.*0\.02"):
         contact_plant(0.025, SPRINGS)
     with pytest.raises(ModelError, match=r"0\.01.*300.*0\.0066"):
-        contact_plant(0.01, DcMotors(1e-4, 0.01, 3.0))  # R / L, which takes h <= 2 L / R.
+        contact_plant(0.01, dd.DcMotors(1e-4, 0.01, 3.0))  # R / L, which takes h <= 2 L / R.
 
 
 def test_what_nothing_damps_is_refused():
     """Valves without leakage are springs whose force is new with the velocity before."""
     with pytest.raises(ModelError, match="1e-05"):
-        contact_plant(1e-3, ElectrohydraulicServos(2e6, 0.0))
+        contact_plant(1e-3, dd.ElectrohydraulicServos(2e6, 0.0))
