@@ -9,9 +9,8 @@ import scipy.linalg
 
 from drake_dae.arrays import FloatArray, show
 from drake_dae.dae.elimination import Elimination
-from drake_dae.dae.family import Deciding
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.samples import Samples
+from drake_dae.dae.samples import Deciding, Samples
 from drake_dae.errors import AssumptionError
 from drake_dae.trace.round_off import (
     SINGULAR,

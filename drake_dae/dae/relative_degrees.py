@@ -12,15 +12,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from drake_dae.arrays import Booleans, FloatArray, show
+from drake_dae.arrays import Booleans, FloatArray
 from drake_dae.dae.assumptions import Violation, ViolationKind, redundant_constraints
 from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivative_along
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
-from drake_dae.dae.family import Family
 from drake_dae.dae.manifold import Manifold
-from drake_dae.dae.samples import Samples, as_matrix, fields_at
+from drake_dae.dae.samples import Family, Samples, as_matrix, fields_at, outside
 from drake_dae.dae.system import DaeSystem
-from drake_dae.errors import AssumptionError, ModelError
+from drake_dae.errors import AssumptionError
 from drake_dae.trace.factorization import nonzeros
 from drake_dae.trace.round_off import MANY, VISIBLE, Sized, multiply
 
@@ -192,11 +191,7 @@ class InputActions:
         values = [row(x, system.parameter_values)[0] for x in samples.states]
         for state, value in zip(samples.states, values, strict=True):
             if not np.all(np.isfinite(value)):
-                raise ModelError(
-                    f"{system.name}: a derivative is not finite at the consistent state x = "
-                    f"{show(state)}; give a nominal_state inside the domain of the functions and "
-                    "of their derivatives"
-                )
+                raise outside(system, "a derivative", state)
         return np.array(values)
 
     def acts(self, pattern: ca.SX, row: Row) -> Booleans:

@@ -22,12 +22,11 @@ from drake_dae.dae.assumptions import (
 )
 from drake_dae.dae.derivatives import Derivatives
 from drake_dae.dae.elimination import Elimination, eliminate
-from drake_dae.dae.family import Family
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.margins import RankMargin, find_margin
 from drake_dae.dae.redundancy import all_constraints_hold
 from drake_dae.dae.relative_degrees import InputActions, constraint_chains, output_chains
-from drake_dae.dae.samples import Samples, draw
+from drake_dae.dae.samples import Family, Samples, draw
 from drake_dae.dae.signals import DerivativeLayout, Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError

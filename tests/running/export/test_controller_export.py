@@ -129,16 +129,6 @@ def test_the_program_finds_what_is_wrong(two_link, tmp_path):
     assert done.stdout.endswith("FAILED\n")
 
 
-@pytest.mark.slow
-@pytest.mark.thorough
-@needs_compiler
-def test_a_long_controller_plays_with_the_instructions_of_this_processor(tmp_path):
-    """Where what is held begins with several equal numbers, of which gcc 12 made more."""
-    exported(tmp_path, "wall_point_contact", steps=50)
-    done = played(tmp_path, "wall_point_contact", "-O1", "-march=native")
-    assert done.returncode == 0, done.stdout
-
-
 def test_it_plays_with_other_roundings_too(two_link):
     """As of another processor or libm: multiplications and additions are joined."""
     done = played(two_link, "two_link_wall", "-O2", "-ffp-contract=fast", "-march=native")
