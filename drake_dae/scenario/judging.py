@@ -34,6 +34,7 @@ from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import check_task, tracking_law
+from drake_dae.scenario.expected import beyond_stated
 from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import (
@@ -301,6 +302,7 @@ def judge_run(
         reasons=[reason for reason, holds in reasons.items() if holds],
         more=behind,
     )
+    notes.append(beyond_stated(scenario, model, law.structure, judgement.outputs, record))
     told = tuple(dict.fromkeys(filter(None, notes)))
     named = (scenario.estimator.parameters if scenario.estimator else None) or ()
     return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy, named)
