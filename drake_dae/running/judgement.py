@@ -185,10 +185,7 @@ def _of_contacts(record: Record, pushing: set[str]) -> Iterator[RunFinding]:
 
 
 def _of_outputs(
-    record: Record,
-    predicted: FloatArray,
-    outputs: Sequence[OutputQuality],
-    reasons: Sequence[str],
+    record: Record, predicted: FloatArray, outputs: Sequence[OutputQuality], reasons: Sequence[str]
 ) -> Iterator[RunFinding]:
     """Which outputs are off their references, or cannot be there yet."""
     times, error = record.time, record["tracking_error"]

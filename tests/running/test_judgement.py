@@ -178,18 +178,10 @@ LEAVE = "Press is ended by a force of 31 N"
         # A way that was chosen for failure is a good end.
         ([BEGIN[0], AWAY, change(4.0, "done", 4, "a distance")], "good", r"4 s, in 2 phases$"),
         # One that leaves is bad where a phase has failed, and cannot become good any more.
-        (
-            [BEGIN[0], change(2.0, "leave", 1, LEAVE, True)],
-            "bad",
-            r"2 s: Press .*31 N$",
-        ),
+        ([BEGIN[0], change(2.0, "leave", 1, LEAVE, True)], "bad", r"2 s: Press .*31 N$"),
         ([BEGIN[0], change(2.0, "leave", 1, LEAVE)], "undecided", "leave"),
         (
-            [
-                BEGIN[0],
-                change(2.0, "leave", 1, LEAVE),
-                change(3.0, "held", 2, "after a force"),
-            ],
+            [BEGIN[0], change(2.0, "leave", 1, LEAVE), change(3.0, "held", 2, "after a force")],
             "good",
             r"3 s: after a force$",
         ),

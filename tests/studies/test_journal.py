@@ -41,11 +41,7 @@ def test_a_result_stays_as_it_was_told_first_unless_its_process_died(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"version": "2.0"}, r"version.*1.0.*2.0"),
-        ({"gains": "1"}, "gains"),
-    ],
+    ("changes", "words"), [({"version": "2.0"}, r"version.*1.0.*2.0"), ({"gains": "1"}, "gains")]
 )
 def test_another_sweep_is_refused_with_what_differs(changes, words, tmp_path):
     path = tmp_path / "runs.db"
