@@ -46,18 +46,14 @@ from drake_dae.scenario.model import (
 )
 from drake_dae.scenario.scenario import Scenario
 
-SAMPLES, MOST_SAMPLES = 1001, 20_000
-"""The smallest number of examined times along a reference, and the largest along a fast one."""
+SAMPLES, MOST_SAMPLES, MOST_TIMES = 1001, 20_000, 2000
+"""The smallest number of examined times along a reference, the largest along a fast one, and the
+most times of a record at which its references are examined."""
 
-STRAIGHT, SHORTEST = 0.01, 1e-6
+STRAIGHT, SHORTEST, BREAK = 0.01, 1e-6, 0.01
 """The allowed deviation of a reference from linear interpolation between two times, relative to its
-range; and the shortest interval that is divided, relative to the whole."""
-
-MOST_TIMES = 2000
-"""The most times of a record at which its references are examined."""
-
-BREAK = 0.01
-"""The share of a run that broke off, at its end, in which its limits are not judged."""
+range; the shortest interval that is divided, relative to the whole; and the share of a run that
+broke off, at its end, in which its limits are not judged."""
 
 WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
 """The remedy for a link behind a surface."""
