@@ -1,7 +1,7 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -34,6 +34,7 @@ from drake_dae.running.judgement import FindingKind, Outcome, RunFinding
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import check_task, tracking_law
+from drake_dae.scenario.expected import beyond_stated
 from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import (
@@ -290,7 +291,7 @@ def judge_run(
         "the state is measured by encoders": scenario.sensors.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }
-    return RunSummary(
+    summary = RunSummary(
         record,
         loop.predicted_error(record),
         ranges,
@@ -302,9 +303,10 @@ def judge_run(
         more=behind,
         statistics=statistics,
         remedies=remedies,
-        notes=tuple(dict.fromkeys(filter(None, notes))),
         named=(scenario.estimator.parameters if scenario.estimator else None) or (),
     )
+    notes.append(beyond_stated(scenario, model, law.structure, summary.outputs, record))
+    return replace(summary, notes=tuple(dict.fromkeys(filter(None, notes))))
 
 
 def _beyond_edge(
