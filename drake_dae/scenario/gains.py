@@ -217,11 +217,7 @@ def _fed_ahead(scenario: Scenario, structure: Structure, stiffness: float) -> fl
 
 
 def _check_bounds(scenario: Scenario) -> None:
-    """Checks that bounds for computed gains are used.
-
-    Raises:
-        ScenarioError: One is not, or is not positive.
-    """
+    """Refuses bounds for computed gains where none are computed by them."""
     is_used, law = scenario.is_advised and scenario.sensors.encoders is not None, scenario.law
     for name in ("largest_roughness", "largest_errors"):
         if getattr(law, name) is not None and not is_used:
@@ -230,9 +226,6 @@ def _check_bounds(scenario: Scenario) -> None:
                 "Drake's contact; leave it out, or leave `law.gains` out and give encoders"
             )
             raise ScenarioError((f"law.{name}", text))
-    if law.largest_roughness is not None and not law.largest_roughness > 0.0:
-        value = f"must be positive, got {law.largest_roughness:g} N m"
-        raise ScenarioError(("law.largest_roughness", value))
 
 
 def _free_gains(scenario: Scenario, model: RobotModel, contact: ContactGains) -> parts.Coefficients:
