@@ -32,13 +32,7 @@ from drake_dae.errors import (
     NonFiniteError,
     SimulationError,
 )
-from drake_dae.running.diagnosis import (
-    IN_ROLLOUT,
-    MANY,
-    explained,
-    too_long,
-    warn_if_stiff,
-)
+from drake_dae.running.diagnosis import IN_ROLLOUT, MANY, explained, too_long, warn_if_stiff
 from drake_dae.running.drake_stepped import run_stepped
 from drake_dae.running.events import Seed
 from drake_dae.running.rollout_program import MAKING, RolloutProgram, program_of

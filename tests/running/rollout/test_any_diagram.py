@@ -183,13 +183,7 @@ def test_two_sources_of_noise_of_one_run_have_numbers_of_their_own(compiled):
     times = np.arange(10) * 0.1 + 0.05
     seeds = np.array([3, 4, 3])
     found = rollout(
-        diagram,
-        [start] * 3,
-        parameters,
-        times,
-        config=fixed(5e-2),
-        compiled=compiled,
-        seeds=seeds,
+        diagram, [start] * 3, parameters, times, config=fixed(5e-2), compiled=compiled, seeds=seeds
     )
     first, second, again = (
         np.hstack([run.record["one"], run.record["other"]]).ravel().tolist() for run in found
