@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System, TriggerType
-from pydrake.systems.primitives import LogVectorOutput, MatrixGain, Multiplexer, VectorLogSink
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.dae import Signal, TrackingLaw
@@ -178,11 +177,6 @@ def wire_loop(
 
     # Integrals are not updated while a contact is lost, or a drive is at its limit.
     if is_limited is not None and controller.HasInputPort("hold"):
-        count = controller.GetInputPort("hold").size()
-        if is_limited.size() != count:  # It holds all integrals.
-            spread = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-            builder.Connect(is_limited, spread.get_input_port())
-            is_limited = spread.get_output_port()
         connect(is_limited, controller, "hold")
     add_signals(builder, controller, parts.signals)
     if parts.control_limits is not None:

@@ -9,13 +9,7 @@ from typing import Any
 
 import casadi as ca
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import (
-    Context,
-    Diagram,
-    OutputPort,
-    PortDataType,
-    System,
-)
+from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from drake_dae.arguments import checked
 from drake_dae.blocks.block import Block, stacked

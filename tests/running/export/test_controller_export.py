@@ -252,11 +252,7 @@ def is_sample(time: float) -> bool:
     ("name", "settings", "reason"),
     [
         ("two_link_wall", (), "samples"),
-        (
-            "two_link_wall",
-            ("law.integral=[tool.z]", "sampling=null"),
-            "'tracking_controller'",
-        ),
+        ("two_link_wall", ("law.integral=[tool.z]", "sampling=null"), "'tracking_controller'"),
         (
             "two_link_wall",
             ("sampling={period: 0.001, delay: 0.00012345678}",),
