@@ -3,9 +3,11 @@
 import base64
 import html
 import json
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from drake_dae.arrays import FloatArray
 from drake_dae.blocks.compose import compose
 from drake_dae.dae import DaeSystem
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import ModelError
+from drake_dae.errors import MachineCodeError, ModelError
 from drake_dae.pictures.page.controls import (
     Control,
     Numbers,
@@ -29,9 +31,9 @@ from drake_dae.pictures.page.controls import (
     strongest_pushes,
 )
 from drake_dae.pictures.page.scene import RobotScene, meshcat_page, scene_size
-from drake_dae.pictures.page.wasm import check_compiler, compiled_loop
 from drake_dae.running.export.c_code import BlockCode
 from drake_dae.running.export.loop import check_traced, write_loop
+from drake_dae.trace.compiler import compile_webassembly
 
 WEB = Path(__file__).with_name("web")
 
@@ -87,12 +89,18 @@ def write_page(
         MachineCodeError: zig is not installed (`pip install ziglang` adds it), or it fails.
         OSError: A file cannot be written.
     """
-    check_compiler()
+    if find_spec("ziglang") is None:
+        raise MachineCodeError(
+            "a page is compiled to WebAssembly by zig, which is not installed: pip install ziglang"
+        )
     bench, file = Bench.of(loop, context), Path(file)
     with tempfile.TemporaryDirectory() as folder:
         start = bench.context.get_time()
         _, source = write_loop(bench.code, start, "page", folder, config)
-        code = base64.b64encode(compiled_loop(source)).decode()
+        source.write_text(in_pieces(source.read_text("utf-8")), "utf-8")
+        target = source.with_suffix(".wasm")
+        compile_webassembly(source, target)
+        code = base64.b64encode(target.read_bytes()).decode()
     data = bench.data() | {"title": title or loop.plant.dae.name, "notes": list(notes)}
     page = meshcat_page(bench.robot, bench.state, loop.scene_graph)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -241,3 +249,70 @@ class Bench:
                 for signal, value in zip(numbers.signals, numbers.values.tolist(), strict=True)
             ],
         }
+
+
+# ------------------------------------------------------------------ long functions in pieces
+
+# The largest number of assignments in a function. For 60,000 assignments, clang needs 180 s of CPU
+# in one function, and 9 s in pieces of 2,000, whose code is 40 % larger.
+LONGEST = 2000
+
+_NAME = re.compile(r"\ba\d+\b")
+_FUNCTION = re.compile(
+    r"(?P<head>static int (?P<name>casadi_f\d+)\([^\n]*\{)\n(?P<body>(?:  [^\n]*\n)*)\}"
+)
+_DECLARATION = "  casadi_real a"
+_ARGUMENTS = (
+    "const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, "
+    "casadi_real* shared"
+)
+
+
+def in_pieces(source: str, longest: int = LONGEST) -> str:
+    """Splits the long functions of a C source of CasADi into pieces, which each calls in turn.
+
+    The array `shared` passes values of a piece to later pieces.
+    """
+    return _FUNCTION.sub(lambda function: _split(function, longest), source)
+
+
+def _split(function: re.Match[str], longest: int) -> str:
+    rows = [
+        row
+        for row in function["body"].splitlines()
+        if not row.startswith(_DECLARATION) and row.strip() != "return 0;"
+    ]
+    if len(rows) <= longest:
+        return function[0]
+    pieces = [rows[i : i + longest] for i in range(0, len(rows), longest)]
+    uses = [_uses(piece) for piece in pieces]
+    # needed[k]: the variables that piece k or a later one reads before a new assignment.
+    needed = [set[str]()]
+    for read, assigned in reversed(uses):
+        needed.insert(0, read | (needed[0] - assigned))
+    index = {variable: i for i, variable in enumerate(sorted(set().union(*needed)))}
+    name, text, calls = function["name"], "", ""
+    for k, (piece, (read, assigned)) in enumerate(zip(pieces, uses, strict=True)):
+        begin = [
+            f"  casadi_real {a}{f' = shared[{index[a]}]' if a in read else ''};"
+            for a in sorted(read | assigned)
+        ]
+        end = [f"  shared[{index[a]}] = {a};" for a in sorted(assigned & needed[k + 1])]
+        head = f"static int __attribute__((noinline)) {name}_{k}({_ARGUMENTS}) {{"
+        text += "\n".join([head, *begin, *piece, *end, "  return 0;", "}", "", ""])
+        calls += f"  if ({name}_{k}(arg, res, iw, w, shared)) return 1;\n"
+    shared = f"  casadi_real shared[{len(index) + 1}];\n"
+    return f"{text}{function['head']}\n{shared}{calls}  return 0;\n}}"
+
+
+def _uses(rows: Sequence[str]) -> tuple[set[str], set[str]]:
+    """Returns the variables that rows read before they assign them, and those that they assign."""
+    read, assigned = set[str](), set[str]()
+    for row in rows:
+        target, _, value = row.partition("=")
+        variable = target.strip()
+        is_assignment = _NAME.fullmatch(variable)  # Otherwise it is a result, or a condition.
+        read |= set(_NAME.findall(value if is_assignment else row)) - assigned
+        if is_assignment:
+            assigned.add(variable)
+    return read, assigned

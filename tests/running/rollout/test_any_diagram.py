@@ -32,8 +32,7 @@ from drake_dae import rollout
 from drake_dae.errors import ModelError
 from drake_dae.running import export_loop, start_values
 from drake_dae.running import rollout as module
-from drake_dae.running.events import events_within
-from drake_dae.running.rollout_program import program_of
+from drake_dae.running.rollout_program import events_within, program_of
 
 
 def fixed(step=1e-3):
