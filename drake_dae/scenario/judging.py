@@ -1,7 +1,7 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -30,7 +30,7 @@ from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots import Constraint, LinkBehind, RobotModel, Surface, links_behind, own_values
-from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
+from drake_dae.running.judgement import FindingKind, Outcome, RunFinding
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import check_task, tracking_law
@@ -291,7 +291,7 @@ def judge_run(
         "the state is measured by encoders": scenario.sensors.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }
-    judgement = judge(
+    summary = RunSummary(
         record,
         loop.predicted_error(record),
         ranges,
@@ -301,11 +301,12 @@ def judge_run(
         accuracy=accuracy,
         reasons=[reason for reason, holds in reasons.items() if holds],
         more=behind,
+        statistics=statistics,
+        remedies=remedies,
+        named=(scenario.estimator.parameters if scenario.estimator else None) or (),
     )
-    notes.append(beyond_stated(scenario, model, law.structure, judgement.outputs, record))
-    told = tuple(dict.fromkeys(filter(None, notes)))
-    named = (scenario.estimator.parameters if scenario.estimator else None) or ()
-    return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy, named)
+    notes.append(beyond_stated(scenario, model, law.structure, summary.outputs, record))
+    return replace(summary, notes=tuple(dict.fromkeys(filter(None, notes))))
 
 
 def _beyond_edge(

@@ -214,11 +214,7 @@ def test_nothing_where_there_is_no_terminal(capsys):
 def test_a_state_that_escapes_in_finite_time_ends_the_run():
     """x' = x^2 from 1 is 1 / (1 - t), which Drake follows with ever smaller steps."""
     system = DaeSystem.from_functions(
-        ["x"],
-        f=lambda s: [s[0] ** 2],
-        h=lambda s: [1],
-        l=lambda s: [s[0]],
-        nominal_state=[1.0],
+        ["x"], f=lambda s: [s[0] ** 2], h=lambda s: [1], l=lambda s: [s[0]], nominal_state=[1.0]
     )
     builder = DiagramBuilder()
     plant = builder.AddSystem(DaePlant(system))

@@ -359,7 +359,7 @@ class Automaton:
             "estimated_state": self.state,
             "reference": self.references[which],
             "measured_force": measured,
-            "hold": ca.repmat(waits, len(law.integral.outputs)),
+            "hold": waits,
         }
         symbols = [block.parameters, *block.inputs.values()]
         values = [ca.vertcat(self.values, gains), *(given[name] for name in block.inputs)]

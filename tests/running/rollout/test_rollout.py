@@ -10,21 +10,10 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, run, scenario, some
 
-from drake_dae import (
-    DaePlant,
-    DaeSystem,
-    build_scenario,
-    rollout,
-    simulate,
-)
+from drake_dae import DaePlant, DaeSystem, build_scenario, rollout, simulate
 from drake_dae.blocks import machine
 from drake_dae.diagrams.parts import encoder_seed
-from drake_dae.errors import (
-    InconsistentStateError,
-    MachineCodeWarning,
-    ModelError,
-    SimulationError,
-)
+from drake_dae.errors import InconsistentStateError, MachineCodeWarning, ModelError, SimulationError
 from drake_dae.references.splines import UNROLLED
 from drake_dae.running import start_values
 from drake_dae.running.rollout import run_loop
@@ -126,11 +115,7 @@ def test_a_reference_of_many_polynomials_is_the_same(compiled):
 
 @mostly_compiled
 @pytest.mark.parametrize(
-    "name",
-    [
-        "two_link_wall",
-        pytest.param("seven_joint_wall", marks=pytest.mark.slow),
-    ],
+    "name", ["two_link_wall", pytest.param("seven_joint_wall", marks=pytest.mark.slow)]
 )
 def test_error_control_agrees(name, compiled):
     """To 1e-9: Drake at an accuracy of 1e-12 is the truth, and the rollout at 1e-8 is held to it.
