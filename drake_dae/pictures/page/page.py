@@ -6,7 +6,7 @@ import json
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,11 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, PortDataType
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
 from drake_dae.blocks.compose import compose
 from drake_dae.dae import DaeSystem
 from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import MachineCodeError, ModelError
 from drake_dae.pictures.page.controls import (
-    Control,
     Numbers,
     controls_of,
     prediction,
@@ -93,7 +91,7 @@ def write_page(
         raise MachineCodeError(
             "a page is compiled to WebAssembly by zig, which is not installed: pip install ziglang"
         )
-    bench, file = Bench.of(loop, context), Path(file)
+    bench, file = Bench(loop, context), Path(file)
     with tempfile.TemporaryDirectory() as folder:
         start = bench.context.get_time()
         _, source = write_loop(bench.code, start, "page", folder, config)
@@ -140,7 +138,6 @@ def as_script(data: Any) -> str:
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
-@dataclass(frozen=True, eq=False)
 class Bench:
     """What a page shows and changes of a loop, from a context on; `size` is that of the scene in m.
 
@@ -148,25 +145,14 @@ class Bench:
     and "coordinates" of the errors.
     """
 
-    loop: ClosedLoop
-    context: Context
-    code: BlockCode
-    numbers: Numbers
-    controls: Sequence[Control]
-    robot: RobotScene
-    state: FloatArray
-    size: float
-    predicted: dict[str, Any] | None
-
-    @classmethod
-    def of(cls, loop: ClosedLoop, context: Context | None) -> "Bench":
-        """The bench of a loop, whose free inputs are 0 where they have no value."""
+    def __init__(self, loop: ClosedLoop, context: Context | None) -> None:
+        """Of a loop, whose free inputs are 0 where they have no value."""
         diagram, plant, law = loop.diagram, loop.plant, loop.controller.law
         context = (context or diagram.CreateDefaultContext()).Clone()
         for port in map(diagram.get_input_port, range(diagram.num_input_ports())):
             if port.get_data_type() == PortDataType.kVectorValued and not port.HasValue(context):
                 port.FixValue(context, np.zeros(port.size()))
-        robot = RobotScene.of(plant, loop.scene_graph)
+        self.robot = robot = RobotScene(plant, loop.scene_graph)
         names = "state", "constraint_force", "integral", "exogenous", "known_exogenous", *SHOWN
         ports = {name: diagram.GetOutputPort(name) for name in names if diagram.HasOutputPort(name)}
         composed = compose(diagram, ports, context=context, shares=False)
@@ -186,8 +172,8 @@ class Bench:
         state, force = values["state"], values["constraint_force"]
         scene = robot.columns(state, force, parameters_of(plant, plant.dae, "exogenous"))
         outputs = {name: values[name] for name in SHOWN if name in values} | {"scene": scene}
-        predicted = prediction(loop, composed.parameters.get(loop.controller))
-        if predicted is not None:
+        self.predicted = prediction(loop, composed.parameters.get(loop.controller))
+        if self.predicted is not None:
             outputs["coordinates"] = law.coordinates_function.function(
                 state,
                 values["reference"],
@@ -195,12 +181,12 @@ class Bench:
                 parameters_of(loop.controller, law.system, "known_exogenous"),
             )[0]
         composed = replace(composed, block=replace(composed.block, outputs=outputs))
-        code = BlockCode.of(composed, context, {}, loop.signals)
-        numbers = Numbers(code.parameters, code.values, composed.parameters, code.places)
-        start = plant.state(plant.GetMyContextFromRoot(context))
-        size = scene_size(robot, start, loop.scene_graph)
-        controls = controls_of(loop, numbers, context.get_time(), size)
-        return cls(loop, context, code, numbers, controls, robot, start, size, predicted)
+        self.loop, self.context = loop, context
+        self.code = code = BlockCode(composed, context, {}, loop.signals)
+        self.numbers = Numbers(code.parameters, code.values, composed.parameters, code.places)
+        self.state = plant.state(plant.GetMyContextFromRoot(context))
+        self.size = scene_size(robot, self.state, loop.scene_graph)
+        self.controls = controls_of(loop, self.numbers, context.get_time(), self.size)
 
     def data(self) -> dict[str, Any]:
         """What the browser knows, as JSON represents it."""

@@ -75,7 +75,7 @@ def export_loop(
         known = loop.signals
     composed = compose(diagram, ports, context=context, shares=False)
     check_traced(composed, "the loop")
-    code, start = BlockCode.of(composed, context, {}, known), context.get_time()
+    code, start = BlockCode(composed, context, {}, known), context.get_time()
     scheme, step = fixed_steps(config)
     same = SimulatorConfig(integration_scheme=scheme, max_step_size=step, use_error_control=False)
     times = [start + k * step for k in range(max(1, min(MOST, round(duration / step))))]
