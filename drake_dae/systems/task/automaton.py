@@ -35,18 +35,15 @@ BEGUN, SUCCESS, LATE, LOST, GUARD = range(5)
 """Why a phase began: the task begins, or the phase before has ended by this; by its guard i with
 GUARD + i."""
 
-GOING, ALL_DONE, RESTING, GIVEN_UP = range(4)
-"""The endings of a task."""
+GOING, ALL_DONE, RESTING, GIVEN_UP = range(4)  # the endings of a task
 
-SMOOTH = 2
-"""The least number of continuous derivatives of a fade, even if a law needs fewer."""
+SMOOTH = 2  # the least number of continuous derivatives of a fade, even if a law needs fewer
 
 LET_GO = 1e-3
 """A contact ceases to be felt this share below `contact_force`, so that a force that stays there,
 apart from round-off, does not begin and cease to be felt all the time."""
 
-EARLY = 2e-12
-"""A margin below this has ended, so that margins with different round-off end together."""
+EARLY = 2e-12  # A margin below this has ended, so that those with other round-off end together.
 
 
 @cache
@@ -362,7 +359,7 @@ class Automaton:
             "estimated_state": self.state,
             "reference": self.references[which],
             "measured_force": measured,
-            "hold": ca.repmat(waits, len(law.integral.outputs)),
+            "hold": waits,
         }
         symbols = [block.parameters, *block.inputs.values()]
         values = [ca.vertcat(self.values, gains), *(given[name] for name in block.inputs)]

@@ -7,19 +7,7 @@ import numpy as np
 import pytest
 from arms import arm, numbers
 from numpy.testing import assert_allclose
-from polishing import (
-    FAR,
-    OVER,
-    PERIOD,
-    POLE,
-    SPEED,
-    WHOLE,
-    laws,
-    push,
-    run_on,
-    started,
-    task_loop,
-)
+from polishing import FAR, OVER, PERIOD, POLE, SPEED, WHOLE, laws, push, run_on, started, task_loop
 
 import drake_dae as dd
 from drake_dae.diagrams import wire_loop
