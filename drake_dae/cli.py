@@ -126,7 +126,7 @@ def make_parser() -> Parser:
     analyze.epilog = "exit code: 0, or 2 if a problem was found (the lines PROBLEM)"
 
     text = (
-        "It writes its record, a summary and an animation into a folder. The first line of the "
+        "A record, a summary and an animation are written into a folder. The first line of the "
         "summary says whether the run is GOOD, BAD or UNDECIDED, and why. A rollout is faster for "
         "many runs (see sweep), not for one; its record has every fixed step, or 1000 rows under "
         "error control."

@@ -17,13 +17,7 @@ from weakref import proxy, ref
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import (
-    CacheEntry,
-    Context,
-    EventStatus,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import CacheEntry, Context, EventStatus, LeafSystem, ValueProducer
 
 from drake_dae.arrays import FloatArray
 from drake_dae.blocks.failures import endless_steps, no_step_leads_on, spoilt_step

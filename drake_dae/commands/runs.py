@@ -195,7 +195,7 @@ def _write(
                         (place / ANIMATION).write_text(page, encoding="utf-8")
     finally:
         written = [name for name in FILES if (folder / name).exists()]
-        text, word = summary.text, summary.judgement.outcome.name
+        text, word = summary.text, summary.outcome.name
         if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
             color = {"GOOD": 32, "BAD": 31, "UNDECIDED": 33}[word]
             text = f"\x1b[1;{color}m{word}\x1b[0m{text.removeprefix(word)}"

@@ -81,7 +81,7 @@ def _check(scenario: Scenario, robot: RobotLinks, end: float) -> str:
         summary = judge_run(half, loop, context, loop.record(context), run)
     except DrakeDaeError as error:
         return str(error)
-    return str(summary.judgement)
+    return str(summary)
 
 
 def _tip(text: str) -> tuple[str, Vector]:

@@ -10,6 +10,7 @@ systems", International Journal of Control 42(6), 1985; Isidori, Nonlinear Contr
 section 5.4; Nijmeijer and van der Schaft, Nonlinear Dynamical Control Systems, 1990, chapter 8.
 """
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray, show, vector
+from drake_dae.arrays import FloatArray, show, unknown_name
 from drake_dae.dae.relative_degrees import InputActions
 from drake_dae.dae.samples import Samples, spread_of
 from drake_dae.dae.signals import Signal
@@ -38,24 +39,18 @@ class Extension:
     """A system with integrators before its controls, whose B(x) is regular.
 
     The original system's control is u = offset(x_e) + matrix(x_e) w, with x_e and w the state and
-    the control of the extended one; with the integrators it is a dynamic state feedback.
-
-    Attributes:
-        original: The system without integrators.
-        system: The extended one. The first n states are those of the original.
-        structure: The structure of the extended system.
-        integrators: The number of integrators before each of the original controls. If others are
-            mixed in first, the new state has a star: "u1*" is u1 + sum_j b_j(x) u_j.
-        control_offset: offset(x_e) as an expression of `system.state`, shape (p, 1).
-        control_matrix: matrix(x_e) likewise, shape (p, p).
+    the control of the extended one, whose first n states are those of the original: with the
+    integrators it is a dynamic state feedback. `integrators` is the number before each of the
+    original controls. If others are mixed in first, the new state has a star: "u1*" is
+    u1 + sum_j b_j(x) u_j.
     """
 
     original: DaeSystem
     system: DaeSystem
     structure: Structure
     integrators: Mapping[str, int]
-    control_offset: ca.SX
-    control_matrix: ca.SX
+    control_offset: ca.SX  # In terms of `system.state`, shape (p, 1).
+    control_matrix: ca.SX  # Likewise, shape (p, p).
 
     def __repr__(self) -> str:
         return f"Extension({self.system!r}, integrators={dict(self.integrators)})"
@@ -102,25 +97,20 @@ def dynamic_extension(
     Raises:
         AssumptionError: No integrators help: the outputs are not independent, B(x) is singular at
             isolated states only, or more than n are needed; or Assumption (3) is violated.
-        ModelError, InconsistentStateError: The system has no structure, see `find_structure`, or it
-            has a `control_metric`.
+        ModelError, InconsistentStateError: As of `find_structure`, or for a `control_metric`.
     """
     if system.control_metric is not None:
         raise ModelError(
             f"{system.name}: control_metric compares controls, not their derivatives; leave it "
             "out, and give the extended system one"
         )
-    given, names = nominal_control or {}, [signal.name for signal in system.control_signals]
-    unknown = [name for name in given if name not in names]
-    if unknown:
-        raise ModelError(
-            f"{system.name}: nominal_control names {', '.join(unknown)}, but the controls are "
-            f"{', '.join(names) or 'none'}"
-        )
-    values = [given.get(name, 0.0) for name in names]
-    held = vector(f"{system.name}: nominal_control", values, len(names))
+    values, names = nominal_control or {}, [signal.name for signal in system.control_signals]
+    for name in values:
+        if name not in names:
+            raise ModelError(f"{system.name}: {unknown_name('control', name, names)}")
+    held = np.array([values.get(name, 0.0) for name in names], dtype=float)
     spreads = spread_of(system, spread)
-    bases = [(signal, 0) for signal in system.control_signals]
+    bases = [(signal, 0) for signal in system.control_signals]  # And how often integrated.
     extended, integrators = system, dict[str, int]()
     offset, matrix = ca.SX(system.num_controls, 1), ca.SX.eye(system.num_controls)
     while True:
@@ -137,19 +127,20 @@ def dynamic_extension(
         columns, mixing = choice
         others, nominal = [j for j in range(len(names)) if j not in columns], held[columns]
         if mixing is not None:
-            function = extended.trace("mixing", {"mixing": mixing}, often=False)
-            here = function(extended.nominal_state, extended.parameter_values)[0]
-            nominal = nominal + here.reshape(mixing.shape) @ held[others]
+            mixed = extended.matrix("mixing", mixing)
+            here = mixed(extended.nominal_state, extended.parameter_values)
+            nominal = nominal + here @ held[others]
             for i in columns:
                 control = extended.control_signals[i]
                 bases[i] = (Signal(f"{control.name}*", control.unit), 0)
-        added = [bases[i][0].derivative(bases[i][1]) for i in columns]
-        following = [bases[i][0].derivative(bases[i][1] + 1) for i in columns]
+        added, controls = list[Signal](), list(extended.control_signals)
         for i in columns:
-            bases[i] = (bases[i][0], bases[i][1] + 1)
+            base, order = bases[i]
+            added.append(base.derivative(order))
+            controls[i], bases[i] = base.derivative(order + 1), (base, order + 1)
             integrators[names[i]] = integrators.get(names[i], 0) + 1
         count = extended.num_states
-        extended = _integrated(extended, columns, added, following, nominal, mixing)
+        extended = _integrated(extended, columns, added, controls, nominal, mixing)
         # u_i = x_i - sum_j b_ij u_j, with the new state x_i.
         offset += ca.mtimes(matrix[:, columns], extended.state[count:])
         if mixing is not None:
@@ -170,13 +161,11 @@ def dynamic_extension(
     except AssumptionError as error:
         if error.state is None:
             raise
-        remedy = "Keep away from this state"
+        remedy, entries = "Keep away from this state", {name: 1.0 for name in integrators}
         if integrators:
-            entries = ", ".join(f'"{name}": 1.0' for name in integrators)
-            remedy += (
-                f", or give another nominal_control, for example nominal_control={{{entries}}}; "
-                f"integrators: {so_far}"
-            )
+            example = json.dumps(entries)
+            remedy += f", or give another nominal_control, for example nominal_control={example}; "
+            remedy += f"integrators: {so_far}"
         raise AssumptionError(
             f"B(x) of (16) is regular around x = {show(error.state)}, but not there: it is "
             f"singular at isolated states, which more integrators do not change. {remedy}",
@@ -250,7 +239,7 @@ def _integrated(
     system: DaeSystem,
     columns: list[int],
     added: Sequence[Signal],
-    following: Sequence[Signal],
+    controls: Sequence[Signal],
     nominal: FloatArray,
     mixing: ca.SX | None = None,
 ) -> DaeSystem:
@@ -258,14 +247,10 @@ def _integrated(
     q, n, p = len(columns), system.num_states, system.num_controls
     others = [j for j in range(p) if j not in columns]
     new = ca.vertcat(*[ca.SX.sym(signal.name) for signal in added])
-    h = ca.SX(n + q, p)
-    h[:n, others] = system.h[:, others]
+    h, scale = ca.SX(n + q, p), system.state_scale
+    h[:n, others], h[n:, columns] = system.h[:, others], ca.SX.eye(q)
     if mixing is not None:
         h[:n, others] -= ca.mtimes(system.h[:, columns], mixing)
-    controls, scale = list(system.control_signals), system.state_scale
-    for row, i in enumerate(columns):
-        h[n + row, i] = 1.0
-        controls[i] = following[row]
     if scale is not None:
         scale = np.concatenate([scale, positive(np.abs(nominal))])
     return replace(

@@ -242,7 +242,7 @@ def _checked_completion(
             "the chains and of the rest of the completion; choose a function whose differential is "
             "not in their span"
         )
-    raise ModelError(f"{system.name}: at x = {show(margin.state)} {text}")
+    raise ModelError(f"{system.name}: {text} at x = {show(margin.state)}")
 
 
 def _chosen_completion(structure: Structure, chains: ca.SX, samples: Samples) -> ca.SX:

@@ -19,8 +19,8 @@ import numpy as np
 import scipy  # SciPy loads its large parts when they are used.
 
 from drake_dae.arrays import FloatArray, numbers, show
+from drake_dae.dae.manifold import CONSISTENT
 from drake_dae.dae.samples import as_matrix
-from drake_dae.dae.settling import CONSISTENT
 from drake_dae.dae.structure import Structure
 from drake_dae.errors import InconsistentStateError, ModelError, NonFiniteError
 from drake_dae.trace.expressions import result_of

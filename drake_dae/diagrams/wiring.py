@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System, TriggerType
-from pydrake.systems.primitives import LogVectorOutput, MatrixGain, Multiplexer, VectorLogSink
+from pydrake.systems.primitives import LogVectorOutput, Multiplexer, VectorLogSink
 
 from drake_dae.arguments import checked
 from drake_dae.dae import Signal, TrackingLaw
@@ -49,7 +48,8 @@ def make_closed_loop(
 ) -> ClosedLoop:
     """Builds the closed loop of a plant, a tracking law and references, with a log and a view.
 
-    With a `ContactPlant` all signals are logged at its steps.
+    On a plant in steps all signals are logged at these. A loop without view, sampling and limits
+    converts to AutoDiffXd, for Drake's Linearize.
 
     Args:
         plant: A `RobotPlant`, or any other `Plant`.
@@ -63,16 +63,12 @@ def make_closed_loop(
             a scene_graph: `FRAME_RATE` times a second, which shortens the integrator's steps. None
             for no live view; `make_animation` does not need it.
 
-    A loop without view, sampling and limits converts to AutoDiffXd, for Drake's
-    Linearize.
-
     Warns:
         NonMinimumPhaseWarning: The zero dynamics are unstable; see `TrackingController`.
 
     Raises:
-        WiringError: The law or the sensor has other sizes than the plant; measured force would
-            close an algebraic loop, or a sampled loop that diverges; the law does not use the
-            sensor; or an observer lacks sampling or measured force.
+        WiringError: The parts do not fit together, or measured force would close an algebraic loop,
+            or a sampled loop that diverges.
     """
     settings = settings or LoopSettings()
     check_law(plant.dae, law)
@@ -178,11 +174,6 @@ def wire_loop(
 
     # Integrals are not updated while a contact is lost, or a drive is at its limit.
     if is_limited is not None and controller.HasInputPort("hold"):
-        count = controller.GetInputPort("hold").size()
-        if is_limited.size() != count:  # It holds all integrals.
-            spread = builder.AddSystem(MatrixGain(np.ones((count, 1))))
-            builder.Connect(is_limited, spread.get_input_port())
-            is_limited = spread.get_output_port()
         connect(is_limited, controller, "hold")
     add_signals(builder, controller, parts.signals)
     if parts.control_limits is not None:
@@ -217,12 +208,12 @@ def wire_loop(
     for block in (controller, observer, plant):
         if block is not None:
             named |= {n: (block.GetOutputPort(n), s) for n, s in block.further_signals.items()}
-    for name, (port, _) in named.items():
-        builder.ExportOutput(port, name)
-    for name in controller.shown:
-        builder.ExportOutput(controller.GetOutputPort(name), name)
+    shown = {name: port for name, (port, _) in named.items()}
+    shown |= {name: controller.GetOutputPort(name) for name in controller.shown}
     if plant.model is not None:
-        builder.ExportOutput(plant.GetOutputPort("link_state"), "link_state")
+        shown["link_state"] = plant.GetOutputPort("link_state")
+    for name, port in shown.items():
+        builder.ExportOutput(port, name)
     log = log_steps(builder, [port for port, _ in named.values()], plant)
 
     # The view: the robot at its link positions, what it touches, the constraint forces.
@@ -256,12 +247,7 @@ def log_steps(builder: DiagramBuilder, ports: Sequence[OutputPort], plant: Plant
     stacked.set_name("logged_signals")
     for index, port in enumerate(ports):
         builder.Connect(port, stacked.get_input_port(index))
-    port = stacked.get_output_port()
     # After the last step of a run the state of a discrete plant belongs to a time that the run has
     # not reached.
-    if plant.time_step:
-        triggers = {TriggerType.kPeriodic}
-        log = builder.AddSystem(VectorLogSink(port.size(), triggers, plant.time_step))
-        builder.Connect(port, log.get_input_port())
-        return log
-    return LogVectorOutput(port, builder, {TriggerType.kPerStep})
+    trigger = TriggerType.kPeriodic if plant.time_step else TriggerType.kPerStep
+    return LogVectorOutput(stacked.get_output_port(), builder, {trigger}, plant.time_step)

@@ -82,11 +82,7 @@ def plot_runs(
 
 
 def save_plots(
-    loop: ClosedLoop,
-    record: Record,
-    context: Context,
-    folder: Path,
-    accuracy: float | None = None,
+    loop: ClosedLoop, record: Record, context: Context, folder: Path, accuracy: float | None = None
 ) -> None:
     """Writes the plots of a run of a loop of a robot as PNG files, `PLOTS`."""
     motion, predicted = follow(loop, record, context), loop.predicted_error(record)

@@ -113,11 +113,7 @@ def explained(
 
 
 def _dependent(
-    structure: Structure,
-    matrix: ca.SX,
-    signals: Sequence[Signal],
-    state: FloatArray,
-    limit: float,
+    structure: Structure, matrix: ca.SX, signals: Sequence[Signal], state: FloatArray, limit: float
 ) -> tuple[str, ...]:
     """The signals whose rows in a matrix depend on each other at a state, but for rows of 0."""
     rows = [i for i in range(matrix.rows()) if matrix[i, :].nnz()]

@@ -1,8 +1,9 @@
 """Judges a run: do outputs reach their references, are all limits kept, is it as predicted?"""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -78,203 +79,192 @@ class OutputQuality:
 class Judgement:
     """Whether a run succeeded, and why: what decided first, then what else was found.
 
-    It is undecided if it is too short to tell, or is off the prediction for no known reason.
+    Without phases, each output must be within its tolerance from the first half of the run on, or
+    from the time at which the predicted error is. If the predicted error exceeds the tolerance even
+    at the end, and the run follows it, the run is undecided; so it is if it is off the prediction
+    for no known reason. With phases, the last one must end. `reasons` explain a deviation,
+    `accuracy` is that of error control, and `ended` why the run broke off.
     """
 
-    outcome: Outcome
-    findings: tuple[RunFinding, ...]
-    outputs: tuple[OutputQuality, ...] = ()
-    ranges: tuple[SignalRange, ...] = ()
+    record: Record
+    predicted: FloatArray
+    ranges: Sequence[SignalRange] = ()
+    tolerances: Mapping[str, float] = field(default_factory=dict)
+    changes: Sequence[PhaseChange] = ()
+    ended: str = ""
+    accuracy: float | None = None
+    reasons: Sequence[str] = ()
+    more: Sequence[RunFinding] = ()
 
     def __str__(self) -> str:
         reasons = [finding.text for finding in self.findings]
         reason = reasons[0] if reasons else "there is no output, and nothing is violated"
         return f"{self.outcome.name}: {reason}"
 
+    @property
+    def outcome(self) -> Outcome:
+        return (self.findings[0].decides if self.findings else None) or Outcome.GOOD
 
-def judge(
-    record: Record,
-    predicted: FloatArray,
-    ranges: Sequence[SignalRange] = (),
-    *,
-    tolerances: Mapping[str, float] | None = None,
-    changes: Sequence[PhaseChange] = (),
-    ended: str = "",
-    accuracy: float | None = None,
-    reasons: Sequence[str] = (),
-    more: Iterable[RunFinding] = (),
-) -> Judgement:
-    """Judges whether a run succeeded.
-
-    Without phases, each output must be within its tolerance from the first half of the run on, or
-    from the time at which the predicted error is. If the predicted error exceeds the tolerance even
-    at the end, and the run follows it, the run is undecided. With phases, the last one must end.
-    """
-    outputs, found = _qualities(record, predicted, tolerances or {}), list[RunFinding]()
-    if ended:
-        end = float(record.time[-1])
-        text = f"the run broke off at {end:.4g} s: {ended}"
-        found.append(RunFinding(FindingKind.ENDED, text, Outcome.BAD, time=end))
-    # Of a compliant contact the whole force is recorded, which cannot pull.
-    kinds = {*LimitKind} - ({LimitKind.FORCE} if "contact_force" in record else set())
-    beyond = [r.excess for r in ranges if r.kind in kinds and r.excess is not None]
-    for excess in sorted(beyond, key=lambda e: -abs(e.value / e.limit) if e.limit else -np.inf):
-        numbers = excess.signal, excess.value, excess.limit, excess.time
-        found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *numbers))
-    found += more
-    if changes:
-        found += _of_task(changes)
-    elif not ended:  # Else it has not had the time.
-        pushing = {r.signal.name for r in ranges if r.kind is LimitKind.FORCE and r.low == 0.0}
-        found += _of_contacts(record, pushing)
-        found += _of_outputs(record, predicted, outputs, reasons)
-        if outputs:
-            found += _of_prediction(record, predicted, accuracy, reasons)
-    order = (Outcome.BAD, Outcome.UNDECIDED, None)
-    first = (FindingKind.TASK, FindingKind.REFERENCE)  # Of the remarks.
-    found.sort(key=lambda f: (order.index(f.decides), not f.decides and f.kind not in first))
-    outcome = (found[0].decides if found else None) or Outcome.GOOD
-    return Judgement(outcome, tuple(found), tuple(outputs), tuple(ranges))
-
-
-def _of_task(changes: Sequence[PhaseChange]) -> Iterator[RunFinding]:
-    """Whether a task was done, given up, or had not ended yet; and which failures it got over."""
-    last, decides = changes[-1], None
-    # After "leave" the change that led there has the reason.
-    failures = [change for change in changes if change.failed and change.phase != "held"]
-    if last.failed and last.phase in ("held", "leave"):
-        left = ""
-        if last.phase == "held" and failures and changes[-2].phase == "leave":
-            last, left = failures[-1], ", and has left the contact"
-        text = f"the task was given up at {last.time:.4g} s{left}: {last.reason}"
-        decides, failures = Outcome.BAD, []
-    elif last.phase == "held":
-        text, failures = f"the task ended as chosen at {last.time:.4g} s: {last.reason}", []
-    elif last.phase == "done":
-        again = len(changes) - len({change.place for change in changes})
-        repeated = f", {again} of them again" if again else ""
-        text = f"the task was done at {last.time:.4g} s, in {count_of(len(changes) - 1, 'phase')}"
-        text += repeated
-    else:
-        where = f"phase {last.place + 1}, {last.phase}, which began at {last.time:.4g} s"
-        text, decides = f"the run ended during {where}", Outcome.UNDECIDED
-    yield RunFinding(FindingKind.TASK, text, decides, time=last.time)
-    for change in failures:
-        text = f"at {change.time:.4g} s {change.reason}, and {change.phase} followed, as chosen"
-        yield RunFinding(FindingKind.TASK, text, time=change.time)
-
-
-def _of_contacts(record: Record, pushing: set[str]) -> Iterator[RunFinding]:
-    """Lost contacts, which are problems in the second half of the run."""
-    times, forces = record.time, record.signals["constraint_force"]
-    for signal, values in zip(forces.signals, forces.values.T, strict=True):
-        touches, decides = np.flatnonzero(values > 0.0), cast(Outcome | None, Outcome.BAD)
-        if signal.name not in pushing or (not touches.size and (values.size < 2 or values.any())):
-            continue
-        if not touches.size:
-            text, first = f"{signal.name} is 0 all the time", times[0]
-        else:
-            lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
-            if not lost.size:
-                continue
-            first, lasted = times[lost[0]], np.diff(times)[lost].sum()
-            text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
-            if times[lost[-1]] < 0.5 * (times[0] + times[-1]):
-                decides = None
-        yield RunFinding(FindingKind.CONTACT, text, decides, signal, 0.0, time=float(first))
-
-
-def _of_outputs(
-    record: Record,
-    predicted: FloatArray,
-    outputs: Sequence[OutputQuality],
-    reasons: Sequence[str],
-) -> Iterator[RunFinding]:
-    """Which outputs are off their references, or cannot be there yet."""
-    times, error = record.time, record["tracking_error"]
-    middle, grace = 0.5 * (times[0] + times[-1]), GRACE * (times[-1] - times[0])
-    late, settled, are_bad = times >= middle, [], False
-    for i, output in enumerate(outputs):
-        signal, since, tolerance = output.signal, output.within_since, output.tolerance
-        name, unit = signal.name, f" {signal.unit}".rstrip()
-        wanted = _within_since(times, predicted[:, i], tolerance)
-        due = None if wanted is None else max(middle, wanted + grace)
-        if since is not None:
-            most = float(np.max(np.abs(error[late & (times >= since), i]), initial=0.0))
-            settled.append((most / tolerance, most, output))
-            if due is None or since <= due:
-                continue
-        numbers = signal, float(np.max(np.abs(error[late, i]))), tolerance, since
-        if due is None and np.all(np.abs(error - predicted)[late, i] <= tolerance):
-            text = f"the run is too short: {name} cannot yet be at its reference, by the gains"
-            cause = "a longer duration"
-            yield RunFinding(FindingKind.REFERENCE, text, Outcome.UNDECIDED, *numbers, cause)
-            continue
-        are_bad, until = True, "ends off" if since is None else f"until {since:.3g} s is off"
-        text = (
-            f"{name} {until} its reference, by up to {numbers[1]:.2g}{unit} in the second half of "
-            f"the run ({tolerance:.2g}{unit} tolerated)"
-        )
-        cause = f"{name} is off likely because {', '.join(reasons)}" if reasons else ""
-        yield RunFinding(FindingKind.REFERENCE, text, Outcome.BAD, *numbers, cause)
-    if settled and not are_bad:
-        since = max(output.within_since or 0.0 for *_, output in settled)
-        _, most, worst = max(settled, key=lambda each: each[0])
-        which = "every output" if len(settled) == len(outputs) else "every other output"
-        text = (
-            f"{which} is at its reference from {since:.3g} s on; {worst.signal.name} comes closest "
-            f"to its tolerance, with {most:.2g} of {worst.tolerance:.2g} {worst.signal.unit}"
-        ).rstrip()
-        numbers = worst.signal, most, worst.tolerance, since
-        yield RunFinding(FindingKind.REFERENCE, text, None, *numbers)
-
-
-def _of_prediction(
-    record: Record, predicted: FloatArray, accuracy: float | None, reasons: Sequence[str]
-) -> Iterator[RunFinding]:
-    """The output that is farthest off the prediction, if that is more than an integrator leaves."""
-    off = np.abs(record["tracking_error"] - predicted)
-    shares, allowed = off / output_sizes(record, predicted), max(NEAR, STEPS * (accuracy or 0.0))
-    column = int(np.argmax(shares.max(axis=0)))
-    if not shares[:, column].max() > allowed:
-        return
-    signal, largest = record.signals["tracking_error"].signals[column], float(off[:, column].max())
-    time = float(record.time[np.argmax(shares[:, column] > allowed)])
-    text = (
-        f"from {time:.3g} s on the error of {signal.name} is off the predicted one, by up to "
-        f"{largest:.2g} {signal.unit}".rstrip()
-    )
-    decides, cause = None, ", ".join(reasons)
-    if not reasons:
-        decides, text = Outcome.UNDECIDED, f"{text}, and nothing in the scenario explains it"
-        finer = "smaller steps" if accuracy is None else f"an accuracy finer than {accuracy:g}"
-        cause = f"if {finer} changes nothing, plant and law differ"
-    yield RunFinding(FindingKind.PREDICTION, text, decides, signal, largest, None, time, cause)
-
-
-def _qualities(
-    record: Record, predicted: FloatArray, tolerances: Mapping[str, float]
-) -> list[OutputQuality]:
-    """How well each output of a record followed its reference; arguments as of `judge`."""
-    error, times, found = record["tracking_error"], record.time, list[OutputQuality]()
-    if not error.size:
+    @cached_property
+    def findings(self) -> list[RunFinding]:
+        """What the run shows, that which decides first."""
+        record, found = self.record, list[RunFinding]()
+        if self.ended:
+            end = float(record.time[-1])
+            text = f"the run broke off at {end:.4g} s: {self.ended}"
+            found.append(RunFinding(FindingKind.ENDED, text, Outcome.BAD, time=end))
+        # Of a compliant contact the whole force is recorded, which cannot pull.
+        kinds = {*LimitKind} - ({LimitKind.FORCE} if "contact_force" in record else set())
+        beyond = [r.excess for r in self.ranges if r.kind in kinds and r.excess is not None]
+        for excess in sorted(beyond, key=lambda e: -abs(e.value / e.limit) if e.limit else -np.inf):
+            numbers = excess.signal, excess.value, excess.limit, excess.time
+            found.append(RunFinding(FindingKind.LIMIT, str(excess), Outcome.BAD, *numbers))
+        found += self.more
+        if self.changes:
+            found += self._of_task()
+        elif not self.ended:  # Else it has not had the time.
+            found += [*self._of_contacts(), *self._of_outputs()]
+            found += self._of_prediction() if self.outputs else ()
+        order = (Outcome.BAD, Outcome.UNDECIDED, None)
+        first = (FindingKind.TASK, FindingKind.REFERENCE)  # Of the remarks.
+        found.sort(key=lambda f: (order.index(f.decides), not f.decides and f.kind not in first))
         return found
-    # By default 1 % of the range of the references in the unit of an output.
-    desired, signals = record["desired_output"], record.signals["tracking_error"].signals
-    sizes, late = output_sizes(record, predicted), late_rms(times, error)
-    spans, largest = np.ptp(desired, axis=0), np.abs(desired).max(axis=0)
-    spans[spans <= ROUND_OFF * sizes] = 0.0
-    units = np.array([signal.unit for signal in record.signals["desired_output"].signals])
-    for i, signal in enumerate(signals):
-        same = units == units[i]
-        size = spans[same].max() or largest[same].max() or sizes[i]
-        size = max(spans[same].max(), 1.0) if units[i] in PURE else size
-        values, tolerance = error[:, i], tolerances.get(signal.name, float(SHARE * size))
-        ends = float(values[0]), float(np.max(np.abs(values))), float(values[-1])
-        off = float(np.max(np.abs(values - predicted[:, i])))
-        since = _within_since(times, values, tolerance)
-        found.append(OutputQuality(signal, *ends, float(late[i]), off, tolerance, since))
-    return found
+
+    @cached_property
+    def outputs(self) -> list[OutputQuality]:
+        """How well each output followed its reference."""
+        record, predicted = self.record, self.predicted
+        error, times, found = record["tracking_error"], record.time, list[OutputQuality]()
+        if not error.size:
+            return found
+        # By default 1 % of the range of the references in the unit of an output.
+        desired, signals = record["desired_output"], record.signals["tracking_error"].signals
+        sizes, late = output_sizes(record, predicted), late_rms(times, error)
+        spans, largest = np.ptp(desired, axis=0), np.abs(desired).max(axis=0)
+        spans[spans <= ROUND_OFF * sizes] = 0.0
+        units = np.array([signal.unit for signal in record.signals["desired_output"].signals])
+        for i, signal in enumerate(signals):
+            same = units == units[i]
+            size = spans[same].max() or largest[same].max() or sizes[i]
+            size = max(spans[same].max(), 1.0) if units[i] in PURE else size
+            values, tolerance = error[:, i], self.tolerances.get(signal.name, float(SHARE * size))
+            ends = float(values[0]), float(np.max(np.abs(values))), float(values[-1])
+            off = float(np.max(np.abs(values - predicted[:, i])))
+            since = _within_since(times, values, tolerance)
+            found.append(OutputQuality(signal, *ends, float(late[i]), off, tolerance, since))
+        return found
+
+    def _of_task(self) -> Iterator[RunFinding]:
+        """Whether a task was done, given up, or had not ended yet; which failures it got over."""
+        changes, last, decides = self.changes, self.changes[-1], None
+        # After "leave" the change that led there has the reason.
+        failures = [change for change in changes if change.failed and change.phase != "held"]
+        if last.failed and last.phase in ("held", "leave"):
+            left = ""
+            if last.phase == "held" and failures and changes[-2].phase == "leave":
+                last, left = failures[-1], ", and has left the contact"
+            text = f"the task was given up at {last.time:.4g} s{left}: {last.reason}"
+            decides, failures = Outcome.BAD, []
+        elif last.phase == "held":
+            text, failures = f"the task ended as chosen at {last.time:.4g} s: {last.reason}", []
+        elif last.phase == "done":
+            again = len(changes) - len({change.place for change in changes})
+            repeated = f", {again} of them again" if again else ""
+            count = count_of(len(changes) - 1, "phase")
+            text = f"the task was done at {last.time:.4g} s, in {count}{repeated}"
+        else:
+            where = f"phase {last.place + 1}, {last.phase}, which began at {last.time:.4g} s"
+            text, decides = f"the run ended during {where}", Outcome.UNDECIDED
+        yield RunFinding(FindingKind.TASK, text, decides, time=last.time)
+        for change in failures:
+            text = f"at {change.time:.4g} s {change.reason}, and {change.phase} followed, as chosen"
+            yield RunFinding(FindingKind.TASK, text, time=change.time)
+
+    def _of_contacts(self) -> Iterator[RunFinding]:
+        """Lost contacts, which are problems in the second half of the run."""
+        times, forces = self.record.time, self.record.signals["constraint_force"]
+        forced = (r for r in self.ranges if r.kind is LimitKind.FORCE)
+        pushing = {r.signal.name for r in forced if r.low == 0.0}
+        for signal, values in zip(forces.signals, forces.values.T, strict=True):
+            touches, decides = np.flatnonzero(values > 0.0), cast(Outcome | None, Outcome.BAD)
+            is_other = not touches.size and (values.size < 2 or values.any())
+            if signal.name not in pushing or is_other:
+                continue
+            if not touches.size:
+                text, first = f"{signal.name} is 0 all the time", times[0]
+            else:
+                lost = touches[0] + np.flatnonzero(values[touches[0] : -1] == 0.0)
+                if not lost.size:
+                    continue
+                first, lasted = times[lost[0]], np.diff(times)[lost].sum()
+                text = f"{signal.name} was 0 for {lasted:.2g} s, first at {first:.4g} s"
+                if times[lost[-1]] < 0.5 * (times[0] + times[-1]):
+                    decides = None
+            yield RunFinding(FindingKind.CONTACT, text, decides, signal, 0.0, time=float(first))
+
+    def _of_outputs(self) -> Iterator[RunFinding]:
+        """Which outputs are off their references, or cannot be there yet."""
+        times, error = self.record.time, self.record["tracking_error"]
+        middle, grace = 0.5 * (times[0] + times[-1]), GRACE * (times[-1] - times[0])
+        late, settled, are_bad = times >= middle, [], False
+        for i, output in enumerate(self.outputs):
+            signal, since, tolerance = output.signal, output.within_since, output.tolerance
+            name, unit = signal.name, f" {signal.unit}".rstrip()
+            wanted = _within_since(times, self.predicted[:, i], tolerance)
+            due = None if wanted is None else max(middle, wanted + grace)
+            if since is not None:
+                most = float(np.max(np.abs(error[late & (times >= since), i]), initial=0.0))
+                settled.append((most / tolerance, most, output))
+                if due is None or since <= due:
+                    continue
+            numbers = signal, float(np.max(np.abs(error[late, i]))), tolerance, since
+            if due is None and np.all(np.abs(error - self.predicted)[late, i] <= tolerance):
+                text = f"the run is too short: {name} cannot yet be at its reference, by the gains"
+                more = *numbers, "a longer duration"
+                yield RunFinding(FindingKind.REFERENCE, text, Outcome.UNDECIDED, *more)
+                continue
+            are_bad, until = True, "ends off" if since is None else f"until {since:.3g} s is off"
+            text = (
+                f"{name} {until} its reference, by up to {numbers[1]:.2g}{unit} in the second half "
+                f"of the run ({tolerance:.2g}{unit} tolerated)"
+            )
+            cause = (
+                f"{name} is off likely because {', '.join(self.reasons)}" if self.reasons else ""
+            )
+            yield RunFinding(FindingKind.REFERENCE, text, Outcome.BAD, *numbers, cause)
+        if settled and not are_bad:
+            since = max(output.within_since or 0.0 for *_, output in settled)
+            _, most, worst = max(settled, key=lambda each: each[0])
+            which = "every output" if len(settled) == len(self.outputs) else "every other output"
+            text = (
+                f"{which} is at its reference from {since:.3g} s on; {worst.signal.name} comes "
+                f"closest to its tolerance, with {most:.2g} of {worst.tolerance:.2g} "
+                f"{worst.signal.unit}"
+            ).rstrip()
+            numbers = worst.signal, most, worst.tolerance, since
+            yield RunFinding(FindingKind.REFERENCE, text, None, *numbers)
+
+    def _of_prediction(self) -> Iterator[RunFinding]:
+        """The output farthest off the prediction, if that is more than an integrator leaves."""
+        record, accuracy, reasons = self.record, self.accuracy, self.reasons
+        off = np.abs(record["tracking_error"] - self.predicted)
+        shares = off / output_sizes(record, self.predicted)
+        allowed, column = max(NEAR, STEPS * (accuracy or 0.0)), int(np.argmax(shares.max(axis=0)))
+        if not shares[:, column].max() > allowed:
+            return
+        signal = record.signals["tracking_error"].signals[column]
+        largest = float(off[:, column].max())
+        time = float(record.time[np.argmax(shares[:, column] > allowed)])
+        text = (
+            f"from {time:.3g} s on the error of {signal.name} is off the predicted one, by up to "
+            f"{largest:.2g} {signal.unit}".rstrip()
+        )
+        decides, cause = None, ", ".join(reasons)
+        if not reasons:
+            decides, text = Outcome.UNDECIDED, f"{text}, and nothing in the scenario explains it"
+            finer = "smaller steps" if accuracy is None else f"an accuracy finer than {accuracy:g}"
+            cause = f"if {finer} changes nothing, plant and law differ"
+        yield RunFinding(FindingKind.PREDICTION, text, decides, signal, largest, None, time, cause)
 
 
 def unit_sizes(

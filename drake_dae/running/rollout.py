@@ -32,16 +32,9 @@ from drake_dae.errors import (
     NonFiniteError,
     SimulationError,
 )
-from drake_dae.running.diagnosis import (
-    IN_ROLLOUT,
-    MANY,
-    explained,
-    too_long,
-    warn_if_stiff,
-)
+from drake_dae.running.diagnosis import IN_ROLLOUT, MANY, explained, too_long, warn_if_stiff
 from drake_dae.running.drake_stepped import run_stepped
-from drake_dae.running.events import Seed
-from drake_dae.running.rollout_program import MAKING, RolloutProgram, program_of
+from drake_dae.running.rollout_program import MAKING, RolloutProgram, Seed, program_of
 from drake_dae.running.simulate import check_config
 from drake_dae.systems.plants.contract import Plant
 from drake_dae.trace.compiled import Compiled, check_choice

@@ -28,8 +28,7 @@ from drake_dae.running.compiled_run import NO_EVENTS, CompiledRun
 from drake_dae.running.diagnosis import RunWatch
 from drake_dae.running.interruption import Interruption, ending_signals
 
-# The time between updates of the progress bar, or between lines without a terminal, in s.
-BAR_PERIOD, LINE_PERIOD = 0.1, 10.0
+BAR_PERIOD = 0.1  # The time between updates of the progress bar, in s.
 
 
 @dataclass(frozen=True)
@@ -76,10 +75,9 @@ def simulate(
         context: Its context with the start state; changed in place.
         duration: The duration to simulate, in s.
         config: Drake's integrator settings; its defaults if None. The run starts at its start_time.
-        progress: Shows simulated time and speed on stderr.
+        progress: Shows simulated time and speed on stderr, if it is a terminal.
         may_diverge: Whether a diverging run continues.
-        look: A function that is called with the context after some steps, at least after every
-            32nd.
+        look: A function that is called with the context after at most 32 steps, again and again.
 
     Raises:
         ModelError: The duration or the settings are not valid.
@@ -88,8 +86,9 @@ def simulate(
     """
     config = config or SimulatorConfig()
     check_context(diagram, context)
-    check_duration(duration)
     check_config(config)
+    if not (isfinite(duration) and duration > 0.0):
+        raise ModelError(f"a duration must be positive, got {duration} s")
     start = config.start_time
     if not np.isfinite(start) or np.spacing(abs(start)) > 1e-9 * duration:
         raise ModelError(
@@ -100,8 +99,7 @@ def simulate(
     _clear_later(diagram, context, start)
     # Under error control, witness functions take their accuracy from the context.
     context.SetAccuracy(config.accuracy)
-    start, going_on = context.get_time(), EventStatus.DidNothing()
-    began, composed = 0.0, None
+    start, began, steps = context.get_time(), 0.0, 0
     watch = RunWatch(diagram, context, config, duration)
 
     def stop(number: signal.Signals) -> None:
@@ -118,11 +116,10 @@ def simulate(
 
     def monitor(current: Context) -> EventStatus:
         if seen(current, 1):
-            return going_on
+            return EventStatus.DidNothing()
         return EventStatus.ReachedTermination(diagram, "interrupted")
 
-    bar = _Progress(duration, progress)
-    ending = Interruption()
+    bar, ending = _Progress(duration, progress), Interruption()
     with closing(bar), ending_signals(stop):
         try:
             simulator.Initialize()
@@ -131,16 +128,17 @@ def simulate(
             # A monitor in Python takes 10 % of a short step, so it is set only if needed.
             if progress or look is not None or not may_diverge or ending.signal is not None:
                 simulator.set_monitor(monitor)
+            composed = None
             if not config.target_realtime_rate:
                 composed = CompiledRun.of(diagram, context, config, duration)
-            if composed is None or not composed.run(start + duration, seen):
+            is_done = composed is not None and composed.run(start + duration, seen)
+            if not is_done:
                 if composed is not None:  # To the failure, whose message the blocks know.
                     simulator.Initialize(NO_EVENTS)
                 simulator.AdvanceTo(start + duration)
                 steps = simulator.get_num_steps_taken()
                 simulator.AdvancePendingEvents()
-            else:
-                steps = 0
+            steps += 0 if composed is None else composed.steps
             elapsed = time.perf_counter() - began
             watch.look(context, is_last=True)
         except (DrakeDaeError, RuntimeError) as error:
@@ -151,7 +149,6 @@ def simulate(
                 raise
             raise told from error
         bar.show(context.get_time() - start, is_last=True)
-        steps += 0 if composed is None else composed.steps
         return RunStatistics(context.get_time() - start, elapsed, steps, ending.signal)
 
 
@@ -164,12 +161,6 @@ def _clear_later(system: System, context: Context, start: float) -> None:
         log = system.FindMutableLog(context)
         if log.num_samples() and log.sample_times()[-1] > start:
             log.Clear()
-
-
-def check_duration(duration: float) -> None:
-    """Checks that a duration is positive."""
-    if not (isfinite(duration) and duration > 0.0):
-        raise ModelError(f"a duration must be positive, got {duration} s")
 
 
 def check_config(config: SimulatorConfig) -> None:
@@ -198,36 +189,29 @@ def check_config(config: SimulatorConfig) -> None:
 
 
 class _Progress:
-    """Simulated time and speed on stderr: a bar on a terminal, otherwise lines in long runs."""
+    """A bar with simulated time and speed on stderr, if it is a terminal."""
 
     def __init__(self, duration: float, is_shown: bool) -> None:
-        is_terminal = sys.stderr.isatty()
-        self._period = BAR_PERIOD if is_terminal else LINE_PERIOD
+        form = "{desc}{percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s{postfix}"
         self._bar = tqdm(
             total=duration,
-            disable=not (is_shown and is_terminal),
+            disable=None if is_shown else True,  # None: without a terminal.
             file=sys.stderr,
+            bar_format=form,
             **default_size(),
-            bar_format="{desc}{percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s{postfix}",
         )
-        self._is_shown, self._began = is_shown, time.perf_counter()
-        self._last = self._began
+        self._began = self._last = time.perf_counter()
 
     def show(self, simulated: float, *, is_last: bool = False) -> None:
-        """Shows the simulated time in s if it is due; the last one if there are others."""
+        """Shows the simulated time in s if it is due."""
         now = time.perf_counter()
-        is_due = is_last and (not self._bar.disable or self._last > self._began)
-        if not self._is_shown or not (is_due or now - self._last >= self._period):
+        if self._bar.disable or not (is_last or now - self._last >= BAR_PERIOD):
             return
-        self._last, speed = now, f"{simulated / (now - self._began):.1f} x real time"
-        with suppress(OSError):  # A closed terminal or pipe must not end the run.
-            if self._bar.disable:
-                text = f"{simulated:.2f}/{self._bar.total:.2f} s, {speed}"
-                print(text, file=sys.stderr, flush=True)
-            else:
-                self._bar.set_postfix_str(speed, refresh=False)
-                self._bar.n = min(simulated, self._bar.total)
-                self._bar.refresh()
+        self._last, speed = now, simulated / (now - self._began)
+        with suppress(OSError):  # A closed terminal must not end the run.
+            self._bar.set_postfix_str(f"{speed:.1f} x real time", refresh=False)
+            self._bar.n = min(simulated, self._bar.total)
+            self._bar.refresh()
 
     def close(self) -> None:
         with suppress(OSError):

@@ -20,7 +20,6 @@ from drake_dae.running.judgement import (
     record_sizes,
 )
 from drake_dae.running.simulate import RunStatistics
-from drake_dae.systems.control.contract import PhaseChange
 
 WIDTH, MOST = 100, 6  # The width of a paragraph; the most findings that are told beside the first.
 UNEXCITED = 0.5  # A parameter is not excited whose deviation is above this share of that at first.
@@ -30,34 +29,29 @@ _FORCES = (LimitKind.FORCE, LimitKind.CONTROL, LimitKind.EFFORT)
 
 
 @dataclass(frozen=True, eq=False)
-class RunSummary:
+class RunSummary(Judgement):
     """What is told about a run: `text` and `data` say the same.
 
     `remedies` are what to look at beside the causes of the findings, `notes` what is approximate,
-    `accuracy` that of error control, and `named` the parameters that the user had estimated;
-    statistics are None for a failed run.
+    and `named` the parameters that the user had estimated; statistics are None for a failed run.
     """
 
-    judgement: Judgement
-    record: Record
-    changes: Sequence[PhaseChange] = ()
     statistics: RunStatistics | None = None
     remedies: Sequence[str] = ()
     notes: Sequence[str] = ()
-    accuracy: float | None = None
     named: Collection[str] = ()
 
     @property
     def missed(self) -> bool:
         """Whether the run is bad, or off the prediction for no known reason."""
-        return self.judgement.outcome is Outcome.BAD or any(
-            f.kind is FindingKind.PREDICTION and f.decides for f in self.judgement.findings
+        return self.outcome is Outcome.BAD or any(
+            f.kind is FindingKind.PREDICTION and f.decides for f in self.findings
         )
 
     @property
     def look_next(self) -> list[str]:
         """What to change, or to look at."""
-        causes = [f.cause for f in self.judgement.findings if f.decides and f.cause]
+        causes = [f.cause for f in self.findings if f.decides and f.cause]
         return list(dict.fromkeys([*self.remedies, *causes]))
 
     @property
@@ -72,14 +66,14 @@ class RunSummary:
     @property
     def data(self) -> dict[str, Any]:
         """The summary as plain data."""
-        judgement, ran = self.judgement, self.statistics
+        ran = self.statistics
         names = ("simulated_time", "steps", "wall_time")
         return {
-            "outcome": str(judgement.outcome),
-            "reason": str(judgement),
+            "outcome": str(self.outcome),
+            "reason": str(self),
             "missed": self.missed,
-            "findings": [_named(asdict(finding)) for finding in judgement.findings],
-            "outputs": [_named(asdict(output)) for output in judgement.outputs],
+            "findings": [_named(asdict(finding)) for finding in self.findings],
+            "outputs": [_named(asdict(output)) for output in self.outputs],
             "forces_and_controls": [
                 {"kind": str(r.kind), **r.to_dict(), "cut_off": self._cut_off(r)}
                 for r in self._limited
@@ -95,7 +89,7 @@ class RunSummary:
     @property
     def text(self) -> str:
         """The summary in lines of at most 100 characters; the first says good, bad, undecided."""
-        judgement, sizes = self.judgement, record_sizes(self.record)
+        sizes = record_sizes(self.record)
 
         def number(value: float, signal: Signal, digits: int) -> str:
             """A number, or 0 if it is round-off."""
@@ -103,15 +97,15 @@ class RunSummary:
             return "0" if abs(value) <= ROUND_OFF * size else f"{value:.{digits}g}"
 
         # Findings; the prediction is told below the table, unless it decides.
-        off = [f for f in judgement.findings if f.kind is FindingKind.PREDICTION and not f.decides]
-        told = [f for f in judgement.findings[1:] if f not in off]
-        head = [fill(str(judgement), WIDTH)]
+        off = [f for f in self.findings if f.kind is FindingKind.PREDICTION and not f.decides]
+        told = [f for f in self.findings[1:] if f not in off]
+        head = [fill(str(self), WIDTH)]
         head += [fill(f"- {f.text}", WIDTH, subsequent_indent="  ") for f in told[:MOST]]
         head += [f"- {len(told) - MOST} more, which --json names"] * (len(told) > MOST)
 
         # The table of outputs.
         rows, outputs = list[list[str]](), list[str]()
-        for q in judgement.outputs:
+        for q in self.outputs:
             numbers = (q.start, 3), (q.largest, 3), (q.late_rms, 2), (q.off_prediction, 2)
             texts = [number(value, q.signal, digits) for value, digits in numbers]
             rows.append([q.signal.name, q.signal.unit or "1", *texts, f"{q.tolerance:.2g}"])
@@ -144,7 +138,7 @@ class RunSummary:
     @property
     def _limited(self) -> list[SignalRange]:
         """Forces of constraints, controls, and forces of joints behind their actuation."""
-        found = [r for r in self.judgement.ranges if r.kind in _FORCES]
+        found = [r for r in self.ranges if r.kind in _FORCES]
         return sorted(found, key=lambda r: _FORCES.index(r.kind))
 
     def _cut_off(self, limited: SignalRange) -> float:
@@ -171,7 +165,7 @@ class RunSummary:
             )
         nearest = list[str]()
         for kinds in ((LimitKind.CONTROL, LimitKind.EFFORT), (LimitKind.POSITION,)):
-            ranges = [r for r in self.judgement.ranges if r.kind in kinds and isfinite(r.share)]
+            ranges = [r for r in self.ranges if r.kind in kinds and isfinite(r.share)]
             for r in sorted(ranges, key=lambda r: -r.share)[:1]:
                 unit = f" {r.signal.unit}".rstrip()
                 left = f"{r.share:.0%} of {r.high:.4g}{unit}"

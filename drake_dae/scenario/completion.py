@@ -22,7 +22,6 @@ from drake_dae.robots import (
     JointPositions,
     Links,
     PointCoordinates,
-    PositionOutput,
     as_force_outputs,
     force_rows,
     plant_constraints,
@@ -50,10 +49,14 @@ _REGULAR = 1e-3
 
 @dataclass(frozen=True)
 class Completed:
-    """A scenario with all outputs and a start, and the library's choices, one line each."""
+    """A scenario with all outputs and a start, and the library's choices, one line each.
+
+    `critical_friction` is the least one along the references of what has been completed.
+    """
 
     scenario: Scenario
     notes: tuple[str, ...] = ()
+    critical_friction: float = np.inf
 
 
 def completions(
@@ -63,212 +66,402 @@ def completions(
 
     Starts and sets of joints are compared by the least `Postures.quality` along the reference.
     """
-    bound = ConstraintSet([*constraints, *plant_constraints(links)])
-    outputs = [make(form, constraints) for form in scenario.outputs]
-    steered = as_force_outputs(scenario.forces, bound)
-    S = force_rows(steered, bound, links)
-    rows = _Rows(scenario, links, outputs, bound)
-    missing = len(links.actuator_signals) + len(bound.motors) - rows.given - S.shape[0]
-    start, task = scenario.start.positions, scenario.task
-    is_placed = bool(start) if task else len(start) == len(links.position_signals)
-    if (
-        missing < 0
-        or (missing == 0 and is_placed)
-        or not (rows.given or S.shape[0] or scenario.references or task)  # Only simulated.
-        or scenario.law.control_weights
-        or scenario.compliances is not None
-        # The model refuses such actuators.
-        or np.linalg.matrix_rank(links.actuation_matrix) < len(links.actuator_signals)
-    ):
+    search = _Search(scenario, links, constraints)
+    if search.is_left_alone:
         yield Completed(scenario)
         return
-    postures = rows.postures(scenario, bound, S)
-    # Rows named by references are known before the posture, from the normal near the guess.
-    first = postures.solve((), np.zeros(0), guess)
-    near = postures.at(guess if first is None else first)
-    forces = [signal.name for output in steered for signal in output.signals(bound)]
-    # Some rows of a planar arm are constant.
-    some = [np.abs(postures.at(q).gradients).max(axis=1) for q in postures.guesses(4)]
-    along = [row for row in rows.points(near) if max(one[row] for one in some) > 1e-9]
-    goals = _Goals(scenario, rows, forces, missing, near, along)
-    named, begin = goals.rows, goals.path[0][0]
-    errors = scenario.start.errors
-    begin = begin + [errors.get(rows.signals[row].name, 0.0) for row in named]
-    if missing == 0 and task is None:
+    search.follow(guess)
+    named, begin, is_given = search.named, search.begin, bool(scenario.start.positions)
+    if search.missing == 0 and scenario.task is None:
+        postures = search.postures
         q = postures.solve(named, begin, guess)
         if q is not None and (
-            start or min(postures.at(x).independence(named) for x in (q, guess)) > _REGULAR
+            is_given or min(postures.at(x).independence(named) for x in (q, guess)) > _REGULAR
         ):
             yield Completed(scenario)
-            if start:
+            if is_given:
                 return
-    starts = _starts(postures, rows, named, begin, guess, bool(start), missing)
-    found = list[tuple[tuple[bool, int, float], Posture, list[int], list[int]]]()
-    for posture in starts[: 1 if start else _POSTURES]:
-        for added in _added(rows, named, posture, missing):
-            held, count = [*named, *added], len({*added} - {*rows.joints})
+    starts = search.starts(guess)
+    found = list[tuple[tuple[bool, int, float], Posture, list[int]]]()
+    for posture in starts[: 1 if is_given else _POSTURES]:
+        for added in search.added(posture):
+            count = len({*added} - {*search.joints})
             rivals = sorted((rank[2] for rank, *_ in found if rank[1] >= count), reverse=True)
             enough = rivals[MOST - 1] if len(rivals) >= MOST else 0.0
-            quality = _least(postures, goals, posture, held, enough)
-            found.append(((quality > 0.0, count, quality), posture, held, added))
+            quality = search.least_quality(posture, [*named, *added], enough)
+            found.append(((quality > 0.0, count, quality), posture, added))
     if not found:
-        raise ScenarioError(_why_none(starts[0], rows, named, missing, bound, forces))
+        raise ScenarioError(search.why_none(starts[0]))
     # Of those that are equal along the reference, the best one at the start.
     found.sort(key=lambda entry: entry[0], reverse=True)
     fewer = [entry for entry in found[MOST:] if entry[0][1] < found[0][0][1]]
-    for _, posture, held, added in [*found[:MOST], *fewer[:1]]:
-        yield _written(scenario, rows, postures, posture, held, added)
+    for _, posture, added in [*found[:MOST], *fewer[:1]]:
+        yield search.written(posture, added)
 
 
-def _starts(
-    postures: Postures,
-    rows: "_Rows",
-    named: Sequence[int],
-    wanted: FloatArray,
-    guess: FloatArray,
-    is_given: bool,
-    missing: int,
-) -> list[Posture]:
-    """The postures in which the references begin, the best first; tools normal where possible."""
-    # Joints in start.positions stay at them; others are guessed.
-    fixed = np.array([name in rows.start for name in (s.name for s in rows.links.position_signals)])
-    guesses = [guess, *np.where(fixed, guess, postures.guesses(_GUESSES))]
-    ways = [(named, wanted)]
-    if missing and rows.tilts:
-        upright = [*named, *rows.tilts]
-        ways.insert(0, (upright, np.concatenate([wanted, np.zeros(len(rows.tilts))])))
-    for chosen, values in ways if is_given else ():
-        q = postures.solve(chosen, values, guess)
-        if q is not None and (near := postures.at(q)).independence(named) > _REGULAR:
-            return [near]
-    for chosen, values in ways:
-        found: list[Posture] = []
-        for count, one in enumerate(guesses):
-            if count == _PATIENCE and not found:
-                break
-            q = postures.solve(chosen, values, one)
-            if q is not None and all(np.max(np.abs(q - p.q)) > 0.02 for p in found):
-                found.append(postures.at(q))
-        if found:
-            return sorted(found, key=lambda p: -postures.quality(p, named))
-    q, left = postures.nearest(named, wanted, guesses)
-    polished = postures.solve(named, wanted, q)
-    if polished is not None:
-        return [postures.at(polished)]
-    signals, missed = [rows.signals[row] for row in named], list[str]()
-    for s, value, goal in zip(signals, postures.at(q).rows[list(named)], wanted, strict=True):
-        if abs(goal - value) > 1e-6:
-            missed.append(f"{s.name} comes to {value:.4g} {s.unit}, and not to {goal:.4g} {s.unit}")
-    residual = float(np.max(np.abs(left[: left.size - len(named)]), initial=0.0))
-    if residual > 1e-6:
-        missed.append(f"{residual:.2g} (m or rad) is left of the constraints")
-    text = (
-        "the robot cannot start there within its joint limits; the nearest start found has: "
-        f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "
-        "references, start.errors or the surface's place, or give start.positions"
-    )
-    key = "task.phases" if rows.is_task else "references"
-    raise ScenarioError((key if len(named) else "constraints", text))
+class _Search:
+    """The rows that outputs may have: `given` ones of the scenario, then those that complete them.
 
-
-def _added(
-    rows: "_Rows", named: Sequence[int], posture: Posture, missing: int
-) -> Iterator[list[int]]:
-    """The rows that complete the named ones, by the rule of `complete_scenario`."""
-    room = missing - (len(named) - rows.given)
-    if not room:
-        yield []
-        return
-    along = [row for row in rows.points(posture) if row not in named]
-    added = posture.independent(named, along, room)
-    axes = [row for row in rows.axes if row not in named]
-    axes = posture.independent([*named, *added], axes, len(axes))
-    axes = axes if len(axes) <= room - len(added) else []
-    # Where no start keeps the axis and all limits, it is left free.
-    for directions in [axes, []] if axes else [[]]:
-        held = [*named, *added, *directions]
-        count = room - len(added) - len(directions)
-        joints = [row for row in rows.joints if row not in held]
-        if comb(len(joints), count) <= 500:
-            sets = [list(chosen) for chosen in combinations(joints, count)]
-        else:
-            sets = [posture.most_independent(held, joints, count)]
-        ranked = [(posture.independence([*held, *chosen]), chosen) for chosen in sets]
-        ranked = [entry for entry in ranked if entry[0] > INDEPENDENT / 10]
-        for _, chosen in sorted(ranked, key=lambda entry: -entry[0])[:_SETS]:
-            yield [*added, *directions, *chosen]
-
-
-def _least(
-    postures: Postures, goals: "_Goals", posture: Posture, rows: Sequence[int], enough: float
-) -> float:
-    """The least quality along the references; 0 if they cannot be followed.
-
-    A value below `enough` need not be exact.
+    `tilts` are zero where tools are normal to their surfaces; `axes` are the rows of the tools'
+    directions that may be outputs, by `tool_axis`. `named` are the rows to which references refer,
+    and `path` their values and rates at some times, of which `begin` are the first values.
     """
-    wanted, count = posture.rows[list(rows)], len(goals.rows)
-    q, least = posture.q, postures.quality(posture, rows)
-    for values, rates in goals.path:
-        wanted[:count] = values
-        found = postures.solve(rows, wanted, q)
-        if found is None:
-            return 0.0
-        q, now = found, postures.at(found)
-        all_rates = np.concatenate([rates, np.zeros(len(rows) - count)])
-        least = min(least, postures.quality(now, rows))
-        if least <= enough or postures.is_too_fast(now, rows, all_rates):
-            return min(least, enough) if least else 0.0
-    return least
 
+    def __init__(self, scenario: Scenario, links: Links, constraints: Sequence[Constraint]) -> None:
+        self._scenario, self._links = scenario, links
+        self._bound = ConstraintSet([*constraints, *plant_constraints(links)])
+        steered = as_force_outputs(scenario.forces, self._bound)
+        self._forces = [s.name for output in steered for s in output.signals(self._bound)]
+        self._S = force_rows(steered, self._bound, links)
+        outputs = [make(form, constraints) for form in scenario.outputs]
+        self._signals: list[Signal] = [s for output in outputs for s in output.signals(links)]
+        self._expressions = [output.expression(links) for output in outputs]
+        self._forms: dict[int, WrittenOutput] = {}
+        self._given = len(self._signals)
+        controls = len(links.actuator_signals) + len(self._bound.motors)
+        self.missing = controls - self._given - self._S.shape[0]
+        touches = {c.name: c.touch(links) for c in self._bound.constraints}
+        self._touches = {name: touch for name, touch in touches.items() if touch is not None}
+        taken, kind = {s.name for s in self._signals}, scenario.tool_axis
+        self._points, self._outward = list[list[int]](), list[ca.SX]()
+        self._tilts, self._axes = list[int](), list[int]()
+        for name, touch in self._touches.items():
+            # Names are unique: the constraint's name is used if the frame's is taken.
+            others = {a: f"{name}_point" * (f"{touch.frame}.{a}" in taken) for a in "xyz"}
+            points = [PointCoordinates(touch.frame, a, touch.point, others[a]) for a in "xyz"]
+            self._points.append([self._add(form) for form in points])
+            column, sign = tool_axis(links, touch)
+            axis = "xyz"[column]
+            self._outward.append(sign * links.rotation(touch.frame)[:, column])
+            if kind != "free":
+                forms = [TiltFromNormalForm(name, axis, a) for a in "xyz" if a != axis]
+                self._tilts += [self._add(form) for form in forms]
+            if kind == "fixed":
+                fixed = [AxisCoordinates(touch.frame, axis, component) for component in "xyz"]
+                self._axes += [self._add(form) for form in fixed]
+        self._axes = self._axes or self._tilts
+        self._joints = [s.name for s in links.position_signals]
+        self.joints = [self._add(JointPositions([name])) for name in self._joints]
 
-def _written(
-    scenario: Scenario,
-    rows: "_Rows",
-    postures: Postures,
-    posture: Posture,
-    held: Sequence[int],
-    added: Sequence[int],
-) -> Completed:
-    """The scenario with outputs, references and start, and notes."""
-    names, notes = [signal.name for signal in rows.signals], []
-    chosen = list(held[rows.given :])
-    if chosen:
-        joints = " (joints so that B(x) is best conditioned)" * bool(set(added) & {*rows.joints})
-        left = "; the tool's axis is left free" * bool(rows.axes and not {*held} & {*rows.axes})
-        listed = ", ".join(names[row] for row in chosen)
-        notes.append(f"outputs completed by {listed}{joints}{left}")
-        outputs = [*scenario.outputs, *_joined(rows.forms[row] for row in chosen)]
-        scenario = replace(scenario, outputs=outputs)
-    if added and not rows.is_task:
-        # A joint that the task leaves free is held where it starts: its error is no fault of a run.
-        values = _rounded(posture.rows)
-        upright = np.max(np.abs(posture.rows[rows.tilts]), initial=0.0) < 1e-6
-        values[rows.tilts] *= not upright
-        resting = {names[row]: float(values[row]) for row in added}
-        free = dict.fromkeys(names[row] for row in added if row in rows.joints)
-        scenario = replace(
-            scenario,
-            references={**scenario.references, **resting},
-            judgement=replace(
-                scenario.judgement, tolerances={**free, **scenario.judgement.tolerances}
-            ),
+    def _add(self, form: WrittenOutput) -> int:
+        output, row = make(form, self._bound.constraints), len(self._signals)
+        self._expressions.append(output.expression(self._links))
+        self._forms[row] = form
+        self._signals += output.signals(self._links)
+        return row
+
+    @property
+    def is_left_alone(self) -> bool:
+        """Whether nothing is missing, nothing can be said, or the model refuses the actuators."""
+        scenario, links = self._scenario, self._links
+        start, is_task = scenario.start.positions, scenario.task is not None
+        is_placed = bool(start) if is_task else len(start) == len(links.position_signals)
+        is_controlled = bool(self._given or self._forces or scenario.references or is_task)
+        rank = np.linalg.matrix_rank(links.actuation_matrix)
+        return (
+            self.missing < (1 if is_placed else 0)
+            or not is_controlled
+            or bool(scenario.law.control_weights)
+            or scenario.compliances is not None
+            or bool(rank < len(links.actuator_signals))
         )
-    if rows.is_task and scenario.start.positions:
-        return Completed(scenario, tuple(notes))
-    q = posture.q
-    if scenario.task is not None and not scenario.task.phases[0].begins_in_contact:
-        q = rows.off_surface(scenario, posture)
-    joints_at = _rounded(q).tolist()
-    positions = dict(zip((s.name for s in rows.links.position_signals), joints_at, strict=True))
-    texts = (f"{name}: {value:.4g}" for name, value in positions.items())
-    notes.append(f"start found: {{{', '.join(texts)}}}")
-    start = replace(scenario.start, positions=positions)
-    return Completed(replace(scenario, start=start), tuple(notes))
 
+    def _postures(self, moved: Mapping[str, FloatArray]) -> Postures:
+        """The configurations of the robot at the start, with some parameters moved."""
+        scenario = self._scenario
+        values = {name: np.atleast_1d(value) for name, value in scenario.plant.parameters.items()}
+        for name, references in scenario.exogenous.items():
+            parts = [_values_of(r, getattr(r, "size", 1)) for r in references]
+            at_start = [part(scenario.integrator.start_time)[:, 0] for part in parts]
+            values[name] = np.concatenate([np.zeros(0), *at_start])
+        rows = ca.vertcat(ca.SX(0, 1), *self._expressions)
+        touches = list(zip(self._touches.values(), self._outward, strict=True))
+        with at("plant.parameters or exogenous"):
+            return Postures(self._links, self._bound, rows, self._S, touches, {**values, **moved})
 
-def _rounded(values: FloatArray) -> FloatArray:
-    """Values in m and rad as they are written, without -0."""
-    return np.round(values, 4) + 0.0
+    # What references say.
+
+    def follow(self, guess: FloatArray) -> None:
+        """Finds the rows that references name, and their values."""
+        scenario, postures = self._scenario, self._postures({})
+        self.postures = postures
+        # Rows named by references are known before the posture, from the normal near the guess.
+        first = postures.solve((), np.zeros(0), guess)
+        near = postures.at(guess if first is None else first)
+        # Some rows of a planar arm are constant.
+        some = [np.abs(postures.at(q).gradients).max(axis=1) for q in postures.guesses(4)]
+        along = [row for row in self._along(near) if max(one[row] for one in some) > 1e-9]
+        key, references = "references", scenario.references
+        if scenario.task is not None:
+            key, references = "task.phases", self._of_phases()
+        known = list[tuple[_Values, list[int | None]]]()
+        for name, reference in references.items():
+            at_key, rows = f"{key}.{name}", list[int | None]()
+            for part in map(str.strip, name.split(",")):
+                rows += self._denoted(part, at_key, along)
+            if isinstance(reference, Reference) and reference.size != len(rows):
+                text = f"{reference.size} values for {len(rows)} outputs"
+                raise ScenarioError((at_key, text))
+            known.append((_values_of(reference, len(rows)), rows))
+        every = dict.fromkeys(row for _, rows in known for row in rows if row is not None)
+        more = [row for row in every if row >= self._given]
+        if len(more) > self.missing:
+            names = ", ".join(self._signals[row].name for row in more)
+            text = f"{names} are {len(more)} outputs, but only {self.missing} are missing"
+            raise ScenarioError((key, text))
+        left = [self._signals[row].name for row in range(self._given) if row not in every]
+        if left and scenario.task is None:
+            raise ScenarioError((key, f"missing: {', '.join(left)}"))
+        self.named = [*range(self._given), *more]
+
+        def values_at(time: float) -> tuple[FloatArray, FloatArray]:
+            found = {row: (near.rows[row], 0.0) for row in self.named}  # If nothing refers to them.
+            for function, rows in known:
+                pairs = zip(rows, function(time), strict=True)
+                found |= {row: (pair[0], pair[1]) for row, pair in pairs if row is not None}
+            values, rates = np.array([found[row] for row in self.named]).reshape(-1, 2).T
+            return values, rates
+
+        begin = scenario.integrator.start_time
+        end = begin if scenario.task else begin + scenario.duration
+        self.path = [values_at(time) for time in np.unique(np.linspace(begin, end, _TIMES))]
+        errors = scenario.start.errors
+        off = [errors.get(self._signals[row].name, 0.0) for row in self.named]
+        self.begin = self.path[0][0] + off
+
+    def _of_phases(self) -> dict[str, Any]:
+        """The first reference that a phase of the task gives each output, without distances."""
+        assert self._scenario.task is not None
+        distances = {signal.name for signal in self._bound.residual_signals}
+        references = dict[str, Any]()
+        for phase in self._scenario.task.phases:
+            for key, reference in getattr(phase, "references", {}).items():
+                parts = [part.strip() for part in key.split(",")]
+                kept = [part for part in parts if part not in distances]
+                # The rows of a Reference cannot be taken apart here.
+                if kept and (kept == parts or not isinstance(reference, Reference)):
+                    references.setdefault(", ".join(kept), reference)
+        return references
+
+    def _denoted(self, name: str, key: str, along: Sequence[int]) -> Sequence[int | None]:
+        """The rows that a name in references denotes; None for a force."""
+        signals, forces = [signal.name for signal in self._signals], self._forces
+        outputs = [*signals[: self._given], *forces]
+        with suppress(ReferenceSignalError):
+            places = denoted(name, outputs, [2] * self._given + [0] * len(forces))
+            return [place if place < self._given else None for place in places]
+        if self.missing:  # Of a point the rows along its surface first.
+            first = [signals[row] for row in along]
+            others = [*first, *(s for s in signals[self._given :] if s not in first)]
+            of_point = [signal for signal in first if signal.rpartition(".")[0] == name]
+            with suppress(ReferenceSignalError):
+                chosen = of_point or [others[k] for k in denoted(name, others, [2] * len(others))]
+                return [signals.index(signal) for signal in chosen]
+            outputs += others
+        for constraint in self._bound.constraints:
+            if name in [signal.name for signal in constraint.coordinate_signals]:
+                text = f"no output '{name}', a coordinate along the constraint '{constraint.name}'"
+                form = f"!SurfaceCoordinates {{constraint: {constraint.name}}}"
+                raise ScenarioError((key, f"{text}: add {form} to outputs"))
+        raise ScenarioError((key, unknown_name("output", name, outputs)))
+
+    def _along(self, posture: Posture) -> list[int]:
+        """The rows along each surface: of the world's axes all but that closest to the normal."""
+        across = abs(posture.normals).argmax(axis=1)
+        pairs = zip(self._points, across, strict=True)
+        return [row for rows, axis in pairs for k, row in enumerate(rows) if k != axis]
+
+    # Where it starts, and by which outputs.
+
+    def starts(self, guess: FloatArray) -> list[Posture]:
+        """The postures in which the references begin, the best first; tools normal if possible."""
+        postures, named, begin = self.postures, self.named, self.begin
+        start = self._scenario.start.positions
+        # Joints in start.positions stay at them; others are guessed.
+        fixed = np.array([name in start for name in self._joints])
+        guesses = [guess, *np.where(fixed, guess, postures.guesses(_GUESSES))]
+        ways = [(named, begin)]
+        if self.missing and self._tilts:
+            upright = np.concatenate([begin, np.zeros(len(self._tilts))])
+            ways.insert(0, ([*named, *self._tilts], upright))
+        for rows, values in ways if start else ():
+            q = postures.solve(rows, values, guess)
+            if q is not None and (near := postures.at(q)).independence(named) > _REGULAR:
+                return [near]
+        for rows, values in ways:
+            found: list[Posture] = []
+            for count, one in enumerate(guesses):
+                if count == _PATIENCE and not found:
+                    break
+                q = postures.solve(rows, values, one)
+                if q is not None and all(np.max(np.abs(q - p.q)) > 0.02 for p in found):
+                    found.append(postures.at(q))
+            if found:
+                return sorted(found, key=lambda p: -postures.quality(p, named))
+        q, left = postures.nearest(named, begin, guesses)
+        polished = postures.solve(named, begin, q)
+        if polished is not None:
+            return [postures.at(polished)]
+        missed, residual = list[str](), float(np.max(np.abs(left), initial=0.0))
+        for row, value, goal in zip(named, postures.at(q).rows[named], begin, strict=True):
+            if abs(goal - value) > 1e-6:
+                name, unit = self._signals[row].name, self._signals[row].unit
+                missed.append(f"{name} comes to {value:.4g} {unit}, and not to {goal:.4g} {unit}")
+        if residual > 1e-6:
+            missed.append(f"{residual:.2g} (m or rad) is left of the constraints")
+        text = (
+            "the robot cannot start there within its joint limits; the nearest start found has: "
+            f"{'; '.join(missed) or 'nothing, but at a limit'}. Change the first values of the "
+            "references, start.errors or the surface's place, or give start.positions"
+        )
+        key = "references" if self._scenario.task is None else "task.phases"
+        raise ScenarioError((key if named else "constraints", text))
+
+    def added(self, posture: Posture) -> Iterator[list[int]]:
+        """The rows that complete the named ones, by the rule of `complete_scenario`."""
+        named = self.named
+        room = self.missing - (len(named) - self._given)
+        if not room:
+            yield []
+            return
+        along = [row for row in self._along(posture) if row not in named]
+        added = posture.independent(named, along, room)
+        axes = [row for row in self._axes if row not in named]
+        axes = posture.independent([*named, *added], axes, len(axes))
+        axes = axes if len(axes) <= room - len(added) else []
+        # Where no start keeps the axis and all limits, it is left free.
+        for directions in [axes, []] if axes else [[]]:
+            held = [*named, *added, *directions]
+            count = room - len(added) - len(directions)
+            joints = [row for row in self.joints if row not in held]
+            if comb(len(joints), count) <= 500:
+                sets = [list(chosen) for chosen in combinations(joints, count)]
+            else:
+                sets = [posture.most_independent(held, joints, count)]
+            ranked = [(posture.independence([*held, *chosen]), chosen) for chosen in sets]
+            ranked = [entry for entry in ranked if entry[0] > INDEPENDENT / 10]
+            for _, chosen in sorted(ranked, key=lambda entry: -entry[0])[:_SETS]:
+                yield [*added, *directions, *chosen]
+
+    def least_quality(self, posture: Posture, rows: Sequence[int], enough: float) -> float:
+        """The least quality along the references; 0 if they cannot be followed.
+
+        A value below `enough` need not be exact.
+        """
+        postures, least = self.postures, self.postures.quality(posture, rows)
+        for now, rates in self._followed(posture, rows):
+            if now is None:
+                return 0.0
+            least = min(least, postures.quality(now, rows))
+            if least <= enough or postures.is_too_fast(now, rows, rates):
+                return min(least, enough) if least else 0.0
+        return least
+
+    def _followed(
+        self, posture: Posture, rows: Sequence[int]
+    ) -> Iterator[tuple[Posture | None, FloatArray]]:
+        """The posture at each time of the references, None out of reach; and the rates of rows."""
+        wanted, count, q = posture.rows[list(rows)], len(self.named), posture.q
+        for values, rates in self.path:
+            wanted[:count] = values
+            found = self.postures.solve(rows, wanted, q)
+            q = posture.q if found is None else found
+            now = None if found is None else self.postures.at(q)
+            yield now, np.concatenate([rates, np.zeros(len(rows) - count)])
+
+    def written(self, posture: Posture, added: Sequence[int]) -> Completed:
+        """The scenario with outputs, references and start, and notes."""
+        scenario, notes, held = self._scenario, list[str](), [*self.named, *added]
+        names, chosen = [signal.name for signal in self._signals], held[self._given :]
+        if chosen:
+            joints = " (joints so that B(x) is best conditioned)" * bool({*added} & {*self.joints})
+            left = "; the tool's axis is left free" * bool(
+                self._axes and not {*held} & {*self._axes}
+            )
+            listed = ", ".join(names[row] for row in chosen)
+            notes.append(f"outputs completed by {listed}{joints}{left}")
+            outputs = [*scenario.outputs, *_joined(self._forms[row] for row in chosen)]
+            scenario = replace(scenario, outputs=outputs)
+        if added and scenario.task is None:
+            # A joint that the task leaves free is held where it starts: its error is no fault.
+            values = _rounded(posture.rows)
+            upright = np.max(np.abs(posture.rows[self._tilts]), initial=0.0) < 1e-6
+            values[self._tilts] *= not upright
+            resting = {names[row]: float(values[row]) for row in added}
+            free = dict.fromkeys(names[row] for row in added if row in self.joints)
+            tolerances = {**free, **scenario.judgement.tolerances}
+            scenario = replace(
+                scenario,
+                references={**scenario.references, **resting},
+                judgement=replace(scenario.judgement, tolerances=tolerances),
+            )
+        if scenario.task is not None and scenario.start.positions:
+            return Completed(scenario, tuple(notes))
+        q = posture.q
+        if scenario.task is not None and not scenario.task.phases[0].begins_in_contact:
+            q = self._off_surface(posture, held)
+        positions = dict(zip(self._joints, _rounded(q).tolist(), strict=True))
+        texts = (f"{name}: {value:.4g}" for name, value in positions.items())
+        notes.append(f"start found: {{{', '.join(texts)}}}")
+        start = replace(scenario.start, positions=positions)
+        critical = [
+            now.critical_friction(contact, rows)
+            for now, _ in self._followed(posture, held)
+            for contact, rows in enumerate(self._points)
+            if now is not None
+        ]
+        return Completed(
+            replace(scenario, start=start), tuple(notes), min(critical, default=np.inf)
+        )
+
+    def _off_surface(self, touching: Posture, held: Sequence[int]) -> FloatArray:
+        """The configuration with the same outputs, `BEFORE` the surface of a task."""
+        scenario = self._scenario
+        assert scenario.task is not None
+        contact = scenario.task.contact
+        names = [contact] if isinstance(contact, str) else [*contact]
+        values = {p.name: p.value for p in self._bound.parameters}
+        values |= {name: np.atleast_1d(v) for name, v in scenario.plant.parameters.items()}
+        moved = {
+            f"{name}.position": values[f"{name}.position"] + BEFORE * normal
+            for name, normal in zip(self._touches, touching.normals, strict=True)
+            if f"{name}.position" in values and (name in names or names == [""])
+        }
+        q = self._postures(moved).solve(held, touching.rows[list(held)], touching.q)
+        if q is None or not moved:
+            text = f"needed: no start was found {BEFORE:g} m before the surface of the task"
+            raise ScenarioError(("start.positions", text))
+        return q
+
+    def why_none(self, posture: Posture) -> tuple[str, str]:
+        """The key and text of the problem if no positions complete the outputs."""
+        forces, needed = self._forces, self._given + self.missing
+        left, values, _ = np.linalg.svd(posture.forces)
+        rank = int(np.count_nonzero(values > 1e-6 * np.max(values, initial=0.0)))
+        if rank < len(forces):
+            weights = np.linalg.norm(left[:, rank:], axis=1)
+            dependent = [
+                name for name, weight in zip(forces, weights, strict=True) if weight > 1e-6
+            ]
+            return "forces", (
+                f"{', '.join(dependent)} depend on each other at the start: of {len(forces)} force "
+                f"outputs {rank} are independent. Leave out {len(forces) - rank} of them; a force "
+                "across several contacts of one plane is a !ForceCombination of those normal to it"
+            )
+        ways = len(posture.mass) - int(np.linalg.matrix_rank(posture.constraints, 1e-9))
+        if needed <= ways:
+            names = ", ".join(self._signals[row].name for row in self.named) or "the constraints"
+            return "outputs", (
+                f"{self.missing} are missing, and no positions of joints beside {names} leave B(x) "
+                "regular; name others under outputs"
+            )
+        possible = ", ".join(signal.name for signal in self._bound.force_signals)
+        return "forces", (
+            f"{needed} outputs more are needed, one for each actuator that is left, but on its "
+            f"constraints the robot moves in {ways} ways: at most {ways} can be positions, and "
+            f"{needed - ways} more must be forces, of {possible}; or leave actuators out by "
+            "robot.actuators"
+        )
 
 
 _JOINED = {
@@ -292,170 +485,9 @@ def _joined(forms: Iterator[WrittenOutput]) -> list[WrittenOutput]:
     return outputs
 
 
-class _Rows:
-    """The `given` rows of the scenario's outputs, then the rows that may complete them.
-
-    `tilts` are zero where tools are normal to their surfaces; `axes` are the rows of the tools'
-    directions that may be outputs, by `tool_axis`.
-    """
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        links: Links,
-        outputs: Sequence[PositionOutput],
-        bound: ConstraintSet,
-    ) -> None:
-        self.links, self.start, self.is_task = links, scenario.start.positions, bool(scenario.task)
-        self.signals: list[Signal] = [s for output in outputs for s in output.signals(links)]
-        self._expressions = [output.expression(links) for output in outputs]
-        self.given, self.bound, self._scenario = len(self.signals), bound, scenario
-        self.forms: dict[int, WrittenOutput] = {}
-        touches = {c.name: c.touch(links) for c in bound.constraints}
-        self.touches = {name: touch for name, touch in touches.items() if touch is not None}
-        taken, kind = {s.name for s in self.signals}, scenario.tool_axis
-        self._points: list[list[int]] = []
-        self.tilts: list[int] = []
-        self.axes: list[int] = []
-        self.outward: list[ca.SX] = []
-        for name, touch in self.touches.items():
-            # Names are unique: the constraint's name is used if the frame's is taken.
-            others = {a: f"{name}_point" * (f"{touch.frame}.{a}" in taken) for a in "xyz"}
-            points = [PointCoordinates(touch.frame, a, touch.point, others[a]) for a in "xyz"]
-            self._points.append([self._add(form) for form in points])
-            column, sign = tool_axis(links, touch)
-            axis = "xyz"[column]
-            self.outward.append(sign * links.rotation(touch.frame)[:, column])
-            if kind != "free":
-                forms = [TiltFromNormalForm(name, axis, a) for a in "xyz" if a != axis]
-                self.tilts += [self._add(form) for form in forms]
-            if kind == "fixed":
-                fixed = [AxisCoordinates(touch.frame, axis, component) for component in "xyz"]
-                self.axes += [self._add(form) for form in fixed]
-        self.axes = self.axes or self.tilts
-        names = [signal.name for signal in links.position_signals]
-        self.joints = [self._add(JointPositions([name])) for name in names]
-
-    def _add(self, form: WrittenOutput) -> int:
-        output, row = make(form, self.bound.constraints), len(self.signals)
-        self._expressions.append(output.expression(self.links))
-        self.forms[row] = form
-        self.signals += output.signals(self.links)
-        return row
-
-    def points(self, posture: Posture) -> list[int]:
-        """The rows along each surface: of the world's axes all but that closest to the normal."""
-        across = abs(posture.normals).argmax(axis=1)
-        pairs = zip(self._points, across, strict=True)
-        return [row for rows, axis in pairs for k, row in enumerate(rows) if k != axis]
-
-    def postures(
-        self,
-        scenario: Scenario,
-        bound: ConstraintSet,
-        S: ca.SX,
-        moved: Mapping[str, FloatArray] | None = None,
-    ) -> Postures:
-        """The configurations of the robot at the start, with some parameters moved."""
-        begin = scenario.integrator.start_time
-        values = {name: np.atleast_1d(value) for name, value in scenario.plant.parameters.items()}
-        for name, references in scenario.exogenous.items():
-            sizes = [getattr(r, "size", 1) for r in references]
-            pairs = zip(references, sizes, strict=True)
-            at_start = [_values_of(r, size)(begin)[:, 0] for r, size in pairs]
-            values[name] = np.concatenate([np.zeros(0), *at_start])
-        rows = ca.vertcat(ca.SX(0, 1), *self._expressions)
-        touches = list(zip(self.touches.values(), self.outward, strict=True))
-        with at("plant.parameters or exogenous"):
-            return Postures(self.links, bound, rows, S, touches, {**values, **(moved or {})})
-
-    def off_surface(self, scenario: Scenario, touching: Posture) -> FloatArray:
-        """The configuration with the same outputs, `BEFORE` the surface of a task."""
-        assert scenario.task is not None
-        outputs = [make(form, self.bound.constraints) for form in scenario.outputs]
-        rows = _Rows(scenario, self.links, outputs, self.bound)
-        contact, bound = scenario.task.contact, self.bound
-        names = [contact] if isinstance(contact, str) else [*contact]
-        values = {p.name: p.value for p in bound.parameters}
-        values |= {name: np.atleast_1d(v) for name, v in scenario.plant.parameters.items()}
-        moved = {
-            f"{name}.position": values[f"{name}.position"] + BEFORE * normal
-            for name, normal in zip(self.touches, touching.normals, strict=True)
-            if f"{name}.position" in values and (name in names or names == [""])
-        }
-        outputs_at = rows.postures(scenario, bound, ca.SX(0, bound.size)).at(touching.q).rows
-        postures = rows.postures(scenario, bound, ca.SX(0, bound.size), moved)
-        q = postures.solve(range(rows.given), outputs_at[: rows.given], touching.q)
-        if q is None or not moved:
-            text = f"needed: no start was found {BEFORE:g} m before the surface of the task"
-            raise ScenarioError(("start.positions", text))
-        return q
-
-
-class _Goals:
-    """The rows to which references refer; `path` are their values and rates at some times."""
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        rows: _Rows,
-        forces: Sequence[str],
-        missing: int,
-        near: Posture,
-        along: Sequence[int],
-    ) -> None:
-        key = "references"
-        references: Mapping[str, Any] = scenario.references
-        self._held = near.rows  # What a task gives no reference.
-        if scenario.task is not None:
-            key = "task.phases"
-            distances = {signal.name for signal in rows.bound.residual_signals}
-            references = _of_phases(scenario, distances)
-        self._references: list[tuple[_Values, list[int | None]]] = []
-        for name, reference in references.items():
-            at_key, meaning = f"{key}.{name}", list[int | None]()
-            for part in map(str.strip, name.split(",")):
-                meaning += _meaning(part, at_key, rows, forces, missing, along)
-            if isinstance(reference, Reference) and reference.size != len(meaning):
-                text = f"{reference.size} values for {len(meaning)} outputs"
-                raise ScenarioError((at_key, text))
-            self._references.append((_values_of(reference, len(meaning)), meaning))
-        every = dict.fromkeys(row for _, meaning in self._references for row in meaning)
-        beside = [row for row in every if row is not None and row >= rows.given]
-        if len(beside) > missing:
-            names = ", ".join(rows.signals[row].name for row in beside)
-            text = f"{names} are {len(beside)} outputs, but only {missing} are missing"
-            raise ScenarioError((key, text))
-        left = [rows.signals[row].name for row in range(rows.given) if row not in every]
-        if left and scenario.task is None:
-            raise ScenarioError((key, f"missing: {', '.join(left)}"))
-        self.rows = [*range(rows.given), *beside]
-        begin = scenario.integrator.start_time
-        end = begin if scenario.task else begin + scenario.duration
-        self.path = [self._values(time) for time in np.unique(np.linspace(begin, end, _TIMES))]
-
-    def _values(self, time: float) -> tuple[FloatArray, FloatArray]:
-        """The values of the rows and their rates at a time in s, shape (len(rows),) each."""
-        found = {row: (self._held[row], 0.0) for row in self.rows}
-        for reference, meaning in self._references:
-            pairs = zip(meaning, reference(time), strict=True)
-            found |= {row: (pair[0], pair[1]) for row, pair in pairs if row is not None}
-        values, rates = np.array([found[row] for row in self.rows]).reshape(-1, 2).T
-        return values, rates
-
-
-def _of_phases(scenario: Scenario, distances: set[str]) -> dict[str, Any]:
-    """The first reference that a phase of the task gives each output, without distances."""
-    assert scenario.task is not None
-    references = dict[str, Any]()
-    for phase in scenario.task.phases:
-        for key, reference in getattr(phase, "references", {}).items():
-            parts = [part.strip() for part in key.split(",")]
-            kept = [part for part in parts if part not in distances]
-            # The rows of a Reference cannot be taken apart here.
-            if kept and (kept == parts or not isinstance(reference, Reference)):
-                references.setdefault(", ".join(kept), reference)
-    return references
+def _rounded(values: FloatArray) -> FloatArray:
+    """Values in m and rad as they are written, without -0."""
+    return np.round(values, 4) + 0.0
 
 
 _Values = Callable[[float], FloatArray]
@@ -472,63 +504,3 @@ def _values_of(reference: Any, size: int) -> _Values:
     except ReferenceSignalError:  # One of a force may jump.
         values = reference.derivatives([0] * size)
         return lambda time: values(time)[:, None] * [1.0, 0.0]
-
-
-def _meaning(
-    name: str, key: str, rows: _Rows, forces: Sequence[str], missing: int, along: Sequence[int]
-) -> Sequence[int | None]:
-    """The rows that a name in references denotes; None for a force."""
-    signals = [signal.name for signal in rows.signals]
-    outputs = [*signals[: rows.given], *forces]
-    with suppress(ReferenceSignalError):
-        places = denoted(name, outputs, [2] * rows.given + [0] * len(forces))
-        return [place if place < rows.given else None for place in places]
-    if missing:  # Of a point the rows along its surface first.
-        first = [signals[row] for row in along]
-        others = [*first, *(signal for signal in signals[rows.given :] if signal not in first)]
-        of_point = [signal for signal in first if signal.rpartition(".")[0] == name]
-        with suppress(ReferenceSignalError):
-            chosen = of_point or [others[k] for k in denoted(name, others, [2] * len(others))]
-            return [signals.index(signal) for signal in chosen]
-        outputs += others
-    for constraint in rows.bound.constraints:
-        if name in [signal.name for signal in constraint.coordinate_signals]:
-            text = f"no output '{name}', a coordinate along the constraint '{constraint.name}'"
-            form = f"!SurfaceCoordinates {{constraint: {constraint.name}}}"
-            raise ScenarioError((key, f"{text}: add {form} to outputs"))
-    raise ScenarioError((key, unknown_name("output", name, outputs)))
-
-
-def _why_none(
-    posture: Posture,
-    rows: _Rows,
-    named: Sequence[int],
-    missing: int,
-    bound: ConstraintSet,
-    forces: Sequence[str],
-) -> tuple[str, str]:
-    """The key and text of the problem if no positions complete the outputs."""
-    left, values, _ = np.linalg.svd(posture.forces)
-    rank = int(np.count_nonzero(values > 1e-6 * np.max(values, initial=0.0)))
-    if rank < len(forces):
-        weights = np.linalg.norm(left[:, rank:], axis=1)
-        dependent = [name for name, weight in zip(forces, weights, strict=True) if weight > 1e-6]
-        return "forces", (
-            f"{', '.join(dependent)} depend on each other at the start: of {len(forces)} force "
-            f"outputs {rank} are independent. Leave out {len(forces) - rank} of them; a force "
-            "across several contacts of one plane is a !ForceCombination of those normal to it"
-        )
-    ways = len(posture.mass) - int(np.linalg.matrix_rank(posture.constraints, 1e-9))
-    lacking = rows.given + missing - ways
-    if lacking <= 0:
-        names = ", ".join(rows.signals[row].name for row in named) or "the constraints"
-        return "outputs", (
-            f"{missing} are missing, and no positions of joints beside {names} leave B(x) regular; "
-            "name others under outputs"
-        )
-    return "forces", (
-        f"{rows.given + missing} outputs more are needed, one for each actuator that is left, but "
-        f"on its constraints the robot moves in {ways} ways: at most {ways} can be positions, and "
-        f"{lacking} more must be forces, of {', '.join(s.name for s in bound.force_signals)}; or "
-        "leave actuators out by robot.actuators"
-    )

@@ -1,7 +1,7 @@
 """Judges a scenario: before its run, along its references; and after it, by its record."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -30,10 +30,11 @@ from drake_dae.errors import AssumptionError, ScenarioError
 from drake_dae.references import Reference
 from drake_dae.references.reference import common_period, stack_references
 from drake_dae.robots import Constraint, LinkBehind, RobotModel, Surface, links_behind, own_values
-from drake_dae.running.judgement import FindingKind, Outcome, RunFinding, judge
+from drake_dae.running.judgement import FindingKind, Outcome, RunFinding
 from drake_dae.running.simulate import RunStatistics
 from drake_dae.running.summary import RunSummary
 from drake_dae.scenario.build import check_task, tracking_law
+from drake_dae.scenario.expected import beyond_stated
 from drake_dae.scenario.form import at
 from drake_dae.scenario.gains import advised
 from drake_dae.scenario.model import (
@@ -46,18 +47,14 @@ from drake_dae.scenario.model import (
 )
 from drake_dae.scenario.scenario import Scenario
 
-SAMPLES, MOST_SAMPLES = 1001, 20_000
-"""The smallest number of examined times along a reference, and the largest along a fast one."""
+SAMPLES, MOST_SAMPLES, MOST_TIMES = 1001, 20_000, 2000
+"""The smallest number of examined times along a reference, the largest along a fast one, and the
+most times of a record at which its references are examined."""
 
-STRAIGHT, SHORTEST = 0.01, 1e-6
+STRAIGHT, SHORTEST, BREAK = 0.01, 1e-6, 0.01
 """The allowed deviation of a reference from linear interpolation between two times, relative to its
-range; and the shortest interval that is divided, relative to the whole."""
-
-MOST_TIMES = 2000
-"""The most times of a record at which its references are examined."""
-
-BREAK = 0.01
-"""The share of a run that broke off, at its end, in which its limits are not judged."""
+range; the shortest interval that is divided, relative to the whole; and the share of a run that
+broke off, at its end, in which its limits are not judged."""
 
 WRONG_SIDE = "turn its normal around if its free side is the other one, or choose another posture"
 """The remedy for a link behind a surface."""
@@ -294,7 +291,7 @@ def judge_run(
         "the state is measured by encoders": scenario.sensors.encoders is not None,
         "the law is sampled": scenario.sampling is not None,
     }
-    judgement = judge(
+    summary = RunSummary(
         record,
         loop.predicted_error(record),
         ranges,
@@ -304,10 +301,12 @@ def judge_run(
         accuracy=accuracy,
         reasons=[reason for reason, holds in reasons.items() if holds],
         more=behind,
+        statistics=statistics,
+        remedies=remedies,
+        named=(scenario.estimator.parameters if scenario.estimator else None) or (),
     )
-    told = tuple(dict.fromkeys(filter(None, notes)))
-    named = (scenario.estimator.parameters if scenario.estimator else None) or ()
-    return RunSummary(judgement, record, changes, statistics, remedies, told, accuracy, named)
+    notes.append(beyond_stated(scenario, model, law.structure, summary.outputs, record))
+    return replace(summary, notes=tuple(dict.fromkeys(filter(None, notes))))
 
 
 def _beyond_edge(

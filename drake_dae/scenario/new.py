@@ -75,15 +75,17 @@ _TOOLS = [
 _ARM, _LONGEST_FINGER = 5, 4
 """Where a chain of so many joints branches into chains of at most so many, a hand begins."""
 
-# A table, walls around, and a ceiling: axis of the normal, its sign, and the preference.
+# Walls around, a table, and a ceiling: axis of the normal, its sign, and the preference.
 _NORMALS = (
-    *((2, 1.0, 1.0), (0, -1.0, 0.8), (1, -1.0, 0.7)),
-    *((0, 1.0, 0.6), (1, 1.0, 0.6), (2, -1.0, 0.4)),
+    *((0, -1.0, 0.8), (0, 1.0, 0.6), (1, -1.0, 0.7), (1, 1.0, 0.6)),
+    *((2, 1.0, 1.0), (2, -1.0, 0.4)),
 )
 
-_TRIES, _PATIENCE, _SLANTED = 40, 8, 0.3
-"""The postures that are tried for each normal; after how many without a tool along it the normal is
-given up; and the weight of a posture with a tool that is not along it."""
+_TRIES, _SLANTED = 40, 0.3
+"""The postures that are tried for each normal; the weight of one with the tool not along it."""
+
+_ENOUGH = 0.6
+"""The friction below which a contact does not jam along the path at a place that is good enough."""
 
 _SHARE = 0.3
 """The share of speed limits that a path may use; half of it of effort limits by the force."""
@@ -92,11 +94,9 @@ _RADIUS, _BEND, _FORCE, _SHORTEST = 0.08, 0.4, 20.0, 5.0
 """The radii of the circle and of a curved surface, relative to the robot's size; the largest force,
 N; and the shortest period, s."""
 
-_FRACTIONS, _PLACES = (1.0, 0.5, 0.2), 4
-"""The fractions of the usual circle and force that are tried, each at so many places."""
-
-_SECONDS = 15.0
-"""The processor time in s after which no further place is tried."""
+_FRACTIONS, _PLACES, _SECONDS = (1.0, 0.5, 0.2), 4, 15.0
+"""The fractions of the usual circle and force that are tried, each at so many places; the processor
+time in s after which no further place is tried."""
 
 
 @checked(lambda text: ScenarioError(("", text)))
@@ -138,7 +138,7 @@ def new_scenario(
 
 def placed_scenario(
     file: str,
-    surface: SurfaceKind,
+    kind: SurfaceKind,
     tip: str,
     point: Vector,
     folder: str | Path | None,
@@ -153,30 +153,36 @@ def placed_scenario(
         robot, tip, last, why = _robot(plant, robot, tip)
     read = robot_links(robot, SceneGraph(), drawn=False)
     links, tried = read[0], list[str]()
-    names = [signal.name for signal in links.position_signals]
     if not any(point) and (far := _far_end(links, tip, last)):
         point, why["point"] = far, "m, in that frame: its far end, where no frame of the file is"
     progress("looking for a place")
-    places = _places(links, tip, point)
-    for fraction, place in product(_FRACTIONS, places[:_PLACES]):
-        scenario = _scenario(robot, tip, point, place, names, surface, fraction)
-        name, center = scenario.constraints[0].name, place.center
-        if tried and process_time() > end:
+    found = list[tuple[float, Scenario, str]]()
+    places = _places(links, tip, point)[:_PLACES]
+    for count, (fraction, place) in enumerate(product(_FRACTIONS, places)):
+        # Near a singular wrist little friction jams a contact: the next place may be better.
+        is_done = found and (found[-1][0] >= _ENOUGH or count % len(places) == 0)
+        if is_done or ((found or tried) and process_time() > end):
             break
-        progress(f"trying a {name} at {center} m")
+        scenario = _scenario(robot, tip, point, place, kind, fraction)
+        name = f"{scenario.constraints[0].name} at {place.center} m"
+        progress(f"trying a {name}")
         try:
-            completed, _, _ = completed_model(scenario, None, robot=read)
+            completed = completed_model(scenario, None, robot=read)[0]
             problem = next((n for n in completed.notes if n.startswith(NOTHING_FOUND)), "")
         except DrakeDaeError as error:
             problem = str(error)
-        if not problem:
-            return scenario, _text(scenario, {**why, "surface": place.why}, folder), read
-        tried.append(f"{name} at {center} m, {fraction:g} of the usual circle: {problem[:160]}")
+        if problem:
+            tried.append(f"{name}, {fraction:g} of the usual circle: {problem[:160]}")
+        else:
+            found.append((completed.critical_friction, scenario, place.why))
+    if found:
+        _, scenario, why["surface"] = max(found, key=lambda entry: entry[0])
+        return scenario, _text(scenario, why, folder), read
+    joints = ", ".join(signal.name for signal in links.position_signals)
     where = "; ".join(tried[:_PLACES]) or "surfaces along all axes of the world"
     text = (
-        f"no place was found where the joints of '{tip}' ({', '.join(names)}) move it along a "
-        f"{surface}. Tried: {where}. Give another tip, as --tip LINK:x,y,z, or copy a shipped "
-        "scenario"
+        f"no place was found where the joints of '{tip}' ({joints}) move it along a {kind}. Tried: "
+        f"{where}. Give another tip, as --tip LINK:x,y,z, or copy a shipped scenario"
     )
     raise ScenarioError(("robot.file", text))
 
@@ -193,9 +199,8 @@ def _read(file: str) -> tuple[MultibodyPlant, Robot]:
             beside = [folder / name for folder in above[:2] if (folder / name).is_dir()]
             found = [*(folder for folder in above if folder.name == name), *beside]
             folders.update({name: str(found[0])} if found else {})
-        robot = replace(robot, packages=folders, leave_out=lost)
         for more in ([], ["empty_limits"]):
-            robot = replace(robot, leave_out=[*robot.leave_out, *more])
+            robot = replace(robot, packages=folders, leave_out=[*lost, *more])
             plant, loops = read_robot(robot)
             if any(map(_has_room, joints_of(plant))):
                 break
@@ -217,23 +222,24 @@ def _has_room(joint: Joint) -> bool:
 
 def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, str, dict[str, str]]:
     """The robot; the tip and the last joint that moves it; and key -> why it is so."""
-    why = {"packages": "where package://<name>/ leads", "leave_out": "what no equation has"}
-    why["actuators"] = "that are not locked"
-    names = {joint.index(): name for name, joint in joint_names(plant).items()}
-    joints = joints_of(plant)
-    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
-    above = {joint.child_body().index(): joint for joint in joints}
-    body_of = dict(zip(unique_names(plant, bodies), bodies, strict=True))
+    why = {
+        "packages": "where package://<name>/ leads",
+        "leave_out": "what no equation has",
+        "actuators": "that are not locked",
+        "locked": "m or rad; all that is not of the chain, or mimics",
+    }
     # The base.
-    floating = QuaternionFloatingJoint | RpyFloatingJoint
+    joints, floating = joints_of(plant), QuaternionFloatingJoint | RpyFloatingJoint
     for joint in joints:
         if not isinstance(joint, WeldJoint | RevoluteJoint | PrismaticJoint | floating):
             raise ModelError(
                 f"joint '{joint.name()}' ({joint.type_name()}) neither turns about one axis nor "
                 "slides along one; a new scenario can neither drive nor lock it"
             )
-    free = {joint.child_body().index() for joint in joints if isinstance(joint, floating)}
-    roots = [name for name, body in body_of.items() if body.index() in free]
+    bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
+    body_of = dict(zip(unique_names(plant, bodies), bodies, strict=True))
+    above = {joint.child_body().index(): joint for joint in joints}
+    roots = [n for n, body in body_of.items() if isinstance(above.get(body.index()), floating)]
     if len(roots) > 1:
         raise ModelError(
             f"{len(roots)} bodies are held by nothing ({', '.join(roots[:8])}), and a new scenario "
@@ -241,7 +247,9 @@ def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, s
         )
     if roots:
         robot, why["base"] = replace(robot, base=RobotPlacement(roots[0])), "nothing holds it"
+
     # The chain: joints that can work, from the base to the tip.
+    names = {joint.index(): name for name, joint in joint_names(plant).items()}
     couplings = couplings_of(plant) if plant.num_constraints() else []
     coupled = {name for c in couplings for name in (c.follower, c.leader)}
     works = [j for j in joints if _has_room(j) and names[j.index()] not in coupled]
@@ -253,7 +261,6 @@ def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, s
             body = found[-1].parent_body()
         return found[::-1]
 
-    paths = {name: path(body) for name, body in body_of.items()}
     if tip:
         try:
             body = GetScopedFrameByName(plant, tip).body()
@@ -264,6 +271,7 @@ def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, s
             raise ModelError(f"no joint that turns or slides for itself moves the tip '{tip}'")
         why["frame"] = f"moved by {len(chain)} joints"
     else:
+        paths = {name: path(body) for name, body in body_of.items()}
         arms = [j for j in works if not _NOT_OF_AN_ARM.search(j.name())]
         arms = [j for j in arms if not _FINGER.search(j.child_body().name())]
         chain = _longest(paths, arms) or _longest(paths, works)
@@ -275,15 +283,15 @@ def _robot(plant: MultibodyPlant, robot: Robot, tip: str) -> tuple[Robot, str, s
             )
         tip = _tip(plant, chain, paths)
         why["frame"] = f"the end of the longest chain, of {len(chain)} joints"
+
     # All else is locked, at zero or the nearest limit; what mimics follows.
     skipped = {names[joint.index()] for joint in chain} | {c.follower for c in couplings}
-    locked = {}
+    locked = dict[str, float]()
     for joint in joints:
         is_simple = isinstance(joint, RevoluteJoint | PrismaticJoint)
         if is_simple and (name := names[joint.index()]) not in skipped:
             low, high = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
             locked[name] = float(min(max(0.0, low), high))
-    why["locked"] = "m or rad; all that is not of the chain, or mimics"
     return replace(robot, locked=locked), tip, names[chain[-1].index()], why
 
 
@@ -309,11 +317,8 @@ def _tip(plant: MultibodyPlant, chain: Sequence[Joint], paths: dict[str, list[Jo
         if sum(joint in chain for joint in path) == len(chain):
             pose = GetScopedFrameByName(plant, name).CalcPoseInWorld(context)
             distances[name] = float(np.linalg.norm(pose.translation() - origin))
-    for word in _TOOLS:
-        named = [n for n in distances if word.search(n) and not _FINGER.search(n)]
-        if named:
-            return max(named, key=lambda name: distances[name])
-    return max(distances, key=lambda name: distances[name])
+    named = ([n for n in distances if word.search(n) and not _FINGER.search(n)] for word in _TOOLS)
+    return max(next(filter(None, named), distances), key=lambda name: distances[name])
 
 
 def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
@@ -328,24 +333,15 @@ def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
     if not isinstance(joint, RevoluteJoint):
         return None
     body = frame.body()
-    origin = joint.frame_on_child().CalcPose(context, body.body_frame())
-    axis = origin.rotation() @ joint.revolute_axis()
-
-    def distance(place: FloatArray) -> float:
-        return float(np.linalg.norm(np.cross(axis, place - origin.translation())))
-
-    mass_at = body.default_com() if body.default_mass() > 0.0 else origin.translation()
-    choices = [[2.0 * mass_at - origin.translation()]]
-    points = [o.points for o in links.outlines if o.name == body.name() and len(o.points) > 1]
-    if points:
-        low, high = np.vstack(points).min(axis=0), np.vstack(points).max(axis=0)
-        sides = product(range(3), (low, high))
-        choices.insert(
-            0, [np.where(np.arange(3) == k, side, (low + high) / 2) for k, side in sides]
-        )
+    pose = joint.frame_on_child().CalcPose(context, body.body_frame())
+    origin, axis = pose.translation(), pose.rotation() @ joint.revolute_axis()
     bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
     origins = [plant.EvalBodyPoseInWorld(context, one).translation() for one in bodies]
     near = 0.01 * float(np.linalg.norm(np.ptp(origins, axis=0)))
+
+    def distance(place: FloatArray) -> float:
+        return float(np.linalg.norm(np.cross(axis, place - origin)))
+
     if distance(frame.GetFixedPoseInBodyFrame().translation()) > near:
         return None
     # A wrist may roll about an axis through the tool, if the joints before it move that anywhere.
@@ -355,6 +351,12 @@ def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
     J = plant.CalcJacobianTranslationalVelocity(context, wrt, frame, np.zeros(3), world, world)
     if np.linalg.matrix_rank(J, tol=1e-6) >= min(3, J.shape[1]):
         return None
+    choices = [[2.0 * body.default_com() - origin]] if body.default_mass() > 0.0 else []
+    points = [o.points for o in links.outlines if o.name == body.name() and len(o.points) > 1]
+    if points:
+        low, high = np.vstack(points).min(axis=0), np.vstack(points).max(axis=0)
+        sides = product(np.eye(3, dtype=bool), (low, high))
+        choices.insert(0, [np.where(row, side, (low + high) / 2) for row, side in sides])
     for places in choices:
         farthest = max(places, key=distance)
         if distance(farthest) > near:
@@ -364,19 +366,16 @@ def _far_end(links: MultibodyExpressions, tip: str, last: str) -> Vector | None:
 
 
 class _Place(NamedTuple):
-    """A place for a surface, for a tip in a posture q that can move along the axes `ways`.
+    """A place for a surface, where the tip can move along the axes `ways` of the world."""
 
-    `speed` and `force` are the largest ones within the limits of joints, in m/s and N.
-    """
-
-    center: Vector
+    center: Vector  # m
     normal: Vector
     ways: tuple[int, ...]
-    q: FloatArray
+    positions: dict[str, float]  # Of the joints, in m and rad.
     why: str
-    speed: float
-    force: float
-    size: float
+    speed: float  # The largest one within the limits of joints, m/s.
+    force: float  # Likewise, N.
+    size: float  # Of the robot, m.
 
 
 def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place]:
@@ -386,8 +385,9 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
     good if the task's directions are independent, joints are away from their limits, all bodies are
     on the free side, the base is beside the tip, and gravity takes less than half of the torques.
     """
-    touch = PointOnSurface(tip, Plane((0, 0, 0), (0, 0, 1)), point).touch(links)
-    column, sign_out = tool_axis(links, touch)
+    column, sign_out = tool_axis(
+        links, PointOnSurface(tip, Plane((0, 0, 0), (0, 0, 1)), point).touch(links)
+    )
     R, place = links.rotation(tip), links.position(tip, point)
     # The tip's position, and of each axis of the world the two components across the tool.
     across = [k for k in range(3) if k != column]
@@ -397,99 +397,85 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
     moving = [place, *(body for body in bodies if ca.depends_on(body, links.q))]
     still = [body for body in bodies if not ca.depends_on(body, links.q)]
     weight = ca.substitute(links.bias, links.v, ca.SX.zeros(links.v.numel()))
-    parameters = [p.symbol for p in links.parameters]
+    parameters = ca.vertcat(*[p.symbol for p in links.parameters])
     outputs = [sign_out * R[:, column], ca.horzcat(*moving), ca.horzcat(*still), weight]
-    function = ca.Function("places", [links.q, ca.vertcat(*parameters)], outputs)
+    function = ca.Function("places", [links.q, parameters], outputs)
     values = np.concatenate([p.value for p in links.parameters])
     speeds, efforts = links.velocity_limits[1], np.full(links.v.numel(), np.inf)
     speeds = np.where(np.isfinite(speeds) & (speeds > 0.0), speeds, np.inf)
     efforts[np.argmax(np.abs(links.actuation_matrix), axis=0)] = links.effort_limits
     efforts = np.where(efforts > 0.0, efforts, np.inf)
     guesses, size = postures.guesses(_TRIES), postures.size
-    decimals = 2 if size > 0.3 else 3
 
-    def seen(posture: Posture) -> tuple[Posture, list[FloatArray]]:
-        return posture, [value.full() for value in function(posture.q, values)]
+    def seen(q: FloatArray, factor: float) -> tuple[Posture, list[FloatArray], float]:
+        return postures.at(q), [value.full() for value in function(q, values)], factor
 
-    slanted = [seen(postures.at(guess)) for guess in guesses]
+    slanted, choices = [seen(guess, _SLANTED) for guess in guesses], []
+    for axis in range(3):  # A planar robot cannot turn its tool along some axes.
+        tilts = [3 + 2 * axis, 4 + 2 * axis]
+        solved = (postures.solve(tilts, np.zeros(2), guess) for guess in guesses)
+        choices.append([*(seen(q, 1.0) for q in solved if q is not None), *slanted])
     found = list[tuple[float, _Place]]()
-    for axis in range(3):
-        tilts, aligned = [3 + 2 * axis, 4 + 2 * axis], list[tuple[Posture, list[FloatArray]]]()
-        ways = [k for k in range(3) if k != axis]
-        for count, guess in enumerate(guesses):
-            if count == _PATIENCE and not aligned:
-                break  # A planar robot cannot rotate its tool about some axes.
-            if (q := postures.solve(tilts, np.zeros(2), guess)) is not None:
-                aligned.append(seen(postures.at(q)))
-        for sign, preference in ((s, p) for k, s, p in _NORMALS if k == axis):
-            score, best, rows_at = 0.0, aligned[0][0] if aligned else None, list[int]()
-            choices = [*((one, 1.0) for one in aligned), *((one, _SLANTED) for one in slanted)]
-            for (posture, (outward, moved, base, gravity)), factor in choices:
-                at_tip, roots = posture.rows[:3], base.mean(axis=1)
-                beside = np.delete(at_tip - roots, axis)
-                disadvantages = (
-                    np.min(sign * (moved[axis] - at_tip[axis])) < -0.02 * size,
-                    sign * outward[axis, 0] > -0.5,
-                    # A table may be as high as the base; a wall must not cut it.
-                    axis != 2 and sign * (roots[axis] - at_tip[axis]) < 0.1 * size,
-                    axis == 2 and np.linalg.norm(beside) < 0.2 * size,
-                    np.any(np.abs(gravity[:, 0]) > 0.5 * efforts),
-                )
-                factor *= postures.margin(posture.q) * 0.1 ** sum(map(bool, disadvantages))
-                if factor * 5 <= score:
-                    continue  # No independence is above 1.
-                chosen = posture.independent([], [axis, *ways, *tilts], posture.q.size)
-                quality = factor * posture.independence(chosen) * len(chosen)
-                if axis in chosen and {*chosen} & {*ways} and quality > score:
-                    score, best, rows_at = quality, posture, chosen
-            if best is None or not rows_at:
-                continue
-            free = tuple(row for row in rows_at if row in ways)
-            inverse = np.linalg.pinv(best.gradients[rows_at])[:, 1 : 1 + len(free)]
-            fastest = np.max(np.abs(inverse) / speeds[:, None], initial=1e-9)
-            torque = np.max(np.abs(best.gradients[axis]) / efforts, initial=1e-9)
-            ways_out = f"{len(rows_at)} directions of motion are free of each other there"
-            why = f"where {ways_out} by {score / len(rows_at):.2g} (1 is best, 0 singular)"
-            x, y, z = (round(float(value), decimals) + 0.0 for value in best.rows[:3])
-            i, j, k = (sign * (n == axis) + 0.0 for n in range(3))
-            of_limits = _SHARE / fastest, _SHARE / 2 / torque
-            placed = _Place((x, y, z), (i, j, k), free, best.q, why, *of_limits, size)
-            found.append((score * preference, placed))
+    for axis, sign, preference in _NORMALS:
+        ways, score, rows_at = [k for k in range(3) if k != axis], 0.0, list[int]()
+        for posture, (outward, moved, base, gravity), factor in choices[axis]:
+            at_tip, roots = posture.rows[:3], base.mean(axis=1)
+            disadvantages = (
+                np.min(sign * (moved[axis] - at_tip[axis])) < -0.02 * size,
+                sign * outward[axis, 0] > -0.5,
+                # A table may be as high as the base; a wall must not cut it.
+                axis != 2 and sign * (roots[axis] - at_tip[axis]) < 0.1 * size,
+                axis == 2 and np.linalg.norm((at_tip - roots)[:2]) < 0.2 * size,
+                np.any(np.abs(gravity[:, 0]) > 0.5 * efforts),
+            )
+            factor *= postures.margin(posture.q) * 0.1 ** sum(map(bool, disadvantages))
+            if factor * 5 <= score:
+                continue  # No independence is above 1.
+            tilts = [3 + 2 * axis, 4 + 2 * axis]
+            chosen = posture.independent([], [axis, *ways, *tilts], posture.q.size)
+            quality = factor * posture.independence(chosen) * len(chosen)
+            if axis in chosen and {*chosen} & {*ways} and quality > score:
+                score, best, rows_at = quality, posture, chosen
+        if not rows_at:
+            continue
+        free = tuple(row for row in rows_at if row in ways)
+        inverse = np.linalg.pinv(best.gradients[rows_at])[:, 1 : 1 + len(free)]
+        speed = _SHARE / np.max(np.abs(inverse) / speeds[:, None], initial=1e-9)
+        force = _SHARE / 2 / np.max(np.abs(best.gradients[axis]) / efforts, initial=1e-9)
+        count, share = len(rows_at), score / len(rows_at)
+        ways_out = f"{count} directions of motion are free of each other there by {share:.2g}"
+        i, j, k = (sign * (n == axis) + 0.0 for n in range(3))
+        values_at = (np.round(best.q, 4) + 0.0).tolist()
+        near = dict(zip((s.name for s in links.position_signals), values_at, strict=True))
+        why, center = f"where {ways_out} (1 is best, 0 singular)", _rounded(best.rows[:3], size)
+        placed = _Place(center, (i, j, k), free, near, why, speed, force, size)
+        found.append((score * preference, placed))
     return [placed for _, placed in sorted(found, key=lambda entry: -entry[0])]
 
 
 def _scenario(
-    robot: Robot,
-    tip: str,
-    point: Vector,
-    place: _Place,
-    names: Sequence[str],
-    kind: SurfaceKind,
-    fraction: float,
+    robot: Robot, tip: str, point: Vector, place: _Place, kind: SurfaceKind, fraction: float
 ) -> Scenario:
     """A circle at a place, or a line, with a fraction of the usual radius and force."""
     center, normal, size, ways = place.center, np.array(place.normal), place.size, place.ways
     radius = _round_number(fraction * _RADIUS * size)
     period = max(_SHORTEST, float(ceil(2 * pi * radius / place.speed)))
-    decimals = 2 if size > 0.3 else 3
-    bend, axis = round(_BEND * size, decimals), int(np.argmax(np.abs(normal)))
-    x, y, z = (float(value) + 0.0 for value in np.round(center - bend * normal, decimals))
+    axis, (bend, _, _) = int(np.argmax(np.abs(normal))), _rounded([_BEND * size] * 3, size)
+    middle = _rounded(center - bend * normal, size)
+    flat = ("ceiling" if normal[2] < 0.0 else "table") if axis == 2 else "wall"
     # A planar robot moves around the cylinder, others also along it.
     along = np.eye(3)[ways[-1] if len(ways) > 1 else 3 - axis - ways[0]].tolist()
-    flat = ("ceiling" if normal[2] < 0.0 else "table") if axis == 2 else "wall"
     surfaces: dict[str, tuple[str, Surface]] = {
         "plane": (flat, Plane(center, place.normal)),
-        "sphere": ("ball", Sphere((x, y, z), bend)),
-        "cylinder": ("pipe", Cylinder((x, y, z), along, bend)),
+        "sphere": ("ball", Sphere(middle, bend)),
+        "cylinder": ("pipe", Cylinder(middle, along, bend)),
     }
     name, surface = surfaces[kind]
-    middle = [center[way] for way in ways]
-    path: Reference = SinusoidReference(middle[0], [radius], [round(2 * pi / period, 4)])
+    begin = [center[way] for way in ways]
+    path: Reference = SinusoidReference(begin[0], [radius], [round(2 * pi / period, 4)])
     if len(ways) > 1:
-        path = CircleReference(middle, radius, period=period)
-    shape = "circle" if len(ways) > 1 else "line"
-    stem = Path(robot.file).name.split(".")[0]
-    near = dict(zip(names, (np.round(place.q, 4) + 0.0).tolist(), strict=True))
+        path = CircleReference(begin, radius, period=period)
+    shape, stem = "circle" if len(ways) > 1 else "line", Path(robot.file).name.split(".")[0]
     return Scenario(
         description=f"{stem} draws a {shape} on a {name} and presses on it",
         robot=robot,
@@ -500,9 +486,15 @@ def _scenario(
             f"{tip}.{''.join('xyz'[way] for way in ways)}": path,
             f"{name}.force": _round_number(fraction * min(_FORCE, place.force)),
         },
-        start=Start(positions=near),
+        start=Start(positions=place.positions),
         duration=2 * period,
     )
+
+
+def _rounded(values: FloatArray | list[float], size: float) -> Vector:
+    """A place in m as it is written, for a robot of a size, without -0."""
+    x, y, z = (float(value) + 0.0 for value in np.round(values, 2 if size > 0.3 else 3))
+    return (x, y, z)
 
 
 def _round_number(value: float) -> float:

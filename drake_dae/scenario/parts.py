@@ -274,7 +274,7 @@ class Law:
     contact_stiffness: float | None = None
     force_gain: ArrayLike = 0.0
     control_weights: list[float] = field(default_factory=list)
-    largest_roughness: float | None = None
+    largest_roughness: Positive | None = None
     largest_errors: LargestErrors | None = None
 
 

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.multibody.parsing import GetScopedFrameByName
 from pydrake.multibody.tree import WeldJoint
 
@@ -72,6 +73,17 @@ class Posture:
         F = self.forces @ inverse.T
         return one_long(P, P - P @ inverse @ J) @ Q, one_long(F, F) @ Q
 
+    def critical_friction(self, contact: int, rows: Sequence[int]) -> float:
+        """The friction from which a contact may jam; the rows are the place of its point.
+
+        Sliding friction mu moves the point into the surface if mu |A_nt| > A_nn (Painleve), with
+        its mobility A = J M^-1 J^T; near a singular wrist A_nn is small.
+        """
+        J, normal = self.gradients[list(rows)], self.normals[contact]
+        A_n = J @ np.linalg.solve(self.mass, J.T @ normal)
+        A_nn = float(normal @ A_n)
+        return A_nn / max(float(np.linalg.norm(A_n - A_nn * normal)), 1e-9 * A_nn)
+
     def independent(self, rows: Sequence[int], more: Iterable[int], count: int) -> list[int]:
         """The first rows of `more`, at most `count`, independent of `rows` and of each other."""
         chosen: list[int] = []
@@ -104,8 +116,7 @@ class Postures:
         touches: Sequence[tuple[Touch, ca.SX]],
         values: Mapping[str, FloatArray],
     ) -> None:
-        parameters = (*links.parameters, *bound.parameters)
-        kinematics = links.kinematics()
+        parameters, kinematics = (*links.parameters, *bound.parameters), links.kinematics()
         residual, rate = bound.residual(links), kinematics.value(bound.rate(kinematics))
         equations = ca.vertcat(residual, rows)
         inputs = {"q": links.q, "parameters": ca.vertcat(*[p.symbol for p in parameters])}
@@ -129,13 +140,13 @@ class Postures:
         self._function = TracedFunction("postures", inputs, outputs)
         by_place = {str(place): touch for place, (touch, _) in enumerate(touches)}
         self._depths = LinkDepths(links, by_place, inputs["parameters"])
-        chosen = [np.atleast_1d(values.get(p.name, p.value)) for p in parameters]
-        for p, value in zip(parameters, chosen, strict=True):
+        sized = [np.zeros(0)]
+        for p in parameters:
+            value = np.atleast_1d(values.get(p.name, p.value))
             if value.size not in (1, p.value.size):
                 raise ModelError(f"{p.name}: {p.value.size} numbers are needed, got {value.size}")
-        pairs = zip(chosen, parameters, strict=True)
-        sized = [np.broadcast_to(value, (p.value.size,)) for value, p in pairs]
-        self._parameters = np.concatenate([np.zeros(0), *sized])
+            sized.append(np.broadcast_to(value, (p.value.size,)))
+        self._parameters = np.concatenate(sized)
         self.low, self.high = links.position_limits
         _, self._fastest = links.velocity_limits
         self._turns = np.array([signal.unit == "rad" for signal in links.position_signals])
@@ -163,8 +174,9 @@ class Postures:
             return shortest_steps(slopes(q), residual)
 
         q = newton(guess, linearize, _NEWTON_STEPS)[0]
-        turned = self._turned_back(q)
-        for found in (turned, q):  # Where a row is the position of a joint, turns matter.
+        is_fine = (self._room(q) >= 0.0) & np.isfinite(self.high - self.low)
+        near = unwound(q, np.zeros(q.size), (self.low, self.high), self._turns & ~is_fine)
+        for found in (near, q):  # Where a row is the position of a joint, turns matter.
             left = np.max(np.abs(residual(found)), initial=0.0)
             if left < EXACT and np.all(self._room(found) >= -EXACT):
                 return found
@@ -173,7 +185,7 @@ class Postures:
     def nearest(
         self, rows: Sequence[int], wanted: FloatArray, guesses: Iterable[FloatArray]
     ) -> tuple[FloatArray, FloatArray]:
-        """The configuration within limits nearest to given values of rows, and what is left."""
+        """The configuration within limits nearest to given values, and what constraints miss."""
         from scipy.optimize import least_squares  # Imported here, since few runs need it.
 
         residual, slopes = self._residual(rows, wanted)
@@ -190,7 +202,7 @@ class Postures:
         tried = sorted(inside, key=lambda q: float(np.sum(weighted(q) ** 2)))[:3]
         fits = [least_squares(weighted, q, gradient, (low, high), max_nfev=50) for q in tried]
         q = min(fits, key=lambda fit: float(fit.cost)).x
-        return q, residual(q)
+        return q, residual(q)[: self._count]
 
     def _residual(self, rows: Sequence[int], wanted: FloatArray):  # type: ignore[no-untyped-def]
         """The equations of `solve`, shape (k + len(rows),), and their slopes."""
@@ -204,16 +216,6 @@ class Postures:
             return self._slopes.evaluate(q, parameters)[0].reshape(-1, q.size)[chosen]
 
         return residual, slopes
-
-    def _turned_back(self, q: FloatArray) -> FloatArray:
-        """Removes whole turns from a configuration, as far as the limits permit."""
-        turned = q - 2 * np.pi * np.round(q / (2 * np.pi)) * self._turns
-        for shift in (-2 * np.pi, 2 * np.pi):
-            moved = turned + shift * self._turns
-            is_better = (self._room(turned) < 0.0) & (self._room(moved) >= 0.0)
-            turned = np.where(is_better, moved, turned)
-        is_fine = (self._room(q) >= 0.0) & np.isfinite(self.high - self.low)
-        return np.where(is_fine, q, turned)
 
     def _room(self, q: FloatArray) -> FloatArray:
         """The distance of each position from its nearer limit, shape (nq,)."""
@@ -250,6 +252,18 @@ class Postures:
         low, high = np.where(empty, self.low, low), np.where(empty, self.high, high)
         inset = 0.5 * NEAR_LIMIT * (high - low)
         return random.uniform(low + inset, high - inset, (count, low.size))
+
+
+def unwound(
+    q: FloatArray, near: FloatArray, limits: tuple[FloatArray, FloatArray], turns: NDArray[np.bool_]
+) -> FloatArray:
+    """A configuration whose turning joints are as near to others as whole turns permit."""
+    nearest = q - 2 * np.pi * np.round((q - near) / (2 * np.pi))
+    choices = nearest + 2 * np.pi * np.array([[0.0], [-1.0], [1.0]])
+    is_inside = (limits[0] <= choices) & (choices <= limits[1])
+    off = np.where(is_inside, np.abs(choices - near), np.inf)
+    best = np.take_along_axis(choices, off.argmin(axis=0)[None], axis=0)[0]
+    return np.where(turns & is_inside.any(axis=0), best, q)
 
 
 def tool_axis(links: Links, touch: Touch) -> tuple[int, float]:

@@ -27,17 +27,13 @@ from drake_dae.scenario.robot_file.reading import robot_links
 from drake_dae.scenario.scenario import Scenario
 from drake_dae.scenario.start import start_scenario
 
-ROWS = 1000
-"""The number of rows of a record of a rollout under error control, after the first."""
+ROWS, MOST_ROWS = 1000, 1e7
+"""The number of rows of a record under error control, after the first; and the largest number of
+rows of fixed steps, since a larger record takes gigabytes."""
 
-PERIOD = 0.2
-"""The time by the clock between checks of a running rollout for divergence, in s."""
-
-SAME = 1e-6
-"""Two times are equal if they differ by less than this fraction of a step."""
-
-MOST_ROWS = 1e7
-"""The largest number of rows of fixed steps; a larger record takes gigabytes."""
+PERIOD, SAME = 0.2, 1e-6
+"""The time by the clock in s between checks of a running rollout for divergence; and the fraction
+of a step within which two times are equal."""
 
 
 def for_rollout(scenario: Scenario) -> tuple[Scenario, str]:

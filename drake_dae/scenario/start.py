@@ -13,6 +13,7 @@ from drake_dae.diagrams.closed_loop import ClosedLoop
 from drake_dae.errors import InconsistentStateError, ModelError, ScenarioError
 from drake_dae.robots import Constraint, Links, RobotModel
 from drake_dae.scenario.form import at
+from drake_dae.scenario.postures import unwound
 from drake_dae.scenario.scenario import Scenario
 
 _SLACK = 1e-6
@@ -30,11 +31,9 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
     model, at_plant = plant.robot("a scenario"), plant.GetMyMutableContextFromRoot(context)
     parameters, count = plant.current_parameters(at_plant), len(model.position_signals)
     forces, nq = np.zeros(model.dae.num_outputs - count), model.links.q.numel()
+    is_steered = not controller.takes_over and model.dae.num_controls > 0
     with at("start"):
-        if controller.takes_over or not model.dae.num_controls:
-            state = _at_rest(scenario, loop, model, forces, parameters)
-            plant.set_state(at_plant, state)
-        else:
+        if is_steered:
             goal, law = loop.reference.reference(context.get_time()), controller.law
             outputs = law.layout.values(goal)
             for name, error in scenario.start.errors.items():
@@ -46,11 +45,19 @@ def start_scenario(scenario: Scenario, loop: ClosedLoop) -> Context:
                             "error"
                         )
                 outputs[index] += error
-            forces, of_law = outputs[count:], _of_law(loop, parameters)
+            # The law assumes its own values of parameters; exogenous ones are measured.
+            sizes, of_law = {p.name: p.value.size for p in law.system.parameters}, parameters.copy()
+            for p in plant.dae.parameters:
+                if not p.exogenous and sizes.get(p.name) == p.value.size:
+                    assumed = law.system.parameter_values[law.system.parameter_slice(p.name)]
+                    of_law[plant.dae.parameter_slice(p.name)] = assumed
+            forces = outputs[count:]
             state = start_state(scenario, model, outputs, parameters, of_law)
-    if not controller.takes_over:
-        moving = state.copy()
-        with at("start"):
+        else:
+            state = _at_rest(scenario, loop, model, forces, parameters)
+            plant.set_state(at_plant, state)
+        if not controller.takes_over:
+            moving = state.copy()
             if scenario.exogenous:  # The state with these outputs and the rates of the references.
                 goal[law.layout.lowest] = outputs
                 own = controller.current_parameters(controller.GetMyContextFromRoot(context))
@@ -76,19 +83,16 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
     at_plant, of_plant = plant.GetMyMutableContextFromRoot(context), scenario.plant
     numbers = dict[str, dict[str, ArrayLike]]()
     if not of_plant.carries:
-        numbers["plant.parameters"] = dict(of_plant.parameters)
         pushes = enumerate(of_plant.disturbances)
+        numbers["plant.parameters"] = dict(of_plant.parameters)
         numbers["plant.payloads"] = {f"{p.name}.mass": p.mass for p in of_plant.payloads}
         numbers["plant.disturbances"] = {f"plant_disturbance_{i}.force": d.force for i, d in pushes}
     before = plant.parameters(at_plant)
     for key, values in numbers.items():
         with at(key):
             for name, value in values.items():
-                # A user's own plant may not let these be set, and has been made with them.
-                is_set = key != "plant.parameters" and np.array_equal(
-                    before[plant.dae.parameter_slice(name)], np.ravel(value)
-                )
-                if not is_set:
+                # A user's own plant may not let numbers be set, and has been made with these.
+                if not np.array_equal(before[plant.dae.parameter_slice(name)], np.ravel(value)):
                     plant.set_parameter(at_plant, name, value)
     with at("plant"):
         of_plant.begin(plant, at_plant)
@@ -119,8 +123,7 @@ def _at_rest(
         rest = model.rest_state(near, forces, parameters)
         return structure.manifold.settle(rest, of_law)[: near.size]
 
-    q = _unwound(model, settled, guess)
-    _check_limits(model, q, "Give")
+    q = _within_limits(model, settled, guess, "Give")
     state = model.rest_state(q, forces, parameters)
     if scenario.exogenous and not structure.manifold.is_consistent(state, of_law):
         raise ModelError(
@@ -137,8 +140,7 @@ def _at_rest(
             continue
         place = model.links.position(touch.frame, touch.point)
         above = model.dae.trace("start", {"above": touch.clearance(place)}, often=False)
-        own = model.dae.parameters_of(loop.plant.dae, parameters)
-        depth = -above(state, own)[0].item()
+        depth = -above(state, model.dae.parameters_of(loop.plant.dae, parameters))[0].item()
         if depth > _SLACK and (
             material is None
             or depth * material.stiffness_on(model, task.contact_force) > task.contact_force
@@ -172,17 +174,6 @@ def opening_contact(scenario: Scenario, model: RobotModel) -> tuple[Constraint, 
     return tuple(c for name, c in fitting.items() if not names or name in names)
 
 
-def _of_law(loop: ClosedLoop, parameters: FloatArray) -> FloatArray:
-    """The parameters of the plant's system as the law assumes them; exogenous ones are measured."""
-    dae, system = loop.plant.dae, loop.controller.law.system
-    sizes, of_law = {p.name: p.value.size for p in system.parameters}, parameters.copy()
-    for p in dae.parameters:
-        if not p.exogenous and sizes.get(p.name) == p.value.size:
-            assumed = system.parameter_values[system.parameter_slice(p.name)]
-            of_law[dae.parameter_slice(p.name)] = assumed
-    return of_law
-
-
 def start_state(
     scenario: Scenario,
     model: RobotModel,
@@ -192,14 +183,15 @@ def start_state(
 ) -> FloatArray:
     """The state at rest near start.positions, within limits, with given outputs z, shape (p,)."""
     count = len(model.position_signals)
-    # By default near the start of the completion.
-    guess = start_guess(scenario, model.links, model.nominal_positions)
 
     def solve(near: FloatArray) -> FloatArray:
         return model.placing.solve(outputs[:count], near, parameters, of_law)
 
+    # By default near the start of the completion.
+    guess = start_guess(scenario, model.links, model.nominal_positions)
     try:
-        q = _unwound(model, solve, guess)
+        remedy = "Change the first values of the references, or give"
+        q = _within_limits(model, solve, guess, remedy)
     except InconsistentStateError as error:
         goal = ", ".join(
             f"{signal.name} = {value:.4g} {signal.unit}".rstrip()
@@ -209,16 +201,24 @@ def start_state(
             f"found no configuration near start.positions with {goal} (the references and "
             f"start.errors at the start) on the constraints: {error}"
         ) from error
-    _check_limits(model, q, "Change the first values of the references, or give")
     return model.balance.state(q, outputs[count:], parameters)
 
 
-def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
-    """Checks that all joints of a configuration are within their limits."""
-    rows = zip(model.links.position_signals, q, *model.links.position_limits, strict=True)
+def _within_limits(
+    model: RobotModel, solve: Callable[[FloatArray], FloatArray], guess: FloatArray, remedy: str
+) -> FloatArray:
+    """A solution near a guess without the whole turns that Newton's method may add to joints."""
+    signals, (low, high) = model.links.position_signals, model.links.position_limits
+    q, turns = solve(guess), np.array([signal.unit == "rad" for signal in signals])
+    near = unwound(q, guess, (low - _SLACK, high + _SLACK), turns)
+    trial = np.where(np.abs(near - q) < 1.0, q, near)
+    if np.any(trial != q):
+        with suppress(InconsistentStateError):
+            settled = solve(trial)
+            q = settled if np.max(np.abs(settled - trial)) < 1e-6 else q
     outside = [
         f"{signal.name} = {value:.4g} {signal.unit}, and its limits are {least:g} to {most:g}"
-        for signal, value, least, most in rows
+        for signal, value, least, most in zip(signals, q, low, high, strict=True)
         if not least - _SLACK <= value <= most + _SLACK
     ]
     if outside:
@@ -226,28 +226,6 @@ def _check_limits(model: RobotModel, q: FloatArray, remedy: str) -> None:
             f"the robot cannot start outside of its limits, and the start near start.positions has "
             f"{'; '.join(outside)}. {remedy} start.positions of all joints near where they shall be"
         )
-
-
-def _unwound(
-    model: RobotModel, solve: Callable[[FloatArray], FloatArray], guess: FloatArray
-) -> FloatArray:
-    """A solution near a guess without the whole turns of joints that Newton's method may add."""
-    q, turn, (low, high) = solve(guess), 2 * np.pi, model.links.position_limits
-    for i, signal in enumerate(model.links.position_signals):
-        nearest = q[i] - turn * np.round((q[i] - guess[i]) / turn)
-        turned = [
-            value
-            for value in (nearest, nearest - turn, nearest + turn)
-            if low[i] - _SLACK <= value <= high[i] + _SLACK
-        ]
-        best = min(turned, key=lambda value: abs(value - guess[i]), default=q[i])
-        if signal.unit != "rad" or abs(best - q[i]) < 1.0:
-            continue
-        trial = q.copy()
-        trial[i] = best
-        with suppress(InconsistentStateError):
-            settled = solve(trial)
-            q = settled if np.max(np.abs(settled - trial)) < 1e-6 else q
     return q
 
 

@@ -72,18 +72,6 @@ class _Loader(yaml.SafeLoader):
 
 
 _Loader.add_multi_constructor("!", _Loader.construct_tagged)
-# YAML 1.1 also has 1_000, 010 for eight and 1:30 for ninety. Here these are text.
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:int", re.compile(r"[-+]?(0|[1-9][0-9]*)$"), list("-+0123456789")
-)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
-        r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
-    ),
-    list("-+.0123456789"),
-)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -95,6 +83,17 @@ class _Dumper(yaml.SafeDumper):
 
 
 _Dumper.add_representer(dict, _Dumper.represent_tagged)
+# YAML 1.1 also has 1_000, 010 for eight and 1:30 for ninety. Here these are text, and 1e5 a number.
+_NUMBERS = {
+    "int": r"[-+]?(0|[1-9][0-9]*)$",
+    "float": r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
+    r"|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$",
+}
+for _kind, _form in _NUMBERS.items():
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_kind}", re.compile(_form), list("-+.0123456789")
+        )
 
 
 def load_yaml(text: str, name: str) -> Any:

@@ -3,6 +3,7 @@
 import json
 import multiprocessing.context
 import os
+import sqlite3
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
@@ -13,7 +14,7 @@ from concurrent.futures import (
     Future,
     wait,
 )
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from importlib.metadata import version
 from pathlib import Path
 from threading import RLock
@@ -32,7 +33,6 @@ from drake_dae.running.simulate import default_size
 from drake_dae.scenario.model import complete_scenario
 from drake_dae.scenario.rolled import for_rollout
 from drake_dae.scenario.scenario import Scenario, read_scenario, scenario_data, varied_data
-from drake_dae.studies.journal import Journal, open_journal
 from drake_dae.studies.runs import Outcome, Runner, RunResult, run_one, structure_of
 from drake_dae.studies.study import Study
 from drake_dae.studies.variations import Variation, plain
@@ -118,15 +118,16 @@ def sweep(
             todo = [run for run in order if not journal.is_done(run)]
             if todo:
                 count = min(workers or num_cores(), len(todo))
-                opened: AbstractContextManager[tuple[Submit, int]] = (
+                opened: AbstractContextManager[Submit] = (
                     _processes(count, time_limit, BUILDS if num_structures > BUILDS else 0)
                     if executor is None
-                    else nullcontext((lambda *args: executor.submit(run_one, *args), AHEAD))
+                    else nullcontext(lambda *args: executor.submit(run_one, *args))
                 )
+                ahead = 4 * count if executor is None else AHEAD
                 size = {"total": len(chosen), "initial": len(chosen) - len(todo), "unit": "run"}
-                is_hidden = not (progress and sys.stderr.isatty())
-                with opened as pool, tqdm(**size, disable=is_hidden, **default_size()) as bar:
-                    _run(todo, lambda run: pool[0](settings, chosen[run]), pool[1], journal, bar)
+                is_hidden = None if progress else True  # None: without a terminal.
+                with opened as submit, tqdm(**size, disable=is_hidden, **default_size()) as bar:
+                    _run(todo, lambda run: submit(settings, chosen[run]), ahead, journal, bar)
             results = journal.results()
     return Study(tuple(chosen), tuple(results[run] for run in range(len(chosen))))
 
@@ -135,7 +136,7 @@ def _run(
     todo: Sequence[int],
     submit: Callable[[int], "Future[RunResult]"],
     ahead: int,
-    journal: Journal,
+    journal: "Journal",
     bar: Any,
 ) -> None:
     """Makes runs, at most so many at a time, and writes their results when they end."""
@@ -172,12 +173,12 @@ def _result(future: "Future[RunResult]") -> RunResult:
 
 
 @contextmanager
-def _processes(count: int, time_limit: float, most: int) -> Iterator[tuple[Submit, int]]:
+def _processes(count: int, time_limit: float, most: int) -> Iterator[Submit]:
     """Processes of this machine, each for so many runs. One that dies, or is slow, is replaced."""
     context = _WithoutMain()
     pool = ProcessPool(count, max_tasks=most, context=context, initializer=_begin)
     try:
-        yield (lambda *args: pool.schedule(run_one, args, timeout=time_limit)), 4 * count
+        yield lambda *args: pool.schedule(run_one, args, timeout=time_limit)
     finally:
         pool.stop()  # type: ignore[no-untyped-call]
         # The pool closes its channels first, which a process that is just starting would report.
@@ -237,3 +238,82 @@ def _try(runner: Runner, variations: Sequence[Variation]) -> None:
         except ScenarioError as error:
             errors.append(error)
     raise errors[0]
+
+
+_TABLES = """
+CREATE TABLE IF NOT EXISTS sweep (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS runs (
+    run INTEGER PRIMARY KEY, outcome TEXT NOT NULL, reason TEXT NOT NULL,
+    figures TEXT NOT NULL, exceeded TEXT NOT NULL
+);
+"""
+
+# The outcomes of runs that are tried again, in SQL.
+_AGAIN = f"({', '.join(repr(str(each)) for each in Outcome if not each.is_final)})"
+
+
+class Journal:
+    """An open file of a sweep. Several processes may have it open; none loses a row of another."""
+
+    def __init__(self, database: sqlite3.Connection) -> None:
+        self._database = database
+
+    def add(self, results: Mapping[int, RunResult]) -> None:
+        """Writes results; a result that is already there stays, unless it is not final."""
+        rows = [
+            (run, r.outcome, r.reason, json.dumps(dict(r.figures)), json.dumps(r.exceeded))
+            for run, r in results.items()
+        ]
+        self._database.executemany(
+            "INSERT INTO runs VALUES (?, ?, ?, ?, ?) ON CONFLICT (run) DO UPDATE SET "
+            "outcome = excluded.outcome, reason = excluded.reason, figures = excluded.figures, "
+            f"exceeded = excluded.exceeded WHERE outcome IN {_AGAIN}",
+            rows,
+        )
+        self._database.commit()
+
+    def is_done(self, run: int) -> bool:
+        """Whether the run has a final result."""
+        query = f"SELECT 1 FROM runs WHERE run = ? AND outcome NOT IN {_AGAIN}"
+        return self._database.execute(query, [run]).fetchone() is not None
+
+    def results(self) -> dict[int, RunResult]:
+        """Number of a run -> its result."""
+        return {
+            run: RunResult(Outcome(outcome), reason, json.loads(figures), tuple(json.loads(left)))
+            for run, outcome, reason, figures, left in self._database.execute("SELECT * FROM runs")
+        }
+
+
+@contextmanager
+def open_journal(path: Path, head: Mapping[str, str]) -> Iterator[Journal]:
+    """Creates the file of a sweep with missing folders, or opens it to continue.
+
+    `head` says what the sweep is, name -> text; equal sweeps have equal ones.
+    """
+    unusable = f"cannot use {brief(str(path))} as the file of a sweep: "
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        database = sqlite3.connect(path, timeout=60.0)
+    except (sqlite3.Error, OSError, ValueError) as error:  # ValueError: a null byte in the path.
+        raise ModelError(f"{unusable}{error}") from None
+    with closing(database):
+        try:
+            database.executescript(f"BEGIN IMMEDIATE; {_TABLES}")
+            there = dict(database.execute("SELECT key, value FROM sweep"))
+            if not there:
+                database.executemany("INSERT INTO sweep VALUES (?, ?)", list(head.items()))
+            database.commit()
+            differing = [
+                f"{key} = {brief(there.get(key))} there, {brief(head.get(key))} here"
+                for key in {**there, **head}
+                if there and there.get(key) != head.get(key)
+            ]
+            if differing:
+                raise ModelError(
+                    f"'{path}' belongs to another sweep: {'; '.join(differing[:6])}. Choose "
+                    "another folder, or remove it"
+                )
+            yield Journal(database)
+        except sqlite3.Error as error:
+            raise ModelError(f"{unusable}{error}") from None

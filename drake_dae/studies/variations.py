@@ -112,13 +112,12 @@ def _drawn(key: str, values: Any, count: int, seed: int) -> list[Any]:
             return int(low) + min(int((int(high) - int(low) + 1) * share), int(high) - int(low))
         return low * (1.0 - share) + high * share
 
-    if isinstance(values, str) and (interval := _INTERVAL.fullmatch(values)):
-        if interval[3]:  # So many values, of which some are drawn.
-            return _drawn(key, _listed(key, values), count, seed)
+    interval = _INTERVAL.fullmatch(values) if isinstance(values, str) else None
+    if interval and not interval[3]:
         return [filled(values, key, run) for run in range(count)]
-    choices, places = _choices(key, values), [0] * count
-    if len(choices) > 1:
-        places = [min(int(len(choices) * share), len(choices) - 1) for share in fractions(key)]
+    choices = _listed(key, values)  # Of so many values, some are drawn.
+    shares = fractions(key) if len(choices) > 1 else np.zeros(count)
+    places = [min(int(len(choices) * share), len(choices) - 1) for share in shares]
     return [filled(choices[place], key, run) for run, place in enumerate(places)]
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
+from hashlib import sha256
 from math import isfinite
 from threading import RLock, local
 from typing import Any
@@ -23,6 +24,11 @@ from drake_dae.trace.compiled import Compiled, attempts, machine_code
 HUGE = 1e30
 # A matrix whose `pivot` is below this counts as singular; see `trace.factorization`.
 SINGULAR_PIVOT = 1e-12
+
+
+# Functions of more operations than this are kept, so many of them: a further run of a loop then
+# takes no time to shorten its expressions, and to find their machine code.
+LONG, KEPT = 2000, 16
 
 
 class FailureKind(Enum):
@@ -88,13 +94,31 @@ class TracedFunction:
         self._attempts: list[tuple[int, bool]] | None = None  # None before the first call.
         self._calls_left, self.is_machine_code = 0, False
 
-    @cached_property
-    @uncollected
+    @property
     def function(self) -> ca.Function:
         """The CasADi function: outputs, pivot, and numbers that are finite if they are valid."""
-        expressions = ca.cse(self._expressions) if self._often else self._expressions
+        return self._made.function
+
+    @cached_property
+    @uncollected
+    def _made(self) -> "_Made":
+        """The function, which long ones of equal expressions have in common."""
         name = re.sub("[^A-Za-z0-9]+", "_", f"f_{self.name}")  # As CasADi accepts them.
-        return ca.Function(name, self._symbols, expressions, {"cse": False})
+        plain = ca.Function(name, self._symbols, self._expressions, {"cse": False})
+        if not self._often:
+            return _Made(plain)
+        key, is_long = f"{self._compiled}", plain.n_instructions() > LONG
+        if is_long:
+            key += sha256(plain.serialize().encode("latin-1")).hexdigest()
+            if (known := _MADE.get(key)) is not None:
+                return known
+        expressions = ca.cse(self._expressions)
+        made = _Made(ca.Function(name, self._symbols, expressions, {"cse": False}))
+        if is_long:
+            if len(_MADE) >= KEPT:
+                _MADE.clear()
+            _MADE[key] = made
+        return made
 
     @property
     def num_operations(self) -> int:
@@ -114,9 +138,10 @@ class TracedFunction:
                 return
             _, make = self._attempts.pop(0)
             self._calls_left = self._attempts[0][0] if self._attempts else 0
-            code = machine_code(self.function, self._compiled, make)
-            if code is not None:
-                self._attempts, self._current, self.is_machine_code = [], code, True
+            made = self._made
+            made.code = made.code or machine_code(made.function, self._compiled, make)
+            if made.code is not None:
+                self._attempts, self._current, self.is_machine_code = [], made.code, True
 
     @property
     def _arrays(self) -> "_Arrays":
@@ -213,6 +238,17 @@ class TracedFunction:
                 raise ModelError(f"{what} has shape {array.shape}, not {(size,)}")
             arrays[i] = array.reshape(-1)
         return tuple(output.copy() for output in self.evaluate(*arrays))
+
+
+@dataclass
+class _Made:
+    """A function, and its machine code if there is any yet."""
+
+    function: ca.Function
+    code: ca.Function | None = None
+
+
+_MADE: dict[str, _Made] = {}
 
 
 class _Arrays:

@@ -138,7 +138,7 @@ def test_a_friction_cone_of_a_scenario(tray):
     loop, context = build_scenario(scenario)
     simulate(loop.diagram, context, 2.0)
     run = judge_run(scenario, loop, context, loop.record(context))
-    said = [one for one in run.judgement.findings if one.kind is FindingKind.LIMIT]
+    said = [one for one in run.findings if one.kind is FindingKind.LIMIT]
     assert [one.signal.name for one in said] == ["the friction cone of grip.fz"]
     assert f"{1.0 / found.rate:.4g} times slower" in run.look_next[0]
 
@@ -157,7 +157,7 @@ def test_the_references_of_a_law_that_feeds_deflections_ahead_are_examined_as_th
     assert loop.controller.law.layout.reference_degrees == (2, 2)
     simulate(loop.diagram, context, 0.1, scenario.integrator)
     run = judge_run(scenario, loop, context, loop.record(context))
-    assert any(one.kind is FindingKind.LIMIT for one in run.judgement.findings)
+    assert any(one.kind is FindingKind.LIMIT for one in run.findings)
     assert "the references alone keep all limits" in run.look_next
 
 

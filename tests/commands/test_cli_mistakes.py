@@ -36,28 +36,18 @@ def test_a_robot_is_not_replaced_by_its_scenario(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ["new", "arm.urdf"],
-        ["plot", "one"],
-        ["page", "two_link_wall"],
-    ],
-    ids=lambda words: "_".join(words),
+    ("words", "suffix"),
+    [("new arm.urdf", "html"), ("plot one", "svg"), ("page two_link_wall", "html")],
 )
-def test_a_file_is_replaced_by_force_alone_and_what_is_none_never(words, tmp_path, capsys):
-    folder, target = tmp_path / "folder.html", tmp_path / "target.svg"
+def test_a_file_is_replaced_by_force_alone_and_what_is_none_never(words, suffix, tmp_path, capsys):
+    names = ("file", "target", "folder", "link")
+    file, target, folder, link = (tmp_path / f"{name}.{suffix}" for name in names)
+    for path in (file, target):
+        path.write_text("mine")
     folder.mkdir()
-    target.write_text("mine")
-    link = tmp_path / "link.html"
     link.symlink_to(target)
-    name = "svg" if words == ["plot", "one"] else "html"
-    file = tmp_path / f"file.{name}"
-    file.write_text("mine")
-    there = [(file, False)] + [
-        (path.rename(path.with_suffix(f".{name}")), True) for path in (folder, link)
-    ]
-    for path, force in there:
-        assert main([*words, f"--out={path}", *["--force"] * force]) == 1
+    for path, force in ((file, []), (folder, ["--force"]), (link, ["--force"])):
+        assert main([*words.split(), f"--out={path}", *force]) == 1
         assert f"'{path}'" in error_line(capsys)
     assert (file.read_text(), target.read_text()) == ("mine", "mine")
 

@@ -17,7 +17,6 @@ from drake_dae import (
     ConstantReference,
     DaeSystem,
     PointToPointReference,
-    SinusoidReference,
     TrackingLaw,
     poles,
 )
@@ -85,24 +84,6 @@ def test_a_contact_that_gives_way_is_damped_as_chosen(share):
         assert abs(found[-1, 1] - 20.0) < 20.0 * np.exp(
             -0.2 * frequency * min(share, 1 / share) / 2
         )
-
-
-def test_a_force_that_changes_is_followed_with_the_error_derived():
-    """F - lambda_d = -(F'' + c F') / (A k), of amplitude c w 5 / (A k) except for w^2 / (A k)."""
-    c, speed = 2.0 * np.sqrt(STIFFNESS / MASS), 3.0
-    law = TrackingLaw(block(), poles(-8.0), constraint_damping=poles(-c))
-    times = np.linspace(0.0, 3.0, 601)
-    wanted = [ConstantReference(0.0), SinusoidReference(20.0, 5.0, speed)]
-    found, _ = press(law, wanted, STIFFNESS, np.zeros(4), times)
-    late = times > 0.5
-    error = (found[:, 1] - 20.0 - 5.0 * np.sin(speed * times))[late]
-    about = -c * 5.0 * speed * np.cos(speed * times[late]) / (STIFFNESS / MASS)
-    assert np.abs(about).max() == pytest.approx(0.42, abs=0.01)
-    assert np.abs(error - about).max() < 0.08 * np.abs(about).max()
-    # Exactly, once the start is forgotten: the same as a transfer function.
-    gain = (STIFFNESS / MASS) / (STIFFNESS / MASS + 1j * speed * c - speed**2) - 1.0
-    exact = 5.0 * np.imag(gain * np.exp(1j * speed * times[late]))
-    assert_allclose(error, exact, atol=2e-5)
 
 
 def test_a_force_that_rises_within_a_period_of_the_contact_is_followed_by_its_deflection():

@@ -3,8 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
-from problems import changed, hidden_normal_form
-from problems.extensions import REGULAR, evaluated, extension_of
+from problems import changed
+from problems.extensions import GRAVITY, REGULAR, evaluated, extension_of, vtol
 from runs import some
 
 from drake_dae.dae import DaeSystem, dynamic_extension, find_structure
@@ -60,43 +60,54 @@ def test_mixed_controls_by_hand():
     assert extension.system.nominal_state[3] == pytest.approx(3.0, rel=1e-15)
 
 
-def behind_integrators(system: DaeSystem, count: int) -> DaeSystem:
-    """A system with E = 1 whose first controls are states, with new controls as rates."""
-    n, held = system.num_states, ca.SX.sym("held", count)
-    h = ca.SX(n + count, system.num_controls)
-    h[:n, count:], h[n:, :count] = system.h[:, count:], ca.SX.eye(count)
-    return changed(
-        system,
-        state=ca.vertcat(system.state, held),
-        f=ca.vertcat(system.f + ca.mtimes(system.h[:, :count], held), ca.SX(count, 1)),
-        g=ca.vertcat(system.g, ca.SX(count, system.num_constraints)),
-        h=h,
-        mass_matrix=None,
-        state_signals=(),
-        nominal_state=np.pad(system.nominal_state, (0, count)),
+# Systems that no integrators help, and what is said of them.
+
+
+def violation(system: DaeSystem, **options) -> AssumptionError:
+    with pytest.raises(AssumptionError) as caught:
+        dynamic_extension(system, **options)
+    return caught.value
+
+
+def pair(outputs) -> DaeSystem:
+    """Two nonlinear double integrators."""
+    return DaeSystem.from_functions(
+        4,
+        f=lambda x: [x[1], ca.sin(x[0]), x[3], x[0] * x[1]],
+        h=lambda x: [[0, 0], [1, 0], [0, 0], [0, 1]],
+        l=outputs,
+        output_signals=["a", "b"],
+        name="pair",
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", some(range(8), of=4))
-def test_hidden_integrators_are_found(seed):
-    """Integrators before some controls of a random system, behind a feedback, want the others too.
+@pytest.mark.parametrize(
+    "outputs", [lambda x: [x[0], ca.sin(x[0])], lambda x: [x[0], x[0] * x[1] + x[1]]]
+)
+def test_outputs_that_depend_on_each_other(outputs):
+    """One is a function of the other, of its derivative, or of both."""
+    error = violation(pair(outputs))
+    assert error.assumption == 5
+    assert "a, b" in str(error)
 
-    B(x) is regular and dense without them, so that all outputs then have one degree more.
-    """
-    random = np.random.default_rng(seed)
-    while True:
-        hidden = hidden_normal_form(int(random.integers(1000)))
-        small = hidden.system.num_states <= 5 and max(hidden.output_degrees) <= 2
-        if hidden.system.num_controls >= 2 and small:  # Larger ones take seconds.
-            break
-    p = hidden.system.num_controls
-    count = int(random.integers(1, p))
-    system = behind_integrators(hidden.system, count)
-    # The controls in another basis: each moves all.
-    system = changed(system, h=ca.mtimes(system.h, np.eye(p) + 0.4 * random.normal(size=(p, p))))
-    extension = dynamic_extension(system)
-    assert extension.structure.constraint_degrees == hidden.constraint_degrees
-    assert extension.structure.output_degrees == tuple(d + 1 for d in hidden.output_degrees)
-    assert sum(extension.integrators.values()) == p - count
-    assert extension.structure.zero_dynamics_dimension == hidden.zero_dynamics
+
+def test_isolated_singularities_are_not_mended():
+    """Ball and beam (Hauser, Sastry and Kokotovic 1992): 2 x1 x4 u in x1''' vanishes at rest."""
+    system = DaeSystem.from_functions(
+        ["ball", "ball'", "beam", "beam'"],
+        f=lambda x: [x[1], 0.7143 * (x[0] * x[3] ** 2 - GRAVITY * ca.sin(x[2])), x[3], 0],
+        h=lambda x: [0, 0, 0, 1],
+        l=lambda x: x[0],
+        name="ball and beam",
+    )
+    error = violation(system)
+    assert error.assumption == 4
+    np.testing.assert_array_equal(error.state, np.zeros(4))
+    assert dynamic_extension(changed(system, nominal_state=[1, 0, 0, 1])).integrators == {}
+
+
+def test_at_rest_another_nominal_control_is_asked_for():
+    error, count, name = violation(vtol()), "2 before thrust", "thrust"
+    assert f'nominal_control={{"{name}": 1.0}}' in str(error)
+    assert count in str(error)
+    assert error.state[vtol().num_states] == 0.0

@@ -85,6 +85,7 @@ def test_damping_of_several_joints_at_once_is_a_matrix():
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_plant_that_steps_damps_by_the_speed_after_the_step():
     """The last joint, of 1e-3 kg m^2 or so with 100 N m s, from 10 mrad off, with poles at -10/s.
 

@@ -1,17 +1,14 @@
-"""Linear models against finite differences, transfer functions and closed forms."""
+"""Linear models against each other by their transfer functions, and against closed forms."""
 
 import numpy as np
 import pytest
 import scipy.linalg
 from arms import arm, law
 from problems import PROBLEMS, hanging_pendulum
-from runs import some
-from scipy.optimize import root
 
 from drake_dae.dae import (
     DaeSystem,
     Linearization,
-    Structure,
     TrackingLaw,
     find_structure,
     linearize,
@@ -22,78 +19,6 @@ from drake_dae.dae import (
 Array = np.ndarray
 
 FREQUENCIES = (0.3j, 2.0j, 17.0j, 1.0 + 0.5j)
-
-
-def rate_and_output(structure: Structure, x: Array, u: Array) -> tuple[Array, Array]:
-    """x' and z of the motion on N* by (9)-(12), (25), as the structure has them."""
-    parts = structure.elimination
-    values = []
-    for constant, slope in ((parts.f_star, parts.h_star), (parts.l_star, parts.n_star)):
-        numbers = [
-            structure.trace("part", value.reshape((-1, 1)), False)(
-                x, structure.system.parameter_values
-            )[0]
-            for value in (constant, slope)
-        ]
-        values.append(numbers[0] + numbers[1].reshape(u.size, -1).T @ u)
-    return values[0], values[1]
-
-
-def on_manifold(structure: Structure, x: Array, free: Array, values: Array) -> Array:
-    """The state on N* with given values of some states, near a given one, by a solver of SciPy."""
-    rest = np.setdiff1d(np.arange(x.size), free)
-
-    def filled(others: Array) -> Array:
-        full = x.copy()
-        full[free], full[rest] = values, others
-        return full
-
-    if not rest.size:
-        return filled(x[rest])
-    found = root(lambda others: structure.manifold.residual(filled(others)), x[rest], tol=1e-13).x
-    np.testing.assert_allclose(structure.manifold.residual(filled(found)), 0.0, atol=1e-12)
-    return filled(found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("moving", [False, True])
-@pytest.mark.parametrize("problem", some(PROBLEMS, of=3), indirect=True)
-def test_the_minimal_form_is_that_of_finite_differences(problem, moving):
-    """Central differences of the motion in the coordinates that were chosen, moving or not."""
-    structure = problem.structure
-    random = np.random.default_rng(1)
-    x = problem.consistent(random) if moving else structure.states[0]
-    u = random.standard_normal(problem.system.num_controls)
-    found = linearize(problem.system, x, u, structure=structure)
-    free, step = found.coordinates, 1e-6
-
-    def motion(values: Array, control: Array) -> Array:
-        rate, z = rate_and_output(structure, on_manifold(structure, x, free, values), control)
-        return np.concatenate([rate[free], z])
-
-    count = free.size
-    np.testing.assert_allclose(
-        motion(x[free], u)[:count],
-        found.rate[free],
-        rtol=1e-9,
-        atol=1e-9 * np.abs(found.rate).max(),
-    )
-    by_state = [
-        (motion(x[free] + step * e, u) - motion(x[free] - step * e, u)) / (2 * step)
-        for e in np.eye(count)
-    ]
-    by_control = [
-        (motion(x[free], u + step * e) - motion(x[free], u - step * e)) / (2 * step)
-        for e in np.eye(u.size)
-    ]
-    expected = np.vstack(
-        [np.array(by_state).reshape(count, count + u.size), np.array(by_control)]
-    ).T
-    model = found.minimal
-    told = np.block([[model.A, model.B], [model.C, model.D]])
-    # Round-off over the step, and the step squared times a third derivative.
-    np.testing.assert_allclose(told, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
-    assert found.index == structure.index
 
 
 def at_rest() -> list[tuple[str, DaeSystem, Array, Array]]:

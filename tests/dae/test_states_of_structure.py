@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose
 from problems import changed, double_integrator, system_of
 from problems.found import violation
 
-from drake_dae.analysis import analyze
+from drake_dae.analysis import Finding, analyze
 from drake_dae.dae import DaeSystem, find_constraint_structure, find_structure
-from drake_dae.errors import InconsistentStateError, ModelError
+from drake_dae.errors import AssumptionError, InconsistentStateError, ModelError
 
 
 @pytest.mark.parametrize("k", [lambda x: x[1] ** 2 + 1, lambda x: ca.exp(x[1]) + 0.5])
@@ -42,7 +42,6 @@ def test_constraints_alone_decide_how_a_system_moves():
     whole = find_structure(DaeSystem(**pendulum, h=h, l=x[0] * x[3] - x[1] * x[2], m=[0]))
     others = {
         "nothing": {"h": ca.SX(4, 0), "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
-        "control alone": {"h": h, "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
         "the constraint as an output": {"h": h, "l": ca.sumsqr(x[:2]), "m": [0]},
         "two outputs": {"h": h, "l": x[:2], "m": [[0], [1]]},
     }
@@ -85,3 +84,28 @@ def test_a_column_of_b_that_is_only_round_off_is_zero():
     error = violation(system)
     assert error.assumption == 5
     assert "dynamic_extension" in str(error)
+
+
+def nearly_singular(off, **more):
+    """z' = [[1, 1], [1, 1 + off]] u: the smallest singular value is off / 8^0.5, rows scaled."""
+    return DaeSystem.from_functions(
+        2,
+        f=lambda x: [-x[0], -x[1]],
+        h=lambda x: [[1, 1], [1, 1 + off]],
+        l=lambda x: [x[0], x[1]],
+        **more,
+    )
+
+
+def test_how_near_to_singular_is_singular_is_said_and_can_be_set():
+    off = 1e-7
+    with pytest.raises(AssumptionError, match=r"least_margin.*1e-06"):
+        find_structure(nearly_singular(off))
+    report = analyze(nearly_singular(off))
+    assert report.assumptions[4].finding is Finding.VIOLATED
+    allowed = nearly_singular(off, least_margin=0.1 * off)
+    assert find_structure(allowed).control_margin.relative == pytest.approx(off / 8**0.5, rel=0.01)
+    assert analyze(allowed).assumptions[4].finding is Finding.SATISFIED
+    assert f"{0.1 * off:.0e}" in str(analyze(allowed))
+    with pytest.raises(AssumptionError, match="least_margin"):
+        find_structure(nearly_singular(0.1, least_margin=0.3))

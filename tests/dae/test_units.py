@@ -1,4 +1,4 @@
-"""No verdict depends on units: each problem in eight systems of units has one answer.
+"""No verdict depends on units: each problem in four systems of units has one answer.
 
 The natural sizes of the states, which all of this stands on, are held against sizes that follow by
 hand: those of a pendulum, a spring that hardens, a tank.
@@ -13,8 +13,8 @@ from drake_dae.analysis import analyze
 from drake_dae.dae import DaeSystem
 
 # From nanometres to giga-units, all states alike or each in a unit of its own.
-ALIKE = (-9.0, -3.0, 3.0, 9.0)
-OWN = 4
+ALIKE = (-9.0, 9.0)
+OWN = 2
 
 
 def answer(system: DaeSystem) -> tuple[dict, np.ndarray]:
@@ -33,7 +33,7 @@ def answer(system: DaeSystem) -> tuple[dict, np.ndarray]:
 
 
 def other_units(system: DaeSystem):
-    """The system in eight systems of units; inputs and equations by up to 1000."""
+    """The system in four systems of units; inputs and equations by up to 1000."""
     random = np.random.default_rng(1)
     counts = (
         system.num_constraints,
@@ -54,7 +54,7 @@ def other_units(system: DaeSystem):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", some(PROBLEMS, of=8, dear=["aircraft", "rolling_disk"]))
-def test_eight_systems_of_units_have_one_answer(name):
+def test_four_systems_of_units_have_one_answer(name):
     system = PROBLEMS[name]().system
     expected, known = answer(system)
     for _, other in other_units(system):

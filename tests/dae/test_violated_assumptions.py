@@ -112,16 +112,14 @@ def test_5_outputs_that_repeat():
     one_more = [system.l[i] for i in range(4)]
     no_force = np.array([[1, 0], [0, 0], [0, 1], [0, 0]])
     for row, output in (
-        (3, q[2]),
         (3, 2 * q[2] + 1),
         (3, ca.sin(q[2])),
-        (3, q[2] + q[0]),
         (3, q[2] * (1 + (q[0] - 1) * q[3])),
     ):
         error = violation(changed(system, l=ca.vertcat(*one_more[:row], output), m=no_force))
         assert error.assumption == 5
         assert error.violation.names == ("v1", "q3", "v2", "q4")
-    for output in (q[0], 3 * q[0] + q[1], q[0] ** 2, (q[0] - 1) * q[2], q[4], ca.SX(0), ca.SX(7)):
+    for output in (3 * q[0] + q[1], (q[0] - 1) * q[2], q[4], ca.SX(7)):
         error = violation(changed(system, l=ca.vertcat(*one_more[:3], output), m=no_force))
         assert error.assumption == 5
         assert error.violation.names == ("q4",)

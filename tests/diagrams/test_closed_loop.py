@@ -2,14 +2,7 @@
 
 import numpy as np
 import pytest
-from arms import (
-    arm,
-    consistent_states,
-    fixed_step,
-    law,
-    numbers,
-    shipped,
-)
+from arms import arm, consistent_states, fixed_step, law, numbers, shipped
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from runs import run, scenario
 

@@ -10,11 +10,7 @@ from pydrake.systems.framework import BasicVector, DiagramBuilder, LeafSystem, T
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 from runs import run_scenario, same_records, scenario
 
-from drake_dae import (
-    Record,
-    load_scenario,
-    simulate,
-)
+from drake_dae import Record, load_scenario, simulate
 from drake_dae.dae import Signal
 from drake_dae.diagrams.record import Recorded
 from drake_dae.errors import ModelError

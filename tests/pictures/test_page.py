@@ -12,7 +12,7 @@ from runs import scenario
 from drake_dae import build_scenario, write_page
 from drake_dae.cli import main
 from drake_dae.errors import MachineCodeError
-from drake_dae.pictures.page import wasm
+from drake_dae.pictures.page import page as module
 from drake_dae.scenario import build_commanded
 from drake_dae.scenario.rolled import for_rollout, roll_scenario
 
@@ -231,7 +231,7 @@ def test_hydroelastic_contact_is_refused_with_what_takes_its_place(tmp_path, cap
 
 
 def test_without_a_compiler_it_says_how_to_get_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(wasm, "find_spec", lambda name: None)
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
     built = build_commanded(scenario("two_link_wall"))
     with pytest.raises(MachineCodeError, match="pip install ziglang"):
         write_page(built.loop, built.context, tmp_path / "no.html")

@@ -25,7 +25,7 @@ def row_of(bench):
 @pytest.mark.slow
 def test_bodies_forces_and_surfaces_are_where_drake_has_them():
     built = build_commanded(scenario("seven_joint_moving_plate"))
-    bench = Bench.of(built.loop, built.context)
+    bench = Bench(built.loop, built.context)
     plant, context = built.loop.plant, built.context
     column, robot = row_of(bench)["scene"], bench.robot
     drake, own = plant.model.links.plant, plant.GetMyContextFromRoot(context)
@@ -59,7 +59,7 @@ def test_errors_are_predicted_by_the_matrix_of_the_law(integral):
     )
     plant = dd.RobotPlant(found.model, structure=found.structure)
     references = {"tool.z": dd.ConstantReference(0.4), "wall.force": 15.0}
-    bench = Bench.of(dd.make_closed_loop(plant, law, references), None)
+    bench = Bench(dd.make_closed_loop(plant, law, references), None)
     told, numbers = bench.predicted, bench.numbers
     E = np.eye(told["size"], k=1)
     E[told["ends"]] = 0.0
@@ -80,7 +80,7 @@ def test_errors_are_predicted_by_the_matrix_of_the_law(integral):
 
 def test_a_mass_is_a_parameter_of_the_plant_and_known_to_the_law():
     built = build_commanded(scenario("two_link_wall"))
-    bench = Bench.of(built.loop, built.context)
+    bench = Bench(built.loop, built.context)
     names = [signal.name for signal in bench.numbers.signals]
     places = [names.index(f"{b}.link2.mass") for b in ("two_link_arm", "tracking_controller")]
     (mass,) = [each for each in bench.controls if each.label == "link2.mass"]
@@ -101,7 +101,7 @@ def test_no_text_ends_a_script():
 def test_a_payload_that_only_the_plant_has_is_not_pushed():
     payload = "plant.payloads=[{frame: tool, mass: 0.5}]"
     built = build_commanded(scenario("two_link_wall", "plant=!CompliantContact {}", payload))
-    pushes = Bench.of(built.loop, built.context).data()["pushes"]
+    pushes = Bench(built.loop, built.context).data()["pushes"]
     assert any("link2" in name for name in pushes)
     assert not any("payload" in name for name in pushes)
 
@@ -123,7 +123,7 @@ def test_a_page_shows_each_combination_or_says_why_not(names, tmp_path):
     assert any("MultibodyPlant" in text for text in built.left_out) == chosen.plant.carries
     if names[2] in ("noise", "force"):
         with pytest.raises(ModelError, match="noise"):
-            Bench.of(built.loop, built.context)
+            Bench(built.loop, built.context)
         return
-    data = Bench.of(built.loop, built.context).data()
+    data = Bench(built.loop, built.context).data()
     assert [len(data[key]) for key in ("bodies", "constraints", "controls")] > [0, 0, 0]

@@ -7,12 +7,7 @@ from contextlib import suppress
 import casadi as ca
 import pytest
 
-from drake_dae.running.interruption import (
-    ENDING_SIGNALS,
-    Interruption,
-    end_at_once,
-    ending_signals,
-)
+from drake_dae.running.interruption import ENDING_SIGNALS, Interruption, end_at_once, ending_signals
 
 
 class Interrupted:

@@ -8,7 +8,7 @@ import pytest
 from drake_dae import Record, Signal
 from drake_dae.analysis import LimitKind, SignalRange
 from drake_dae.diagrams.record import Recorded
-from drake_dae.running.judgement import FindingKind, Outcome, judge, late_rms
+from drake_dae.running.judgement import FindingKind, Judgement, Outcome, late_rms
 from drake_dae.systems.control.contract import PhaseChange
 
 TIMES = np.linspace(0.0, 10.0, 1001)
@@ -42,7 +42,7 @@ PUSHES = (force_range(),)
 def judged(record, predicted=None, ranges=PUSHES, reasons=("a reason",), **options):
     if predicted is None:
         predicted = np.zeros_like(record["tracking_error"])
-    return judge(record, predicted, ranges, reasons=reasons, **options)
+    return Judgement(record, predicted, ranges, reasons=reasons, **options)
 
 
 def decaying(rate):
@@ -178,18 +178,10 @@ LEAVE = "Press is ended by a force of 31 N"
         # A way that was chosen for failure is a good end.
         ([BEGIN[0], AWAY, change(4.0, "done", 4, "a distance")], "good", r"4 s, in 2 phases$"),
         # One that leaves is bad where a phase has failed, and cannot become good any more.
-        (
-            [BEGIN[0], change(2.0, "leave", 1, LEAVE, True)],
-            "bad",
-            r"2 s: Press .*31 N$",
-        ),
+        ([BEGIN[0], change(2.0, "leave", 1, LEAVE, True)], "bad", r"2 s: Press .*31 N$"),
         ([BEGIN[0], change(2.0, "leave", 1, LEAVE)], "undecided", "leave"),
         (
-            [
-                BEGIN[0],
-                change(2.0, "leave", 1, LEAVE),
-                change(3.0, "held", 2, "after a force"),
-            ],
+            [BEGIN[0], change(2.0, "leave", 1, LEAVE), change(3.0, "held", 2, "after a force")],
             "good",
             r"3 s: after a force$",
         ),
@@ -205,7 +197,7 @@ def test_a_run_without_outputs():
     empty = Recorded(np.zeros((TIMES.size, 0)), ())
     names = ("desired_output", "tracking_error", "constraint_force")
     record = Record(TIMES, dict.fromkeys(names, empty))
-    assert judge(record, np.zeros((TIMES.size, 0))).outcome is Outcome.GOOD
+    assert Judgement(record, np.zeros((TIMES.size, 0))).outcome is Outcome.GOOD
 
 
 def test_the_late_size_of_a_straight_line():

@@ -9,19 +9,21 @@ from arms import numbers
 from pydrake.systems.analysis import Simulator
 from runs import scenario
 
-from drake_dae import build_scenario, contact_gains, load_scenario
+from drake_dae import build_scenario, contact_gains, load_scenario, simulate
 from drake_dae.cli import main
-from drake_dae.dae import Parameter
+from drake_dae.dae import Parameter, advised_gains
 from drake_dae.dae.beyond.disturbance import estimated_within
 from drake_dae.errors import ScenarioError
 from drake_dae.scenario import build, plants
 from drake_dae.scenario import parts as parts
 from drake_dae.scenario.build import build_completed
 from drake_dae.scenario.estimated import estimates_all, with_all_estimated
-from drake_dae.scenario.gains import advised, sensed_contact
-from drake_dae.scenario.judging import find_feasibility
+from drake_dae.scenario.expected import sensed_contact, stated_errors
+from drake_dae.scenario.gains import advised
+from drake_dae.scenario.judging import find_feasibility, judge_run
 from drake_dae.scenario.model import scenario_model, scenario_structure
 from drake_dae.scenario.scenario import Scenario, save_scenario
+from drake_dae.scenario.start import start_scenario
 
 PLANT = "plant=!MultibodyPlant {time_step: 1.0e-3, stiffness: 1.0e5, friction: 0.3}"
 STILL = "references={tool.z: 0.3, wall.force: 20}"
@@ -153,6 +155,36 @@ def test_largest_errors_bound_what_is_predicted_or_say_what_forbids_them():
         chosen(two_link("law.largest_errors={force: 0.1}"))
     with pytest.raises(ScenarioError, match="force"):
         chosen(two_link("sensors.encoders={resolution: 1.0e-5}", "law.largest_errors={force: 0}"))
+
+
+def test_the_stated_errors_are_those_of_the_linear_model_and_the_bias_of_the_sensor():
+    """Gains are rounded to three digits."""
+    found = two_link(
+        "sensors.encoders={resolution: 1.0e-5}", "sensors.force={sample_period: 1.0e-3, bias: 0.7}"
+    )
+    model = scenario_model(found)
+    structure = scenario_structure(model)
+    efforts = model.control_limits[np.isfinite(model.control_limits)]
+    best = advised_gains(sensed_contact(found, model, structure, 1e5), 3e-3 * efforts.max())
+    position, force = stated_errors(advised(found, model, structure).scenario, model, structure)
+    assert position == pytest.approx(best.position_error, rel=0.01)
+    assert force == pytest.approx(np.hypot(best.force_error, 0.7), rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_run_beyond_twice_its_stated_errors_says_which_assumption_failed():
+    """A force of 20 + 5 sin(w t): 5 w / sqrt(2) N/s rms, of which 10 N/s are assumed."""
+    told = {}
+    for frequency in (1.0, 40.0):
+        wanted = f"!Sinusoids {{offset: 20, amplitudes: [5], frequencies: [{frequency}]}}"
+        moves = f"references={{tool.z: 0.3, wall.force: {wanted}}}"
+        completed, loop = build_completed(two_link(moves, "duration=0.8", "plant.friction=0"))
+        context = start_scenario(completed.scenario, loop)
+        simulate(loop.diagram, context, 0.8, completed.scenario.integrator)
+        told[frequency] = judge_run(completed.scenario, loop, context, loop.record(context)).notes
+    assert not told[1.0]
+    slope = float(re.search(r"changes by (\S+) N/s rms", told[40.0][-1])[1])
+    assert slope == pytest.approx(5.0 * 40.0 / 2.0**0.5, rel=0.1)
 
 
 @pytest.mark.slow
@@ -307,7 +339,7 @@ def test_levers_and_mobilities_are_those_of_multibody_plant():
     found = two_link("sensors.encoders={resolution: 1.0e-4}")
     model = scenario_model(found)
     structure = scenario_structure(model)
-    sensed = sensed_contact(found, model, structure, (1e-3, 1), 1e5)
+    sensed = sensed_contact(found, model, structure, 1e5)
     known = numbers("two_link", *np.split(structure.states[0], 2))
     inverse, rows = np.linalg.inv(known.mass), (known.output_jacobian, known.constraint_jacobian)
     levers, mobilities = zip(

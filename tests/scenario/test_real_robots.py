@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from runs import run_scenario
 
-from drake_dae import load_scenario
+from drake_dae import load_scenario, new_scenario
 from drake_dae.cli import main
+from drake_dae.scenario import complete_scenario
 
 FOLDER = Path(sysconfig.get_path("purelib"), "cmeel.prefix/share/example-robot-data/robots")
 
@@ -55,3 +56,9 @@ def test_a_robot_runs_as_predicted_on_a_surface_that_new_finds(name, tmp_path):
     low, high = model.links.position_limits
     q = record["state"][:, : low.size]
     assert np.all((low < q) & (q < high))
+
+
+def test_a_place_keeps_away_from_a_singular_wrist():
+    """Where the best conditioned start is, friction of 0.5 would jam the contact along the path."""
+    found = new_scenario(str(FOLDER / "ur_description/urdf/ur3_robot.urdf"), "sphere")[0]
+    assert complete_scenario(found).critical_friction > 1.0

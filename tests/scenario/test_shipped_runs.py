@@ -12,20 +12,49 @@ from drake_dae.scenario.shipped import find_scenario, shipped_scenarios
 from drake_dae.scenario.typed_yaml import load_yaml
 
 RIGID = ["two_link_wall", "seven_joint_wall", "seven_joint_dome", "two_arms", "five_bar"]
+ACTUATED = {
+    "two_link_flexible": 1e-9,
+    "two_link_motors": 1e-9,
+    "two_link_hydraulics": 1e-9,
+    "two_link_flexible_motors": 1e-8,
+    "seven_joint_flexible": 1e-7,
+    "seven_joint_flexible_motors": 1e-4,
+}
+LONG = some(RIGID), some(ACTUATED, dear=("seven_joint_flexible_motors",), first=1)
+RUN_LONG = [one.values[0] for one in (*LONG[0], *LONG[1]) if not one.marks]
+# Drake's own contact, and those that open, have suites of their own: the former touches without a
+# force at the start.
+OTHERS = [
+    pytest.param(name, marks=[pytest.mark.thorough] * (name in DEAR))
+    for name in shipped_scenarios()
+    if not name.startswith(IN_CONTACT) and name not in RUN_LONG
+]
+
+
+def run_from_start_errors(name, duration):
+    """The scenario, its loop, record and distances from the predicted error."""
+    scenario = load_scenario(find_scenario(name), [f"duration={duration}"])
+    assert scenario.description
+    loop, record, distance = run(scenario)
+    assert record.time[-1] == pytest.approx(duration, abs=1e-9)
+    for i, signal in enumerate(loop.plant.dae.output_signals):
+        wanted = scenario.start.errors.get(signal.name, 0.0)
+        # With a degree of 0 the law meets the reference at once, if its model is right.
+        if loop.controller.law.degrees[i] or not scenario.plant.parameters:
+            assert record["tracking_error"][0, i] == pytest.approx(wanted, abs=1e-9)
+    return scenario, loop, record, distance
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some(RIGID))
+@pytest.mark.parametrize("name", LONG[0])
 def test_rigid_scenario_has_the_predicted_error(name):
     """In 3 s all outputs move and the start errors decay by 1e-4.
 
     The accuracy of 1e-8 in a step leaves less than 1e-6 along the way; the force has no dynamics,
     so that its error is round-off alone.
     """
-    scenario = load_scenario(find_scenario(name), ["duration=3"])
-    loop, record, distance = run(scenario)
+    _, loop, record, distance = run_from_start_errors(name, 3.0)
     positions = len(loop.plant.model.position_signals)
-    assert record.time[-1] == 3.0
     assert np.max(distance[:positions]) < 1e-6
     assert np.max(distance[positions:]) < 1e-11
     assert np.max(np.abs(record["constraint_residual"])) < 1e-8
@@ -39,56 +68,28 @@ def test_rigid_scenario_has_the_predicted_error(name):
     assert np.all((low <= links) & (links <= high))
 
 
-ACTUATED = {
-    "two_link_flexible": 1e-9,
-    "two_link_motors": 1e-9,
-    "two_link_hydraulics": 1e-9,
-    "two_link_flexible_motors": 1e-8,
-    "seven_joint_flexible": 1e-7,
-    "seven_joint_flexible_motors": 1e-4,
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some(ACTUATED, dear=("seven_joint_flexible_motors",), first=1))
+@pytest.mark.parametrize("name", LONG[1])
 def test_actuated_scenario_has_the_predicted_error(name):
     """In 1 s, relative to the start errors of some cm and 5 N.
 
     Steps and round-off leave 5e-11 to 8e-10 of the two-link arm's, and 1e-8 and 6e-6 of the
     seven-joint arm's, whose wrist is light. The tolerances leave a factor of ten.
     """
-    scenario = load_scenario(find_scenario(name), ["duration=1"])
-    loop, record, distance = run(scenario)
+    scenario, loop, record, distance = run_from_start_errors(name, 1.0)
     signals = loop.plant.dae.output_signals
     errors = [abs(scenario.start.errors.get(signal.name, 0.03)) for signal in signals]
-    assert record.time[-1] == pytest.approx(1.0, abs=1e-9)
     assert np.max(distance / errors) < ACTUATED[name]
     assert np.all(record["constraint_force"] > 0.0)
     # By then the force error has fallen.
     assert np.abs(record["tracking_error"][-1, -1]) < 0.3 * 5.0
 
 
-# Drake's own contact, and those that open, have suites of their own: the former touches without a
-# force at the start.
-IDEAL = [name for name in shipped_scenarios() if not name.startswith(IN_CONTACT)]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.thorough] * (name in DEAR)) for name in IDEAL],
-)
-def test_shipped_scenario_runs_from_its_start_errors(name):
-    scenario = load_scenario(find_scenario(name), ["duration=0.3"])
-    assert scenario.description
-    loop, record, distance = run(scenario)
-    assert record.time[-1] == 0.3
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_scenario_runs_from_its_start_errors(name):
+    scenario, _, record, distance = run_from_start_errors(name, 0.3)
     assert np.max(np.abs(record["constraint_residual"])) < 1e-9
-    for i, signal in enumerate(loop.plant.dae.output_signals):
-        wanted = scenario.start.errors.get(signal.name, 0.0)
-        # With a degree of 0 the law meets the reference at once, if its model is right.
-        if loop.controller.law.degrees[i] or not scenario.plant.parameters:
-            assert record["tracking_error"][0, i] == pytest.approx(wanted, abs=1e-9)
     if not scenario.plant.parameters:
         # Accuracy 1e-8 in a step; of the actuated ones see ACTUATED.
         assert np.max(distance) < 1e-5 * max(map(abs, scenario.start.errors.values()))

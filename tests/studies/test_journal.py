@@ -5,8 +5,8 @@ import resource
 import pytest
 
 from drake_dae.errors import ModelError
-from drake_dae.studies.journal import open_journal
 from drake_dae.studies.runs import Outcome, RunResult
+from drake_dae.studies.sweep import open_journal
 
 HEAD = {"version": "1.0", "duration": "1.0", "variations": "[1, 2, 3]"}
 RESULTS = {
@@ -41,11 +41,7 @@ def test_a_result_stays_as_it_was_told_first_unless_its_process_died(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"version": "2.0"}, r"version.*1.0.*2.0"),
-        ({"gains": "1"}, "gains"),
-    ],
+    ("changes", "words"), [({"version": "2.0"}, r"version.*1.0.*2.0"), ({"gains": "1"}, "gains")]
 )
 def test_another_sweep_is_refused_with_what_differs(changes, words, tmp_path):
     path = tmp_path / "runs.db"

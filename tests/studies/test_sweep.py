@@ -253,10 +253,7 @@ def test_a_run_without_end_is_ended_at_the_limit(tmp_path):
         ([], "variation"),
         ([{"start.error.tool.z": 1.0}], r"start: .*'error'.*'errors'"),
         ([{"duration": 1.0}, {"duration": "a"}], r"duration: .*'a'"),
-        (
-            [{"duration": value} for value in (1.0, float("nan"), 2.0)],
-            r"duration: .*nan",
-        ),
+        ([{"duration": value} for value in (1.0, float("nan"), 2.0)], r"duration: .*nan"),
         ([{"outputs.3.axes": "z"}], r"outputs: .*'3'"),
         ([{"duration": object()}], "duration: "),
         ([{"start.errors.tool.x": 0.1}], r"start.errors: .*'tool.x'"),

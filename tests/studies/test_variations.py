@@ -111,11 +111,7 @@ def test_ranges_within_a_value_are_drawn_each_on_its_own():
         ),
         (["duration=1..2"], {"count": 0}, r"count.*0"),
         (["duration=1..2"], {"count": 1, "seed": -1}, r"seed.*-1"),
-        (
-            ["duration=1..2:900000", "sensors.force.seed=1..9:9"],
-            {},
-            r"1000000.*8100000",
-        ),
+        (["duration=1..2:900000", "sensors.force.seed=1..9:9"], {}, r"1000000.*8100000"),
     ],
 )
 def test_what_cannot_be_read_is_reported(texts, options, words):

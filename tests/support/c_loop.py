@@ -19,7 +19,7 @@ def code_of(loop: ClosedLoop, context: Context) -> BlockCode:
     ports = {name: loop.diagram.GetOutputPort(name) for name in loop.signals}
     composed = compose(loop.diagram, ports, context=context, shares=False)
     check_traced(composed, "the loop")
-    return BlockCode.of(composed, context, {}, {})
+    return BlockCode(composed, context, {}, {})
 
 
 class CLoop:

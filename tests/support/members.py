@@ -21,7 +21,7 @@ from drake_dae.robots import (
     diagonal_parameter,
 )
 from drake_dae.systems import Controller, Plant
-from drake_dae.systems.task.phases import Phase
+from drake_dae.systems.task.phases import Condition, Phase
 
 
 @dataclass(frozen=True)
@@ -254,8 +254,5 @@ class Rise(Phase):
     def rates(self, contact_output):
         return {"tool.z": self.speed}
 
-    def margin(self, now, contact_force):
-        return self.duration - now.time
-
-    def awaited(self, contact_force):
-        return f"{self.duration:g} s of rising"
+    def ends(self, contact_force):
+        return [Condition("time", above=self.duration)]

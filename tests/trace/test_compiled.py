@@ -1,6 +1,5 @@
 """Machine code: the same values as the interpreter, and what happens where there can be none."""
 
-import gc
 import os
 import re
 import shutil
@@ -10,14 +9,11 @@ import sys
 import casadi as ca
 import numpy as np
 import pytest
-from runs import IN_CONTACT, each_scenario, some
 
-from drake_dae import DaeSystem, build_scenario
+from drake_dae import DaeSystem
 from drake_dae.errors import MachineCodeError, MachineCodeWarning, ModelError
-from drake_dae.scenario.scenario import load_scenario
-from drake_dae.scenario.shipped import find_scenario
 from drake_dae.trace.compiled import attempts
-from drake_dae.trace.compiler import Compiler, find_compiler
+from drake_dae.trace.compiler import find_compiler
 from drake_dae.trace.functions import TracedFunction
 
 needs_compiler = pytest.mark.skipif(
@@ -74,54 +70,6 @@ def test_values_that_are_not_finite_are_reported_alike(x, p, cache):
     for name in ("is_valid", "is_finite", "pivot"):
         np.testing.assert_equal(getattr(code, name), getattr(interpreted, name))
     assert code.failure() == interpreted.failure()
-
-
-def functions_of(name: str, compiled: str) -> dict[tuple, TracedFunction]:
-    """All functions that are made for a scenario, by name and sizes."""
-    before = [f for f in gc.get_objects() if isinstance(f, TracedFunction)]
-    loop, _ = build_scenario(load_scenario(find_scenario(name), [f"compiled={compiled}"]))
-    after = [f for f in gc.get_objects() if isinstance(f, TracedFunction)]
-    known = set(map(id, before))
-    found = {(f.name, f.sizes, f.num_operations): f for f in after if id(f) not in known}
-    assert any(f is loop.controller.law.function for f in found.values())
-    return found
-
-
-# The dynamics of walls are Drake's, or those of modes.
-SLOW = some(
-    each_scenario(lambda name: name.startswith(IN_CONTACT)),
-    of=4,
-    dear=["seven_joint_moving_plate", "two_link_motors"],
-)
-OPTIMIZED = ("two_link_wall", "two_link_motors", "seven_joint_wall", "cart_wall")
-"""Others would take two minutes together to compile by -O1."""
-
-
-@pytest.mark.slow
-@needs_compiler
-@pytest.mark.parametrize("name", SLOW)
-def test_machine_code_agrees_with_the_interpreter(name, monkeypatch):
-    """To 1e-12 of the largest value: sums that cancel have the round-off of their terms."""
-    if name not in OPTIMIZED:
-        plain = Compiler.compile
-        monkeypatch.setattr(
-            Compiler,
-            "compile",
-            lambda own, code, file, _, limit, more: plain(own, code, file, "-O0", limit, more),
-        )
-    code, interpreted = (functions_of(name, compiled) for compiled in ("true", "false"))
-    random, compiled = np.random.default_rng(0), 0
-    for key, function in code.items():
-        for _ in range(3):
-            arguments = [random.normal(size=size) for size in function.sizes]
-            found = [np.array(value) for value in function.evaluate(*arguments)]
-            for one, two in zip(found, interpreted[key].evaluate(*arguments), strict=True):
-                size = np.max(np.abs(two[np.isfinite(two)]), initial=0.0)
-                np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12 * size)
-            np.testing.assert_equal(function.is_valid, interpreted[key].is_valid)
-        compiled += function.is_machine_code
-    # The law, the dynamics, the force, the outputs, the manifold and the step to it at least.
-    assert compiled >= 6
 
 
 @needs_compiler

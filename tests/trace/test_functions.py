@@ -173,3 +173,20 @@ def test_threads_do_not_share_arrays():
 
     with ThreadPoolExecutor(4) as pool:
         assert all(pool.map(values, range(4)))
+
+
+def test_long_functions_of_equal_expressions_are_made_once():
+    """And those that differ in one constant are two."""
+
+    def made(last):
+        x = ca.SX.sym("x", 3)
+        value = x
+        for k in range(1000):
+            value = ca.sin(value) + (last if k == 999 else 1.0) * x
+        return TracedFunction("long", {"x": x}, {"value": value})
+
+    one, again, other = made(1.0), made(1.0), made(1.5)
+    assert one.function is again.function
+    at = np.array([0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(one(at)[0], again(at)[0])
+    np.testing.assert_allclose(other(at)[0], one(at)[0] + 0.5 * at, rtol=1e-12)

@@ -1,6 +1,6 @@
 """Gains of law, observer and estimator for compliant contact and given sensors, as an optimum."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -14,7 +14,6 @@ from drake_dae.dae.beyond.contact_gains import ContactGains, best_damping
 from drake_dae.dae.beyond.one_direction import (
     Direction,
     DirectionGains,
-    SampledLoop,
     SensorNoise,
     sampled_loop,
 )
@@ -51,18 +50,13 @@ RAMP = 10.0
 class SensedContact:
     """The numbers of a robot in contact, its sampling and its sensors that decide the gains.
 
-    Attributes:
-        period: T in s.
-        delay: The delay of the control in samples.
-        stiffness: k of the contact in N/m.
-        mobility: J M^-1 J^T of the contact in 1/kg, the largest along the motion.
-        free_mobility: The mobility of the points that follow a path, in 1/kg.
-        lever, contact_lever: The displacement of a point that follows a path, and of the contact,
-            per radian of noise of all joints: the length of a row of J, in m/rad.
-        inertia: sqrt(tr M M): the torque per acceleration of all joints, in kg m^2.
-        noise: The noise of a joint's angle and velocity, in rad and rad/s, and of the force in N;
-            with a `velocity_bandwidth` if velocities are filtered finite differences.
-        estimates: Whether the state comes from a `StateEstimator`.
+    `period` is T in s, `delay` that of the control in samples, `stiffness` k in N/m, `mobility`
+    J M^-1 J^T of the contact in 1/kg, the largest along the motion, and `free_mobility` that of the
+    points that follow a path. `lever` and `contact_lever` are the displacements of such a point and
+    of the contact per radian of noise of all joints, the lengths of rows of J, in m/rad; `inertia`
+    is sqrt(tr M M), the torque per acceleration of all joints, in kg m^2; `noise` that of a joint's
+    angle and velocity and of the force, with a `velocity_bandwidth` if velocities are filtered
+    differences; `estimates` tells whether the state comes from a `StateEstimator`.
 
     Raises:
         ModelError: A number is not positive, or a noise is negative.
@@ -89,29 +83,23 @@ class SensedContact:
                 raise ModelError(f"the noise of the {name} must be 0 or more, got {value:g}")
 
     def free(self, mass_error: float = 1.0) -> Direction:
-        """Returns a free direction."""
+        """A free direction."""
         return Direction(self.period, self.delay, mass_error=mass_error)
 
     def contact(self, mass_error: float = 1.0, share: float = 1.0) -> Direction:
-        """Returns the direction of the contact, with a fraction of its stiffness."""
+        """The direction of the contact, with a fraction of its stiffness."""
         stiffness = share * self.stiffness
         return Direction(self.period, self.delay, self.mobility, stiffness, mass_error)
 
     def noise_of(self, lever: float) -> SensorNoise:
-        """Returns the noise of a distance that is computed from noisy angles."""
-        noise = self.noise
-        position, velocity = lever * noise.position, lever * noise.velocity
-        return replace(noise, position=position, velocity=velocity)
+        """The noise of a distance that is computed from noisy angles."""
+        position, velocity = lever * self.noise.position, lever * self.noise.velocity
+        return replace(self.noise, position=position, velocity=velocity)
 
     @cached_property
     def best_damping(self) -> float:
         """`contact_damping` of the contact, in 1/s."""
         return best_damping(self.stiffness, self.mobility, self.period, self.delay)
-
-    @property
-    def quiet(self) -> SensorNoise:
-        """Measurements without noise, with the lag of differentiated velocities."""
-        return SensorNoise(velocity_bandwidth=self.noise.velocity_bandwidth)
 
 
 @dataclass(frozen=True)
@@ -125,48 +113,58 @@ class Part:
     by_noise: float
     roughness: float
 
+    @classmethod
+    def of(cls, situation: SensedContact, w: float, rates: DirectionGains, contact: bool) -> "Part":
+        """Of the linear loop with these gains, which belong to the rate w in 1/s."""
+        direction = situation.contact() if contact else situation.free()
+        lever = situation.contact_lever if contact else situation.lever
+        mobility = situation.mobility if contact else situation.free_mobility
+        loop = sampled_loop(direction, rates, situation.noise_of(lever))
+        error, jump = loop.deviations()
+        step = MODEL_ERROR * mobility * loop.after_step() * (loop.period / EVERY) ** 0.5
+        if contact:
+            ramp = rates.gains[2] * RAMP / (mobility * situation.stiffness)
+            whole, roughness = float(np.linalg.norm([error, step, ramp])), lever * jump / mobility
+        else:
+            _, jump = sampled_loop(direction, rates, situation.noise_of(1.0)).deviations()
+            whole, roughness = float(np.hypot(error, step)), situation.inertia * jump
+        return cls(w, rates, contact, whole, error, roughness)
+
 
 def is_stable(situation: SensedContact, part: Part) -> bool:
     """Whether a loop settles for all masses and stiffnesses for which it must be stable."""
+    quiet = SensorNoise(velocity_bandwidth=situation.noise.velocity_bandwidth)
     cases = [(situation.free(mass), DECAY) for mass in MASSES]
     if part.is_contact:
         cases = [
             (situation.contact(mass, share), DECAY if share >= 0.5 else 0.0)
             for mass, share in product(CONTACT_MASSES, STIFFNESSES)
         ]
-    for direction, decay in cases:
-        loop = sampled_loop(direction, part.rates, situation.quiet)
-        if not loop.radius < 1.0 - decay * part.rate * loop.period:
-            return False
-    return True
+    return all(
+        loop.radius < 1.0 - decay * part.rate * loop.period
+        for direction, decay in cases
+        for loop in [sampled_loop(direction, part.rates, quiet)]
+    )
 
 
-def free_part(situation: SensedContact, w: float, fast: float | None) -> Part:
-    """The prediction for free directions with the rates w and that of an estimator, in 1/s."""
-    p = 1.5 * w
-    rates = DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
-    loop = sampled_loop(situation.free(), rates, situation.noise_of(situation.lever))
-    error, _ = loop.deviations()
-    _, jump = sampled_loop(situation.free(), rates, situation.noise_of(1.0)).deviations()
-    step = MODEL_ERROR * situation.free_mobility * _rms(loop)
-    return Part(w, rates, False, float(np.hypot(error, step)), error, situation.inertia * jump)
+def _free(situation: SensedContact, fast: float | None) -> list[Part]:
+    """The predictions for free directions with all rates, and that of an estimator, in 1/s."""
+    found = []
+    for w in _rates(situation):
+        p = 1.5 * w
+        rates = DirectionGains((p**3, 2.0 * p**2, 2.0 * p), 0.0, 2.0 * w, fast)
+        found.append(Part.of(situation, w, rates, False))
+    return found
 
 
-def contact_part(situation: SensedContact, w: float, fast: float | None, share: float) -> Part:
+def _along(situation: SensedContact, fast: float | None, share: float) -> list[Part]:
     """The same along the contact, with a factor by which integral and observer are slowed."""
-    c = min(2.3 * w, situation.best_damping)
-    rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
-    loop = sampled_loop(situation.contact(), rates, situation.noise_of(situation.contact_lever))
-    error, jump = loop.deviations()
-    step = MODEL_ERROR * situation.mobility * _rms(loop)
-    ramp = rates.gains[2] * RAMP / (situation.mobility * situation.stiffness)
-    whole = float(np.linalg.norm([error, step, ramp]))
-    return Part(w, rates, True, whole, error, situation.contact_lever * jump / situation.mobility)
-
-
-def _rms(loop: SampledLoop) -> float:
-    """The rms error per disturbing acceleration that appears every `EVERY` seconds."""
-    return loop.after_step() * float(np.sqrt(loop.period / EVERY))
+    found = []
+    for w in _rates(situation):
+        c = min(2.3 * w, situation.best_damping)
+        rates = DirectionGains((0.0, 0.0, c), share * 0.4 * (c or w / 2.0), share * w, fast)
+        found.append(Part.of(situation, w, rates, True))
+    return found
 
 
 def noisiest_sensor(situation: SensedContact, part: Part, deviation: int) -> str:
@@ -183,17 +181,12 @@ def noisiest_sensor(situation: SensedContact, part: Part, deviation: int) -> str
 
 @dataclass(frozen=True)
 class AdvisedGains:
-    """Gains, and the errors predicted for them.
+    """Gains with the rate of the estimator in 1/s, if there is one, and what is predicted for them.
 
-    Attributes:
-        gains: The gains.
-        state_rate: w of the estimator in 1/s; None without one.
-        position_error: The rms error of a point in m: by noise, and by an unknown force of
-            `MODEL_ERROR` that appears every `EVERY` seconds, in squares.
-        force_error: The rms error of the contact force in N, also by a reference that changes by
-            `RAMP`.
-        noise_error, noise_force: The parts of the errors by noise.
-        roughness: The rms change of the controls from sample to sample, over all joints, in N m.
+    The errors are the rms ones of a point in m and of the contact force in N: by noise, by an
+    unknown force of `MODEL_ERROR` that appears every `EVERY` seconds and, of the force, by a
+    reference that changes by `RAMP`, in squares; `noise_error` and `noise_force` are their parts by
+    noise. The roughness is the rms change of the controls from sample to sample in N m.
     """
 
     gains: ContactGains
@@ -213,20 +206,16 @@ class _Bounds:
     position_error: float
     force_error: float
 
-    @property
-    def along(self) -> float:
-        """The largest roughness along the contact."""
-        return self.roughness / 2.0**0.5
-
-    @property
-    def has_errors(self) -> bool:
-        return min(self.position_error, self.force_error) < inf
-
-    def order(self, free: Part, contact: Part) -> tuple[float, float]:
+    def order(self, pair: Sequence[Part]) -> tuple[float, float]:
         """What is least for the best gains: the errors without a bound, then the roughness."""
-        pairs = (free, self.position_error), (contact, self.force_error)
-        errors = [part.error for part, most in pairs if most == inf]
-        return prod(errors), float(np.hypot(free.roughness, contact.roughness))
+        bounds = self.position_error, self.force_error
+        errors = [part.error for part, most in zip(pair, bounds, strict=True) if most == inf]
+        return prod(errors), _roughness(pair)
+
+
+def _roughness(pair: Sequence[Part]) -> float:
+    """That of both directions, in N m."""
+    return float(np.hypot(pair[0].roughness, pair[1].roughness))
 
 
 @checked(ModelError)
@@ -246,19 +235,14 @@ def advised_gains(
     stability from eigenvalues; see `sampled_loop`. The product of the errors of position and force
     is least among those gains that
 
-    - change the controls by at most `roughness` from sample to sample, in rms,
+    - change the controls by at most `roughness` N m from sample to sample, in rms,
     - are stable, and settle at least at the rate `DECAY` w, if a force accelerates 1/2 to 2 times
       as in the model of the law in free directions, and 2/3 to 3/2 times along a contact whose
       stiffness is up to 2 times the stated one,
     - lose at most 0.3 rad of phase to samples and delay, with an estimator half of it.
 
-    Where an error is bounded, the gains of its direction are the smoothest ones within the bound.
-
-    Args:
-        situation: The contact and its sensors.
-        roughness: The largest rms change of the controls from sample to sample, in N m.
-        position_error, force_error: The largest predicted errors, as of `AdvisedGains`, in m and N;
-            infinite without a bound.
+    Where an error in m or N is bounded, the gains of its direction are the smoothest ones within
+    the bound.
 
     Raises:
         GainError: No gains do so; the message names the noise or the limit that prevents it.
@@ -269,16 +253,11 @@ def advised_gains(
         if not most > 0.0:
             raise ModelError(f"{name} must be positive, got {most:g}")
     bounds = _Bounds(roughness, position_error, force_error)
-    highest = _highest(situation)
-    rates = _rates(highest)
-    candidates = []
-    for fast in _state_rates(situation, highest):
-        found = _pair(situation, rates, fast, bounds)
-        if found is not None:
-            candidates.append((*found, fast))
+    tried = ((_pair(situation, fast, bounds), fast) for fast in _state_rates(situation))
+    candidates = [(*found, fast) for found, fast in tried if found is not None]
     if not candidates:
-        raise GainError(_reason(situation, rates, bounds, highest))
-    free, contact, fast = min(candidates, key=lambda parts: bounds.order(*parts[:2]))
+        raise GainError(_reason(situation, bounds))
+    free, contact, fast = min(candidates, key=lambda found: bounds.order(found[:2]))
     w, of_contact = free.rate, contact.rates
     return AdvisedGains(
         gains=ContactGains(
@@ -294,41 +273,36 @@ def advised_gains(
         force_error=contact.error,
         noise_error=free.by_noise,
         noise_force=contact.by_noise,
-        roughness=float(np.hypot(free.roughness, contact.roughness)),
+        roughness=_roughness((free, contact)),
     )
 
 
-def _highest(situation: SensedContact) -> float:
-    """The largest w by the loss of phase."""
+def _rates(situation: SensedContact) -> list[float]:
+    """The rates w that are tried, from the largest one by the loss of phase on."""
     phase = _PHASE / 2.0 if situation.estimates else _PHASE
-    return phase / (3.0 * (situation.delay + 0.5) * situation.period)
-
-
-def _rates(highest: float) -> list[float]:
+    highest = phase / (3.0 * (situation.delay + 0.5) * situation.period)
     return np.geomspace(highest, highest / 60.0, 17).tolist()
 
 
-def _state_rates(situation: SensedContact, highest: float) -> Iterator[float | None]:
+def _state_rates(situation: SensedContact) -> list[float | None]:
+    """The rates of an estimator that are tried."""
     if not situation.estimates:
-        yield None
-        return
-    for share in (2.0, 4.0, 7.0, 12.0, 20.0):
-        if share * highest * situation.period <= 0.5:
-            yield share * highest
+        return [None]
+    rates = [share * _rates(situation)[0] for share in (2.0, 4.0, 7.0, 12.0, 20.0)]
+    return [rate for rate in rates if rate * situation.period <= 0.5]
 
 
 def _pair(
-    situation: SensedContact, rates: list[float], fast: float | None, bounds: _Bounds
+    situation: SensedContact, fast: float | None, bounds: _Bounds
 ) -> tuple[Part, Part] | None:
     """The best gains of free directions and of the contact, if there are any."""
 
     def free(allowed: float) -> Part | None:
-        parts = [free_part(situation, w, fast) for w in rates]
-        return _best(situation, parts, allowed, bounds.position_error)
+        return _best(situation, _free(situation, fast), allowed, bounds.position_error)
 
     def contact(allowed: float) -> Part | None:
-        tried = ([contact_part(situation, w, fast, share) for w in rates] for share in SLOWER)
-        allowed = min(allowed, bounds.along)
+        allowed = min(allowed, bounds.roughness / 2.0**0.5)
+        tried = (_along(situation, fast, share) for share in SLOWER)
         best = (_best(situation, parts, allowed, bounds.force_error) for parts in tried)
         return next(filter(None, best), None)
 
@@ -338,8 +312,7 @@ def _pair(
     first, second = (free, contact) if is_free_first else (contact, free)
     if (one := first(bounds.roughness)) is None:
         return None
-    remaining = (bounds.roughness**2 - one.roughness**2) ** 0.5
-    if (other := second(remaining)) is None:
+    if (other := second((bounds.roughness**2 - one.roughness**2) ** 0.5)) is None:
         return None
     return (one, other) if is_free_first else (other, one)
 
@@ -358,24 +331,17 @@ def _best(situation: SensedContact, parts: list[Part], allowed: float, most: flo
 
 def settles_along(situation: SensedContact) -> bool:
     """Whether any gains are stable along the contact with a margin."""
-    highest = _highest(situation)
-    return any(
-        is_stable(situation, contact_part(situation, w, fast, share))
-        for fast in _state_rates(situation, highest)
-        for w in _rates(highest)
-        for share in SLOWER
-    )
+    tried = product(_state_rates(situation), SLOWER)
+    return any(is_stable(situation, part) for each in tried for part in _along(situation, *each))
 
 
-def _reason(situation: SensedContact, rates: list[float], bounds: _Bounds, highest: float) -> str:
-    """Returns why no gains are found."""
+def _reason(situation: SensedContact, bounds: _Bounds) -> str:
+    """Why no gains are found."""
     found = []  # The stable parts of free directions and of the contact, for each estimator.
-    for fast in _state_rates(situation, highest):
-        free = [free_part(situation, w, fast) for w in rates]
-        contact = [contact_part(situation, w, fast, share) for w in rates for share in SLOWER]
-        found.append(
-            [[part for part in parts if is_stable(situation, part)] for parts in (free, contact)]
-        )
+    for fast in _state_rates(situation):
+        along = [part for share in SLOWER for part in _along(situation, fast, share)]
+        tried = _free(situation, fast), along
+        found.append([[part for part in parts if is_stable(situation, part)] for parts in tried])
     most_of = bounds.position_error, bounds.force_error
     names = ("in free directions", "m"), ("along the contact", "N")
     for parts, (where, unit), most in zip(zip(*found, strict=True), names, most_of, strict=True):
@@ -396,25 +362,28 @@ def _reason(situation: SensedContact, rates: list[float], bounds: _Bounds, highe
                 f"stable, mostly by {cause}, and {most:.3g} {unit} are allowed: allow more, sample "
                 "more often, or use better sensors"
             )
-    smoothest = []
-    for both in found:  # Of one estimator.
-        within = [
+    pairs = [
+        [
             [part for part in parts if part.error <= most]
             for parts, most in zip(both, most_of, strict=True)
         ]
-        if all(within):
-            smoothest.append([min(parts, key=lambda part: part.roughness) for parts in within])
+        for both in found
+    ]
+    smoothest = [
+        [min(parts, key=lambda part: part.roughness) for parts in both]
+        for both in pairs
+        if all(both)
+    ]
     if not smoothest:
         return (
             "no rate of the estimator has both errors within their bounds: allow more of one of "
             "them, sample more often, or use better sensors"
         )
-    across, along = min(smoothest, key=lambda pair: np.hypot(pair[0].roughness, pair[1].roughness))
-    noisiest = noisiest_sensor(situation, across, 1)
-    gains = "all gains that are stable" + bounds.has_errors * " and have errors within their bounds"
+    across, into = min(smoothest, key=_roughness)
     return (
-        f"the noise of the {noisiest} changes the controls by {across.roughness:.3g} N m in free "
-        f"directions and {along.roughness:.3g} N m along the contact from sample to sample with "
-        f"{gains}; {bounds.roughness:.3g} N m are allowed, of which the contact has at most "
-        f"{bounds.along:.3g}: allow more roughness, or use a better sensor"
+        f"the noise of the {noisiest_sensor(situation, across, 1)} changes the controls by "
+        f"{across.roughness:.3g} N m in free directions and {into.roughness:.3g} N m along the "
+        "contact from sample to sample with the smoothest gains that are stable and keep the "
+        f"errors; {bounds.roughness:.3g} N m are allowed, of which the contact has at most "
+        f"{bounds.roughness / 2.0**0.5:.3g}: allow more roughness, or use a better sensor"
     )

@@ -74,8 +74,7 @@ def controls_of(loop: ClosedLoop, numbers: Numbers, time: float, size: float) ->
     ]
     return [
         *_commands(loop, numbers, time, size),
-        *_moving_surfaces(loop, numbers, rounded(0.2 * size)),
-        *_compliant_surfaces(loop.plant, numbers, rounded(0.2 * size)),
+        *_surfaces(loop, numbers, rounded(0.2 * size)),
         *signals,
         *_controls_of_plant(loop, numbers),
         *_control_of_pole(loop.controller, numbers),
@@ -123,38 +122,30 @@ def _commands(loop: ClosedLoop, numbers: Numbers, time: float, size: float) -> l
     return sorted(controls, key=lambda s: _ORDER.index(s.unit) if s.unit in _ORDER else 2)
 
 
-def _moving_surfaces(loop: ClosedLoop, numbers: Numbers, high: float) -> list[Control]:
-    """Sliders for the positions of surfaces, which move in the plant and in the law."""
-    places = dict[str, list[int]]()
+def _surfaces(loop: ClosedLoop, numbers: Numbers, reach: float) -> list[Control]:
+    """Sliders for the positions of surfaces.
+
+    Those that move do so in the plant and in the law. Those of a compliant contact are parameters
+    of the plant and not of the law, and change in steps, which the limited rate makes small.
+    """
+    places, plant = dict[str, list[int]](), loop.plant
     for generator in dict.fromkeys((loop.plant_exogenous, loop.exogenous)):
         if isinstance(generator, CommandedReferences):
             for name, place in numbers.of(generator).items():
-                places.setdefault(name, []).append(place)
-    return [
-        Control("surface", name, "m", -high, high, 0.0, tuple(every))
+                if ".position" in name and numbers.signals[place].unit == "m":
+                    places.setdefault(name, []).append(place)
+    controls = [
+        Control("surface", name, "m", -reach, reach, 0.0, tuple(every))
         for name, every in places.items()
-        if ".position" in name and numbers.signals[every[0]].unit == "m"
     ]
-
-
-def _compliant_surfaces(plant: Plant, numbers: Numbers, reach: float) -> list[Control]:
-    """Sliders for the positions of the surfaces of a compliant contact.
-
-    They are parameters of the plant and not of the law, and change in steps. The limited rate makes
-    the steps small.
-    """
     if plant.is_ideal or plant.model is None:
-        return []
-    places, controls = numbers.of(plant), list[Control]()
-    exogenous = {signal.name for signal in plant.dae.exogenous.signals}
-    for constraint in plant.model.constraints:
-        for k in range(3):
-            name = f"{constraint.name}.position[{k}]"
-            if name in places and name not in exogenous:
-                place, value = places[name], float(numbers.values[places[name]])
-                limits = value - reach, value + reach, value
-                rate = MAX_SURFACE_SPEED
-                controls.append(Control("surface", name, "m", *limits, (place,), rate=rate))
+        return controls
+    own, exogenous = numbers.of(plant), {signal.name for signal in plant.dae.exogenous.signals}
+    names = [f"{c.name}.position[{k}]" for c in plant.model.constraints for k in range(3)]
+    for name in [name for name in names if name in own and name not in exogenous]:
+        value, rate = float(numbers.values[own[name]]), MAX_SURFACE_SPEED
+        limits = value - reach, value + reach, value
+        controls.append(Control("surface", name, "m", *limits, (own[name],), rate=rate))
     return controls
 
 

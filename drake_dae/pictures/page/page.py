@@ -3,9 +3,11 @@
 import base64
 import html
 import json
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,11 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import Context, PortDataType
 
 from drake_dae.arguments import checked
-from drake_dae.arrays import FloatArray
 from drake_dae.blocks.compose import compose
 from drake_dae.dae import DaeSystem
 from drake_dae.diagrams.closed_loop import ClosedLoop
-from drake_dae.errors import ModelError
+from drake_dae.errors import MachineCodeError, ModelError
 from drake_dae.pictures.page.controls import (
-    Control,
     Numbers,
     controls_of,
     prediction,
@@ -29,9 +29,9 @@ from drake_dae.pictures.page.controls import (
     strongest_pushes,
 )
 from drake_dae.pictures.page.scene import RobotScene, meshcat_page, scene_size
-from drake_dae.pictures.page.wasm import check_compiler, compiled_loop
 from drake_dae.running.export.c_code import BlockCode
 from drake_dae.running.export.loop import check_traced, write_loop
+from drake_dae.trace.compiler import compile_webassembly
 
 WEB = Path(__file__).with_name("web")
 
@@ -87,12 +87,18 @@ def write_page(
         MachineCodeError: zig is not installed (`pip install ziglang` adds it), or it fails.
         OSError: A file cannot be written.
     """
-    check_compiler()
-    bench, file = Bench.of(loop, context), Path(file)
+    if find_spec("ziglang") is None:
+        raise MachineCodeError(
+            "a page is compiled to WebAssembly by zig, which is not installed: pip install ziglang"
+        )
+    bench, file = Bench(loop, context), Path(file)
     with tempfile.TemporaryDirectory() as folder:
         start = bench.context.get_time()
         _, source = write_loop(bench.code, start, "page", folder, config)
-        code = base64.b64encode(compiled_loop(source)).decode()
+        source.write_text(in_pieces(source.read_text("utf-8")), "utf-8")
+        target = source.with_suffix(".wasm")
+        compile_webassembly(source, target)
+        code = base64.b64encode(target.read_bytes()).decode()
     data = bench.data() | {"title": title or loop.plant.dae.name, "notes": list(notes)}
     page = meshcat_page(bench.robot, bench.state, loop.scene_graph)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -132,7 +138,6 @@ def as_script(data: Any) -> str:
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
-@dataclass(frozen=True, eq=False)
 class Bench:
     """What a page shows and changes of a loop, from a context on; `size` is that of the scene in m.
 
@@ -140,25 +145,14 @@ class Bench:
     and "coordinates" of the errors.
     """
 
-    loop: ClosedLoop
-    context: Context
-    code: BlockCode
-    numbers: Numbers
-    controls: Sequence[Control]
-    robot: RobotScene
-    state: FloatArray
-    size: float
-    predicted: dict[str, Any] | None
-
-    @classmethod
-    def of(cls, loop: ClosedLoop, context: Context | None) -> "Bench":
-        """The bench of a loop, whose free inputs are 0 where they have no value."""
+    def __init__(self, loop: ClosedLoop, context: Context | None) -> None:
+        """Of a loop, whose free inputs are 0 where they have no value."""
         diagram, plant, law = loop.diagram, loop.plant, loop.controller.law
         context = (context or diagram.CreateDefaultContext()).Clone()
         for port in map(diagram.get_input_port, range(diagram.num_input_ports())):
             if port.get_data_type() == PortDataType.kVectorValued and not port.HasValue(context):
                 port.FixValue(context, np.zeros(port.size()))
-        robot = RobotScene.of(plant, loop.scene_graph)
+        self.robot = robot = RobotScene(plant, loop.scene_graph)
         names = "state", "constraint_force", "integral", "exogenous", "known_exogenous", *SHOWN
         ports = {name: diagram.GetOutputPort(name) for name in names if diagram.HasOutputPort(name)}
         composed = compose(diagram, ports, context=context, shares=False)
@@ -178,8 +172,8 @@ class Bench:
         state, force = values["state"], values["constraint_force"]
         scene = robot.columns(state, force, parameters_of(plant, plant.dae, "exogenous"))
         outputs = {name: values[name] for name in SHOWN if name in values} | {"scene": scene}
-        predicted = prediction(loop, composed.parameters.get(loop.controller))
-        if predicted is not None:
+        self.predicted = prediction(loop, composed.parameters.get(loop.controller))
+        if self.predicted is not None:
             outputs["coordinates"] = law.coordinates_function.function(
                 state,
                 values["reference"],
@@ -187,12 +181,12 @@ class Bench:
                 parameters_of(loop.controller, law.system, "known_exogenous"),
             )[0]
         composed = replace(composed, block=replace(composed.block, outputs=outputs))
-        code = BlockCode.of(composed, context, {}, loop.signals)
-        numbers = Numbers(code.parameters, code.values, composed.parameters, code.places)
-        start = plant.state(plant.GetMyContextFromRoot(context))
-        size = scene_size(robot, start, loop.scene_graph)
-        controls = controls_of(loop, numbers, context.get_time(), size)
-        return cls(loop, context, code, numbers, controls, robot, start, size, predicted)
+        self.loop, self.context = loop, context
+        self.code = code = BlockCode(composed, context, {}, loop.signals)
+        self.numbers = Numbers(code.parameters, code.values, composed.parameters, code.places)
+        self.state = plant.state(plant.GetMyContextFromRoot(context))
+        self.size = scene_size(robot, self.state, loop.scene_graph)
+        self.controls = controls_of(loop, self.numbers, context.get_time(), self.size)
 
     def data(self) -> dict[str, Any]:
         """What the browser knows, as JSON represents it."""
@@ -241,3 +235,70 @@ class Bench:
                 for signal, value in zip(numbers.signals, numbers.values.tolist(), strict=True)
             ],
         }
+
+
+# ------------------------------------------------------------------ long functions in pieces
+
+# The largest number of assignments in a function. For 60,000 assignments, clang needs 180 s of CPU
+# in one function, and 9 s in pieces of 2,000, whose code is 40 % larger.
+LONGEST = 2000
+
+_NAME = re.compile(r"\ba\d+\b")
+_FUNCTION = re.compile(
+    r"(?P<head>static int (?P<name>casadi_f\d+)\([^\n]*\{)\n(?P<body>(?:  [^\n]*\n)*)\}"
+)
+_DECLARATION = "  casadi_real a"
+_ARGUMENTS = (
+    "const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, "
+    "casadi_real* shared"
+)
+
+
+def in_pieces(source: str, longest: int = LONGEST) -> str:
+    """Splits the long functions of a C source of CasADi into pieces, which each calls in turn.
+
+    The array `shared` passes values of a piece to later pieces.
+    """
+    return _FUNCTION.sub(lambda function: _split(function, longest), source)
+
+
+def _split(function: re.Match[str], longest: int) -> str:
+    rows = [
+        row
+        for row in function["body"].splitlines()
+        if not row.startswith(_DECLARATION) and row.strip() != "return 0;"
+    ]
+    if len(rows) <= longest:
+        return function[0]
+    pieces = [rows[i : i + longest] for i in range(0, len(rows), longest)]
+    uses = [_uses(piece) for piece in pieces]
+    # needed[k]: the variables that piece k or a later one reads before a new assignment.
+    needed = [set[str]()]
+    for read, assigned in reversed(uses):
+        needed.insert(0, read | (needed[0] - assigned))
+    index = {variable: i for i, variable in enumerate(sorted(set().union(*needed)))}
+    name, text, calls = function["name"], "", ""
+    for k, (piece, (read, assigned)) in enumerate(zip(pieces, uses, strict=True)):
+        begin = [
+            f"  casadi_real {a}{f' = shared[{index[a]}]' if a in read else ''};"
+            for a in sorted(read | assigned)
+        ]
+        end = [f"  shared[{index[a]}] = {a};" for a in sorted(assigned & needed[k + 1])]
+        head = f"static int __attribute__((noinline)) {name}_{k}({_ARGUMENTS}) {{"
+        text += "\n".join([head, *begin, *piece, *end, "  return 0;", "}", "", ""])
+        calls += f"  if ({name}_{k}(arg, res, iw, w, shared)) return 1;\n"
+    shared = f"  casadi_real shared[{len(index) + 1}];\n"
+    return f"{text}{function['head']}\n{shared}{calls}  return 0;\n}}"
+
+
+def _uses(rows: Sequence[str]) -> tuple[set[str], set[str]]:
+    """Returns the variables that rows read before they assign them, and those that they assign."""
+    read, assigned = set[str](), set[str]()
+    for row in rows:
+        target, _, value = row.partition("=")
+        variable = target.strip()
+        is_assignment = _NAME.fullmatch(variable)  # Otherwise it is a result, or a condition.
+        read |= set(_NAME.findall(value if is_assignment else row)) - assigned
+        if is_assignment:
+            assigned.add(variable)
+    return read, assigned

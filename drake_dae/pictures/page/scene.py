@@ -1,7 +1,6 @@
 """The scene of a page: Meshcat's drawing of robots, and the poses of its parts as expressions."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
@@ -26,7 +25,6 @@ from drake_dae.systems.plants.contract import Plant
 _BACKGROUND = [0.97, 0.97, 0.98]
 
 
-@dataclass(frozen=True, eq=False)
 class RobotScene:
     """The drawn parts of a robot.
 
@@ -34,19 +32,12 @@ class RobotScene:
     outputs that are coordinates of a point.
     """
 
-    plant: Plant
-    bodies: Sequence[tuple[str, tuple[str, ...], Frame]]
-    wrenches: ConstraintWrenches
-    surfaces: Sequence[Constraint]
-    targets: Sequence[PointCoordinates]
-
-    @classmethod
-    def of(cls, plant: Plant, scene_graph: SceneGraph | None) -> "RobotScene":
-        model = plant.robot("a page")
+    def __init__(self, plant: Plant, scene_graph: SceneGraph | None) -> None:
+        model, self.plant = plant.robot("a page"), plant
+        self.bodies, self.wrenches = _drawn_bodies(model, scene_graph), ConstraintWrenches(model)
         surfaces = [c for c in model.constraints if _has_moving_surface(c, plant.is_ideal)]
-        targets = [output for output in model.outputs if isinstance(output, PointCoordinates)]
-        bodies = _drawn_bodies(model, scene_graph)
-        return cls(plant, bodies, ConstraintWrenches(model), surfaces, targets)
+        self.surfaces: list[Constraint] = surfaces
+        self.targets = [each for each in model.outputs if isinstance(each, PointCoordinates)]
 
     def columns(self, state: ca.SX, force: ca.SX, parameters: ca.SX) -> ca.SX:
         """Numbers in the world, as one column of expressions.

@@ -2,11 +2,10 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from string import Template
-from typing import Self
 
 import casadi as ca
 import numpy as np
@@ -19,7 +18,6 @@ from drake_dae.blocks.compose import Composed, Port
 from drake_dae.blocks.stepping import StepFunctions
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.trace.compiled import generate, renamed, without_branches
 
 TEMPLATES = Path(__file__).with_name("c99")
 
@@ -27,43 +25,34 @@ MOST = 2000  # The largest number of steps of a run that is played to exported c
 Vectors = Mapping[str, Sequence[Signal]]  # Name of a vector -> names and units of its entries.
 
 
-@dataclass(frozen=True, eq=False)
 class BlockCode:
-    """A block as functions in C, and its numbers at a start.
+    """A part of a diagram as functions in C, and its numbers at a start.
 
     Each input of the block is a parameter of these functions: first come the parameters of the
     block, then inputs that keep their value in the context (`places`), and last `inputs`, those of
     each step. `parameters` and `values` are without these. Held values that are nan at the start
-    come from the function "begin".
+    come from the function "begin". `known` names outputs whose blocks do not name them.
     """
 
-    steps: StepFunctions
-    inputs: Vectors
-    outputs: Vectors
-    parameters: Sequence[Signal]
-    values: FloatArray
-    places: Mapping[str, slice]
-    held: FloatArray
-
-    @classmethod
-    def of(cls, composed: Composed, context: Context, inputs: Vectors, known: Vectors) -> Self:
-        """The code of a part of a diagram; `known` names outputs whose blocks do not name them."""
-        block, named = composed.block, composed.block.signals
+    def __init__(
+        self, composed: Composed, context: Context, inputs: Vectors, known: Vectors
+    ) -> None:
+        block, named, self.inputs = composed.block, composed.block.signals, inputs
         parameters, values = [*named["parameters"]], [block.default("parameters")]
-        columns, places = [block.parameters], dict[str, slice]()
+        columns, self.places = [block.parameters], dict[str, slice]()
         for name in [name for name in block.inputs if name not in inputs]:
             system, index = composed.fixed[name]
             port, local = system.get_input_port(index), system.GetMyContextFromRoot(context)
             if not port.HasValue(local):
                 raise ModelError(f"the input port '{name}' has no value in this context: fix one")
-            places[name] = slice(len(parameters), len(parameters) + port.size())
+            self.places[name] = slice(len(parameters), len(parameters) + port.size())
             parameters += signals_of({}, name, port.size())
             values.append(port.Eval(local))
             columns.append(block.inputs[name])
         columns += [block.inputs[name] for name in inputs]
         # Values of one rate are neighbours.
         held = {name: block.held[name] for names in block.rates().values() for name in names}
-        steps = StepFunctions(
+        self.steps = steps = StepFunctions(
             replace(block, inputs={}, parameters=stacked(columns), held=held, defaults={})
         )
         starts = [np.asarray(each.start, float).ravel() for each in held.values()]
@@ -74,13 +63,12 @@ class BlockCode:
             ]
             value = ca.densify(stacked(begun))
             steps.functions["begin"] = ca.Function("begin", steps.columns, [value])
-        outputs = {
+        self.outputs = {
             name: signals_of({**known, **named}, name, value.numel())
             for name, value in block.outputs.items()
         }
-        at_start = np.concatenate([np.zeros(0), *starts])
-        own = np.concatenate(values)
-        return cls(steps, inputs, outputs, parameters, own, places, at_start)
+        self.held = np.concatenate([np.zeros(0), *starts])
+        self.parameters, self.values = parameters, np.concatenate(values)
 
     def words(self, name: str) -> dict[str, str]:
         """The texts of a block for the templates, and those that all templates have."""
@@ -104,12 +92,6 @@ class BlockCode:
             "parameter_names": strings(s.name for s in self.parameters),
             "parameter_units": strings(s.unit for s in self.parameters),
         }
-
-
-def generated(functions: Mapping[str, ca.Function]) -> str:
-    """C code of functions, as generated_name."""
-    named = (renamed(function, f"generated_{name}") for name, function in functions.items())
-    return without_branches(generate(*named))
 
 
 def written(folder: str | Path, files: Mapping[str, str], words: Mapping[str, str]) -> list[Path]:

@@ -9,13 +9,7 @@ from typing import Any
 
 import casadi as ca
 from pydrake.systems.analysis import SimulatorConfig
-from pydrake.systems.framework import (
-    Context,
-    Diagram,
-    OutputPort,
-    PortDataType,
-    System,
-)
+from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType, System
 
 from drake_dae.arguments import checked
 from drake_dae.blocks.block import Block, stacked
@@ -27,13 +21,13 @@ from drake_dae.running.export.c_code import (
     BlockCode,
     Vectors,
     file_of,
-    generated,
     recorded_run,
     signals_of,
     write_replay,
     written,
 )
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.trace.compiled import generate, renamed, without_branches
 
 CONTROL = "control"  # The name of a controller's output port and a plant's input port.
 FINEST = 1000  # The largest ratio of the shortest sample period to the common period.
@@ -88,10 +82,7 @@ def export_controller(
         ModelError: The controller acts continuously, or has a block that cannot be exported.
         OSError: A file cannot be written.
     """
-    part, diagram = (
-        controller_of(loop, context),
-        loop if isinstance(loop, Diagram) else loop.diagram,
-    )
+    part, diagram = ControllerPart(loop, context), _diagram_of(loop)
     ticks, start, code = part.ticks, context.get_time(), part.code
     count = max(1, min(MOST, floor(duration / ticks.period + 1e-9)))
     times = [ticks.time(ticks.at(start) + k) for k in range(count)]
@@ -144,16 +135,57 @@ class Ticks:
         return time
 
 
-@dataclass(frozen=True, eq=False)
 class ControllerPart:
-    """The controller of a diagram, and the ports of its inputs and outputs in the diagram."""
+    """The controller of a diagram with one `Plant`, and the ports of its inputs and outputs there.
 
-    code: BlockCode
-    ticks: Ticks
-    inputs: Mapping[str, Port]
-    outputs: Mapping[str, Port]
-    acts_at_once: bool
-    """Whether the control has direct feedthrough from measurements; else updates change it."""
+    It acts at once if the control has direct feedthrough from measurements; else updates change it.
+    """
+
+    def __init__(self, loop: ClosedLoop | Diagram, context: Context) -> None:
+        diagram = _diagram_of(loop)
+        machine = list(_machine(diagram))
+        plants = [system for system in machine if isinstance(system, Plant)]
+        if len(plants) != 1:
+            raise ModelError(
+                f"an export cuts a diagram at its plant, and this one has {len(plants)}: a Plant, "
+                "as RobotPlant, DaePlant or ContactPlant"
+            )
+        (plant,), leaves, measured = plants, Leaves.of(diagram), dict[str, OutputPort]()
+        for system in machine:
+            for port in map(system.get_output_port, range(system.num_output_ports())):
+                own = port.get_name()
+                measured[f"{system.get_name()}_{own}" if own in measured else own] = port
+        place = leaf_inputs(plant, int(plant.GetInputPort(CONTROL).get_index()))[0]
+        control = leaves.sources.get(place)
+        if control is None:
+            raise ModelError(f"nothing leads to the control of '{plant.get_name()}'")
+        upstream = _upstream(leaves, control, {leaf_port(port) for port in measured.values()})
+        outputs = {CONTROL: control[0].get_output_port(control[1])}
+        for port in map(diagram.get_output_port, range(diagram.num_output_ports())):
+            is_vector = port.get_data_type() == PortDataType.kVectorValued and port.size()
+            if is_vector and leaf_port(port)[0] in upstream and leaf_port(port) != control:
+                outputs.setdefault(port.get_name(), port)
+        composed = compose(diagram, outputs, cuts=measured, context=context)
+        block, self.acts_at_once = _checked(composed, measured)
+        if self.acts_at_once and not plant.time_step:
+            raise ModelError(
+                f"the controller acts continuously, and as one step it needs samples: {SAMPLING}"
+            )
+        known: Vectors = {
+            **plant.port_signals,
+            **plant.further_signals,
+            "estimated_state": plant.dae.state_signals,
+            "measured_force": plant.dae.constraint_input_signals,
+        }
+        inputs = {
+            name: signals_of(known, name, symbol.numel()) for name, symbol in block.inputs.items()
+        }
+        inputs = {name: signals for name, signals in inputs.items() if name in measured}
+        self.code = BlockCode(replace(composed, block=block), context, inputs, known)
+        rates = [(rate.period, rate.offset) for rate in self.code.steps.rates]
+        self.ticks = Ticks.of(rates, plant.time_step)
+        self.inputs = {name: leaf_port(measured[name]) for name in inputs}
+        self.outputs = {name: leaf_port(outputs[name]) for name in block.outputs}
 
     def words(self, name: str, start: float) -> dict[str, str]:
         """The texts for the templates."""
@@ -179,9 +211,13 @@ class ControllerPart:
             begin = "  double held[HELD + 1];\n  memcpy(held, c->held, sizeof(held));\n"
             begin += f"  evaluate(generated_begin, c, {at}, held, c->held);\n"
         unused = "rate", "newton"  # There is no continuous state.
-        functions = {key: f for key, f in code.steps.functions.items() if key not in unused}
+        functions = (
+            renamed(function, f"generated_{key}")
+            for key, function in code.steps.functions.items()
+            if key not in unused
+        )
         return code.words(name) | {
-            "generated": generated(functions),
+            "generated": without_branches(generate(*functions)),
             "period": repr(ticks.period),
             "start": repr(ticks.time(first)),
             "first": str(first),
@@ -191,55 +227,8 @@ class ControllerPart:
         }
 
 
-def controller_of(loop: ClosedLoop | Diagram, context: Context) -> ControllerPart:
-    """The controller of a loop, or of any diagram with one `Plant`."""
-    diagram = loop if isinstance(loop, Diagram) else loop.diagram
-    machine = list(_machine(diagram))
-    plants = [system for system in machine if isinstance(system, Plant)]
-    if len(plants) != 1:
-        raise ModelError(
-            f"an export cuts a diagram at its plant, and this one has {len(plants)}: a Plant, as "
-            "RobotPlant, DaePlant or ContactPlant"
-        )
-    (plant,), leaves, measured = plants, Leaves.of(diagram), dict[str, OutputPort]()
-    for system in machine:
-        for port in map(system.get_output_port, range(system.num_output_ports())):
-            own = port.get_name()
-            measured[f"{system.get_name()}_{own}" if own in measured else own] = port
-    place = leaf_inputs(plant, int(plant.GetInputPort(CONTROL).get_index()))[0]
-    control = leaves.sources.get(place)
-    if control is None:
-        raise ModelError(f"nothing leads to the control of '{plant.get_name()}'")
-    upstream = _upstream(leaves, control, {leaf_port(port) for port in measured.values()})
-    outputs = {CONTROL: control[0].get_output_port(control[1])}
-    for port in map(diagram.get_output_port, range(diagram.num_output_ports())):
-        is_vector = port.get_data_type() == PortDataType.kVectorValued and port.size()
-        if is_vector and leaf_port(port)[0] in upstream and leaf_port(port) != control:
-            outputs.setdefault(port.get_name(), port)
-    composed = compose(diagram, outputs, cuts=measured, context=context)
-    block, acts_at_once = _checked(composed, measured)
-    if acts_at_once and not plant.time_step:
-        raise ModelError(
-            f"the controller acts continuously, and as one step it needs samples: {SAMPLING}"
-        )
-    known: Vectors = {
-        **plant.port_signals,
-        **plant.further_signals,
-        "estimated_state": plant.dae.state_signals,
-        "measured_force": plant.dae.constraint_input_signals,
-    }
-    inputs = {
-        name: signals_of(known, name, symbol.numel()) for name, symbol in block.inputs.items()
-    }
-    inputs = {name: signals for name, signals in inputs.items() if name in measured}
-    code = BlockCode.of(replace(composed, block=block), context, inputs, known)
-    return ControllerPart(
-        code,
-        Ticks.of([(rate.period, rate.offset) for rate in code.steps.rates], plant.time_step),
-        {name: leaf_port(measured[name]) for name in inputs},
-        {name: leaf_port(outputs[name]) for name in block.outputs},
-        acts_at_once,
-    )
+def _diagram_of(loop: ClosedLoop | Diagram) -> Diagram:
+    return loop if isinstance(loop, Diagram) else loop.diagram
 
 
 def _machine(diagram: Diagram) -> Iterator[Any]:

@@ -70,10 +70,9 @@ class Controller(System):
 
     1. Inputs. The input port `estimated_state` is x, shape (n,). Further input ports, if needed:
        `reference` (R of its `law`), `measured_force` (all constraint forces), `exogenous` (as of a
-       `Plant`), `hold` (one entry for each integral of `law`, which is not updated while it is not
-       0), and signal_<name> for each signal for which it waits. One that plans its references
-       itself has the output port `contact_reference` for an observer, and `tared_force` where it
-       corrects the measured force.
+       `Plant`), `hold` (no integral of `law` is updated while it is not 0), and signal_<name> for
+       each signal for which it waits. One that plans its references itself has the output port
+       `contact_reference` for an observer, and `tared_force` where it corrects the measured force.
     2. Outputs. The output port `control` is u, shape (p,). `further_signals` are the other output
        ports in a record, with names and units; `shown` are those that a loop exports without
        recording them.

@@ -28,8 +28,8 @@ class TrackingController(ParameterizedSystem, Controller):
         reference: R, output-major, r_i, ..., r_i^(mu_i); shape (sum (mu_i + 1),).
         measured_force: The constraint force from a sensor, shape (m,); if the law takes it.
         exogenous: The signals w with their derivatives, if there are any.
-        hold: Of a law with integrals, shape (k,): an error is not integrated while its entry is not
-            0, as while a drive is at its limit or a contact is lost; 0 without a wire.
+        hold: Of a law with integrals, shape (1,): no error is integrated while it is not 0, as
+            while a drive is at its limit or a contact is lost; 0 without a wire.
 
     Output ports:
         control: u, shape (p,).
@@ -167,16 +167,16 @@ def law_block(law: TrackingLaw, sample_period: float) -> Block:
     )
     if not signals:
         return block
-    sigma, count = inputs.pop("integral"), len(signals)
-    hold = ca.SX.sym("hold", count)
+    sigma, hold = inputs.pop("integral"), ca.SX.sym("hold")
     rate = ca.if_else(hold != 0, 0, values["integral_rate"])
     block = replace(
         block,
         inputs={**inputs, "hold": hold},
         outputs={**shown, "integral": sigma},
-        defaults={"hold": ca.SX.zeros(count)},
+        defaults={"hold": ca.SX.zeros(1)},
     )
     if not sample_period:
         return replace(block, state=sigma, derivative=rate)
-    summed = Held(sigma, sigma + sample_period * rate, np.zeros(count), sample_period)
+    start = np.zeros(len(signals))
+    summed = Held(sigma, sigma + sample_period * rate, start, sample_period)
     return replace(block, held={"integral": summed})

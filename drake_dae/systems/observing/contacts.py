@@ -13,17 +13,13 @@ from drake_dae.dae.beyond.friction_share import Metric, shares
 from drake_dae.systems.observing.observing import Observing
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
-BREAK_RATE = 12.0
-"""The rate in 1/s at which a coefficient of friction rises until its contact breaks away."""
+BREAK_RATE = 12.0  # 1/s, at which a coefficient of friction rises until its contact breaks away
 
-STICKS = 0.5
-"""A contact sticks below this share of the wanted speed."""
+STICKS = 0.5  # A contact sticks below this share of the wanted speed,
 
-LEAST_SHARE = 0.06
-"""The least wanted speed for which this is tested, relative to `Observing.least_speed`."""
+LEAST_SHARE = 0.06  # which is tested from this share of `Observing.least_speed` on.
 
-EARLY = 2.0
-"""The number of samples that the first value of a coefficient counts for."""
+EARLY = 2.0  # the number of samples that the first value of a coefficient counts for
 
 CLEAR = 4.0
 """A displacement is no noise from this multiple of its standard deviation on: one angle that passes
@@ -33,8 +29,7 @@ _SHARP = 10.0
 """Friction of a contact that gives way is taken as that of a motion faster by this factor: it is
 fully developed from v_s / 10 on. An ideal contact has the friction of the model."""
 
-LITTLE = 1e-9
-"""The least normal force, in N, by which is divided."""
+LITTLE = 1e-9  # the least normal force, in N, by which is divided
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +84,7 @@ class Contacts:
 
     def _pressing(self, v: ca.SX) -> ca.SX:
         """The normal force of each contact."""
-        forces = [v[i] for i in self._observation.frictions.values()]
-        return ca.vertcat(ca.SX(0, 1), *forces)
+        return ca.vertcat(ca.SX(0, 1), *(v[i] for i in self._observation.frictions.values()))
 
     def terms(self, state: ca.SX, v: ca.SX, parameters: ca.SX) -> ContactTerms:
         """The directions of friction and constraints at a state."""
@@ -131,13 +125,7 @@ class Contacts:
         return friction(self.faster(state), v, parameters)[0]
 
     def early(
-        self,
-        slid: ca.SX,
-        contact: ContactTerms,
-        x: ca.SX,
-        v: ca.SX,
-        parameters: ca.SX,
-        d: ca.SX,
+        self, slid: ca.SX, contact: ContactTerms, x: ca.SX, v: ca.SX, parameters: ca.SX, d: ca.SX
     ) -> tuple[ca.SX, ca.SX]:
         """The change of friction at the first break-away, and the samples of sliding after it.
 
@@ -201,8 +189,7 @@ class Contacts:
         friction = self._observation.friction.function
         wanted, actual = (friction(each, v, parameters)[1] for each in (goal, now))
         towards, forces = (self.developed(each, v, parameters) for each in (goal, now))
-        pressing = self._pressing(v)
-        pressing = ca.fmax(ca.fabs(pressing), LITTLE)
+        pressing = ca.fmax(ca.fabs(self._pressing(v)), LITTLE)
         is_moved, sticks = wanted > self._least_speed, slid == 0
         ahead = -ca.mtimes(towards.T, error) > CLEAR * ca.sqrt(ca.sum1(towards**2 * squares).T)
         aside = [

@@ -9,12 +9,12 @@ from pydrake.systems.framework import Context
 
 from drake_dae.arguments import checked
 from drake_dae.arrays import FloatArray, numbers, positive
-from drake_dae.blocks.block import Block, Held
+from drake_dae.blocks.block import Block
 from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.dae import Signal, TrackingLaw
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.observing.sample import PARAMETER_PERIOD, EstimatorSample
+from drake_dae.systems.observing.sample import EstimatorSample
 from drake_dae.systems.parameterized import ParameterizedSystem
 
 
@@ -94,7 +94,7 @@ class StateEstimator(ParameterizedSystem):
             is_ideal,
         )
         self.observing, self.sample_period = observing, period
-        self.observation, self._place = sample.observation, sample.place("friction")
+        self.observation, self._place = sample.observation, sample.friction_place
         super().__init__(law.system, _block(law, sample, period), degrees=(), sees_steps=False)
 
     @property
@@ -139,12 +139,11 @@ def _each(name: str, given: ArrayLike, law: TrackingLaw) -> FloatArray:
 def _block(law: TrackingLaw, sample: EstimatorSample, period: float) -> Block:
     """The block of an estimator."""
     system, observation, names = law.system, sample.observation, list(sample.observation.frictions)
-    estimates = sample.sizes["state"] > 0
-    shown = sample.now if estimates else sample.memory
+    shown = sample.shown
     outputs = {
         "exogenous": sample.exogenous,
-        "disturbance": shown.disturbance,
-        "friction": shown.friction,
+        "disturbance": shown["disturbance"],
+        "friction": shown["friction"],
     }
     frictions = tuple(Signal(name) for name in names)
     signals: dict[str, Sequence[Signal]] = {
@@ -158,21 +157,16 @@ def _block(law: TrackingLaw, sample: EstimatorSample, period: float) -> Block:
         "friction": frictions,
         "parameters": system.parameter_signals,
     }
-    if estimates:
+    if shown["state"].numel():
         outputs = {"estimated_state": sample.state, **outputs}
     if not sample.measures:
         outputs["estimated_force"] = sample.force
         signals["estimated_force"] = system.constraint_input_signals
     identified = observation.identified.signals
     if identified:
-        outputs["identified"] = ca.vertcat(shown.theta, shown.friction)
-        outputs["identified_deviation"] = sample.filter.deviations
+        outputs["identified"] = ca.vertcat(shown["theta"], shown["friction"])
+        outputs["identified_deviation"] = sample.deviations
         signals |= dict.fromkeys(("identified", "identified_deviation"), (*identified, *frictions))
-    held = {"memory": Held(sample.memory.column, sample.now.column, sample.start, period)}
-    if identified:
-        own = sample.filter
-        slower = period * max(round(PARAMETER_PERIOD / period), 1)
-        held["parameters"] = Held(own.held, sample.filtered(), own.start, slower)
     rates = observation.moving.function(sample.state, system.parameter_symbol)[0]
     return Block(
         "state_estimator",
@@ -180,7 +174,7 @@ def _block(law: TrackingLaw, sample: EstimatorSample, period: float) -> Block:
         {**outputs, "hold": sample.hold},
         parameters=system.parameter_symbol,
         start={"parameters": system.parameter_values},
-        held=held,
+        held=sample.held,
         defaults={"hold": ca.SX.zeros(1), "reference": rates},
         signals=signals,
     )

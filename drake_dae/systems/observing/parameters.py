@@ -1,10 +1,12 @@
 """A Kalman filter of a model's parameters, from the disturbance that they leave."""
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.dae import IdentifiedTerms
+from drake_dae.dae import DaeSystem, IdentifiedTerms, Observation
 
 GAP = 1e-5
 """The standard deviation of a measured distance to a surface, in m."""
@@ -18,6 +20,9 @@ MEMORY = 100.0
 FADING = 10.0
 """The time in s in which what was measured of a place or a compliance fades. It covers the motion
 along a path and back; with 3 s and with 30 s the places of the tests are as good."""
+
+_DEVELOPED = 0.9
+"""A joint moves where its Coulomb friction has this share of its full size."""
 
 _SETTLING = 1.0
 """The time in s in which the size of what no parameter explains is averaged."""
@@ -178,6 +183,83 @@ class ParameterFilter:
         # A projection may take along another parameter beyond its bound, where the law needs it.
         inside = ca.fmin(ca.fmax(values[:num], self._low), self._high)
         return ca.vertcat(inside, values[num:])
+
+
+class Regressor:
+    """Y = -dr/dtheta at the filter's samples, which are slower than those of r.
+
+    By the derivatives of the momentum p, of its rate without inputs and of the part from the
+    inputs, d theta leaves over a sample T the disturbance
+
+        own = mean of (drift + inputs) - (p - p before) / T,
+
+    low-pass filtered as r is, along the free directions and along the constrained ones. Friction of
+    contacts has its own columns. That of joints turns within a sample: its mean is that of states
+    between both, `steps` of them. `jumps` are the changes of r, and of p and its rate if the state
+    `is_exact`, by the last change of theta.
+    """
+
+    def __init__(
+        self,
+        system: DaeSystem,
+        observation: Observation,
+        rates: Sequence[float],
+        period: float,
+        steps: int,
+        is_exact: bool,
+    ) -> None:
+        self._gains, self._period = [-np.expm1(-rate * period) for rate in rates], period
+        self._middles = ((np.arange(steps) + 0.5) / steps).tolist()
+        parameters, size = observation.identified.parameters, len(observation.rows)
+        names = [p.name for p in parameters for _ in range(p.value.size)]
+        dry = [p for p in parameters if p.name in system.dry]
+        self._dry = [i for i, name in enumerate(names) if name in system.dry]
+        symbols = ca.vertcat(ca.SX(0, 1), *(p.symbol for p in dry))
+        turning = ca.densify(ca.jacobian(system.f[list(observation.rows)], symbols))
+        self._turning = ca.Function("turning", [system.state, system.parameter_symbol], [turning])
+        self._value = ca.SX.sym("regressor", size, len(names) + len(observation.frictions))
+        self._slopes = [ca.SX.sym("slopes", size, len(names)) for _ in range(3)]
+        self._state = ca.SX.sym("state", system.num_states)
+        named = ("disturbance", "momentum", "drift") if is_exact else ("disturbance",)
+        self.jumps = {name: ca.SX.sym(f"jump of {name}", size) for name in named}
+        self.held = _column(self._state, self._value, *self._slopes, *self.jumps.values())
+
+    def after(
+        self,
+        state: ca.SX,
+        parameters: ca.SX,
+        slopes: Sequence[ca.SX],
+        slides: ca.SX,
+        free: ca.SX,
+        is_used: ca.SX,
+    ) -> ca.SX:
+        """Y after a sample, (k, c); the columns `slides` are of friction of contacts."""
+        (momentum, drift, inputs), (before, drifted, pushed) = slopes, self._slopes
+        mean = (drift + inputs + drifted + pushed) / 2.0
+        own = mean - (momentum - before) / self._period
+        total = ca.SX(momentum.shape[0], len(self._dry))
+        for share in self._middles if self._dry else ():
+            turning = self._turning(self._state + share * (state - self._state), parameters)
+            # A joint that rests may have any friction.
+            sizes = ca.vertcat(*(ca.mmax(ca.fabs(c)) for c in ca.horzsplit(turning)))
+            total += ca.mtimes(turning, ca.diag(sizes > _DEVELOPED))
+        own[:, self._dry] = total / len(self._middles)
+        signal = ca.horzcat(own, slides)
+        fast, slow = (gain * (signal - self._value) for gain in self._gains)
+        return self._value + is_used * (slow + ca.mtimes(free, fast - slow))
+
+    def held_after(
+        self, state: ca.SX, value: ca.SX, slopes: Sequence[ca.SX], change: ca.SX
+    ) -> ca.SX:
+        """What is held after a sample that changes theta."""
+        jumps = [-ca.mtimes(value, change)]
+        if len(self.jumps) > 1:
+            jumps += [ca.mtimes(slope, change[: slope.shape[1]]) for slope in slopes[:2]]
+        return _column(state, value, *slopes, *jumps)
+
+
+def _column(*parts: ca.SX) -> ca.SX:
+    return ca.vertcat(*map(ca.vec, parts))
 
 
 def _pushes(pair: ca.SX, block: ca.SX) -> ca.SX:

@@ -1,15 +1,12 @@
 """The equations of a `StateEstimator` at a sample, as expressions."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import accumulate
-from typing import Self
+from collections.abc import Iterable, Sequence
 
 import casadi as ca
 import numpy as np
 
 from drake_dae.arrays import FloatArray
-from drake_dae.blocks.block import TIME, where_finite
+from drake_dae.blocks.block import TIME, Held, stacked, where_finite
 from drake_dae.dae import Lags, Observation, TrackingLaw
 from drake_dae.dae.beyond.disturbance import DISTURBANCE, estimated_within
 from drake_dae.dae.beyond.filters import ChainFilter
@@ -17,88 +14,27 @@ from drake_dae.dae.beyond.friction_share import beside, shares
 from drake_dae.errors import ModelError
 from drake_dae.systems.observing.contacts import LITTLE, Contacts, ContactTerms
 from drake_dae.systems.observing.observing import Observing
-from drake_dae.systems.observing.parameters import ParameterFilter
+from drake_dae.systems.observing.parameters import ParameterFilter, Regressor
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 
-PARAMETER_PERIOD = 0.01
+_PARAMETER_PERIOD = 0.01
 """The time in s, in whole samples, between samples of the filter of parameters."""
-
-_DEVELOPED = 0.9
-"""A joint moves where its Coulomb friction has this share of its full size."""
 
 _SAME = 1e-9
 """Times that differ by less than this, in periods, count as equal."""
 
-
-@dataclass(frozen=True, eq=False)
-class Memory:
-    """What is held between samples, as columns that are stacked; some are empty.
-
-    Attributes:
-        sample: The index k of the sample t_k = k T; -1 before the first.
-        state: The estimated x, if it is estimated.
-        disturbance, rates, lags: r; r', ..., r^(n); the inputs of the lags before r.
-        friction: mu.
-        slid: The samples for which each contact has slid, while they are few.
-        force: The constraint force of the model, if none is measured.
-        momentum, drift: p and its rate without inputs, if the state is exact.
-        control, measured_force: u and v of the sample before.
-        theta, regressor: The parameters, and Y of the `ParameterFilter`, shape (k c,).
-        momentum_slopes, drift_slopes: The derivatives of p and its rate with respect to theta.
-        rests: Whether a contact sticks.
-    """
-
-    sample: ca.SX
-    state: ca.SX
-    disturbance: ca.SX
-    rates: ca.SX
-    lags: ca.SX
-    friction: ca.SX
-    slid: ca.SX
-    force: ca.SX
-    momentum: ca.SX
-    drift: ca.SX
-    control: ca.SX
-    measured_force: ca.SX
-    theta: ca.SX
-    regressor: ca.SX
-    momentum_slopes: ca.SX
-    drift_slopes: ca.SX
-    rests: ca.SX
-
-    @classmethod
-    def of(cls, column: ca.SX, sizes: dict[str, int]) -> Self:
-        ends = [0, *accumulate(sizes[name] for name in cls.__dataclass_fields__)]
-        return cls(*ca.vertsplit(column, ends))
-
-    @property
-    def column(self) -> ca.SX:
-        return ca.vertcat(*vars(self).values())
-
-
-def disturbance_degree(law: TrackingLaw) -> int:
-    """The number of derivatives of the disturbance that a law needs."""
-    degrees = iter(law.exogenous_degrees)
-    own = {
-        p.name: [next(degrees) for _ in range(p.value.size)] for p in law.system.exogenous.moving
-    }
-    return max(own[DISTURBANCE])
+Memory = dict[str, ca.SX]
+"""What is held between samples, as columns by name, some of them empty."""
 
 
 class EstimatorSample:
     """The estimate at a sample.
 
-    Attributes:
-        observation: The observed functions.
-        inputs: The symbols of the input ports.
-        filter: The filter of parameters.
-        memory, sizes: What was held before, as symbols, and the sizes of its parts.
-        start: Its initial value.
-        now: What is held from this sample on. If the state is estimated, it is the same until the
-            next one, so that outputs may depend on it.
-        state, force: The state and the constraint force that the law takes.
-        exogenous: The disturbance to compensate, mu and parameters, with derivatives.
-        hold: 1 if integrals are not updated, otherwise 0.
+    Held are the index k of the `sample` t_k = k T, -1 before the first; the estimated `state`; the
+    `disturbance` r, its `rates` r', ..., r^(n), and the inputs of the `lags` before r; `friction`
+    mu; the samples for which each contact has `slid`, while they are few; the `force` of the model,
+    if none is measured; `momentum` p and `drift`, its rate without inputs, if the state is exact;
+    `control` and `measured_force` of the sample before; and the parameters `theta`.
     """
 
     def __init__(
@@ -115,122 +51,107 @@ class EstimatorSample:
         self.observation = observation = Observation.of(law.structure, law.layout)
         self._law, self._system, self._observing, self._period = law, law.system, observing, period
         self._lag, self._step = lag, step
-        estimates = observing.state_rate is not None
         system, k, c = law.system, len(observation.rows), len(observation.frictions)
-        degree, n = disturbance_degree(law), system.num_states
-        if estimates:
-            _check_rigid(law, observation.rows)
-            self._gains = _gains(observing, period, *deviations)
-        rates = observing.rate, observing.force_rate or observing.rate
-        self._lags = [Lags.of(rate, period, degree) for rate in rates]
-        self._breaks_away = bool(c) and observation.wanted is not None and not degree
+        estimates, degree = observing.state_rate is not None, disturbance_degree(law)
         self.measures = (
             not estimates or law.measured_force is not None or not system.num_constraints
         )
-        identified = observation.identified
-        entries = (system.parameter_slice(p.name) for p in identified.parameters)
-        self._places = [i for part in entries for i in range(part.start, part.stop)]
+        rates = observing.rate, observing.force_rate or observing.rate
+        if observing.state_rate is not None:
+            _check_rigid(law, observation.rows)
+            self._gains = _gains(observing.state_rate, rates, period, *deviations)
+        self._lags = [Lags.of(rate, period, degree) for rate in rates]
+        self._breaks_away = bool(c) and observation.wanted is not None and not degree
+        identified, theta = observation.identified, observation.identified.parameters
+        places = np.arange(system.parameter_values.size)
+        self._places = [i for p in theta for i in places[system.parameter_slice(p.name)].tolist()]
         if self._places and degree:
             raise ModelError(
                 f"{system.name}: parameters are estimated for rigid joints; behind springs "
                 "and motors only coefficients of friction are"
             )
-        known, values = len(self._places), system.parameter_values
-        self._ratio = max(round(PARAMETER_PERIOD / period), 1)
-        self.filter = ParameterFilter(
-            identified,
-            estimated_within(identified.parameters, observing.ranges),
-            c,
-            observing.largest_friction,
-            rates[0],
-            self._ratio * period,
-        )
-        exact = 0 if estimates else k
-        self.sizes = {
-            "sample": 1,
-            "state": n if estimates else 0,
-            "disturbance": k,
-            "rates": degree * k,
-            "lags": degree * k,
-            "friction": c,
-            "slid": c,
-            "force": 0 if self.measures else system.num_constraints,
-            "momentum": exact,
-            "drift": exact,
-            "control": system.num_controls,
-            "measured_force": system.num_constraints if estimates and self.measures else 0,
-            "theta": known,
-            "regressor": k * (known + c) if known else 0,
-            "momentum_slopes": k * known,
-            "drift_slopes": k * known,
-            "rests": 1 if known else 0,
-        }
         ports = {
-            "measured_state": n,
+            "measured_state": system.num_states,
             "control": system.num_controls,
             "hold": 1,
             "reference": law.layout.reference_size,
-            "measured_force": system.num_constraints if self.measures else 0,
         }
+        if self.measures:
+            ports["measured_force"] = system.num_constraints
         self.inputs = {name: ca.SX.sym(name, size) for name, size in ports.items()}
-        if not self.measures:
-            del self.inputs["measured_force"]
+        self._measured, self._control = self.inputs["measured_state"], self.inputs["control"]
+        self._measured_force = self.inputs.get("measured_force", ca.SX(0, 1))
+        signals = self.inputs["reference"], self.inputs["hold"]
+        is_ideal = is_ideal and not estimates
         self._contacts = Contacts(
-            observation,
-            observing,
-            period,
-            delay,
-            is_ideal and not estimates,
-            deviations[0],
-            self.inputs["reference"],
-            self.inputs["hold"],
+            observation, observing, period, delay, is_ideal, deviations[0], *signals
         )
-        self.memory = Memory.of(ca.SX.sym("held", sum(self.sizes.values())), self.sizes)
+
+        values = system.parameter_values
+        frictions = [values[system.parameter_slice(name)][0] for name in observation.frictions]
+        exact = [0.0] * (0 if estimates else k)
+        start = {
+            "sample": [-1.0],
+            "state": [0.0] * (system.num_states if estimates else 0),
+            "disturbance": [0.0] * k,
+            "rates": [0.0] * (degree * k),
+            "lags": [0.0] * (degree * k),
+            "friction": frictions,
+            "slid": [0.0] * c,
+            "force": [0.0] * (0 if self.measures else system.num_constraints),
+            "momentum": exact,
+            "drift": exact,
+            "control": [0.0] * system.num_controls,
+            "measured_force": [0.0] * (self._measured_force.numel() if estimates else 0),
+            "theta": values[self._places].tolist(),
+        }
+        self._memory = {name: ca.SX.sym(name, len(value)) for name, value in start.items()}
+        slower = max(round(_PARAMETER_PERIOD / period), 1) * period
+        within, most = estimated_within(theta, observing.ranges), observing.largest_friction
+        self._filter = ParameterFilter(identified, within, c, most, rates[0], slower)
+        self._ratio = round(slower / period)
+        self._regressor = Regressor(system, observation, rates, slower, self._ratio, not estimates)
         self._before = self._adopted()
-        self.start = np.zeros(sum(self.sizes.values()))
-        self.start[0] = -1.0
-        for name, value in zip(observation.frictions, range(c), strict=True):
-            self.start[self.place("friction")][value] = values[system.parameter_slice(name)][0]
-        self.start[self.place("theta")] = values[self._places]
 
         sample = ca.floor(TIME / period + _SAME)
         after = self._estimated() if estimates else self._observed(sample)
         # What blocks share is found again later; once here saves a fifth of the operations.
-        after = Memory.of(ca.cse(after.column), self.sizes)
-        if estimates:
+        column, memory = ca.cse(stacked([*after.values()])), stacked([*self._memory.values()])
+        self.shown, self.state = self._memory, self._measured
+        if estimates:  # Outputs depend on this sample.
             # The state before the first sample is zero, where a contact may have no direction.
-            given = {"state": self._measured, "control": self.inputs["control"]}
+            given = {"state": self._measured, "control": self._control}
             given |= {"measured_force": self._measured_force} if self.measures else {}
-            first = Memory(**{**vars(self.memory), **given})
-            begun = ca.if_else(self.memory.sample >= 0, after.column, first.column)
+            first, is_old = self._memory | given, self._memory["sample"] >= 0
+            begun = ca.if_else(is_old, column, stacked([*first.values()]))
             fresh = ca.vertcat(sample, begun[1:])
-            column = ca.if_else(ca.eq(self.memory.sample, sample), self.memory.column, fresh)
-            self.now = Memory.of(column, self.sizes)
-            self.state, known_now = self.now.state, self.now
-        else:
-            self.now, self.state, known_now = after, self._measured, self.memory
-        self.force = self._measured_force if self.measures else known_now.force
-        self.exogenous = self._compensated(self.state, self.force, known_now)
+            column = ca.if_else(ca.eq(self._memory["sample"], sample), memory, fresh)
+            ends = np.cumsum([0, *(value.numel() for value in after.values())])
+            self.shown = dict(zip(after, ca.vertsplit(column, ends.tolist()), strict=True))
+            self.state = self.shown["state"]
+        self.held = {"memory": Held(memory, column, np.concatenate([*start.values()]), period)}
+        if self._places:
+            parts = ca.vertcat(self._filter.held, self._regressor.held)
+            begin = np.zeros(parts.numel())
+            begin[: self._filter.start.size] = self._filter.start
+            self.held["parameters"] = Held(parts, self._filtered(), begin, slower)
+        self.deviations = self._filter.deviations
+        self.force = self._measured_force if self.measures else self.shown["force"]
+        self.exogenous = self._compensated(self.state, self.force)
         lost = self._contacts.is_lost(self.force)
         self.hold = ca.fmax(self.inputs["hold"] != 0, ca.mmax(lost) if c else 0)
 
-    def place(self, name: str) -> slice:
-        """The place of a part of the memory."""
-        end = sum(list(self.sizes.values())[: list(self.sizes).index(name) + 1])
-        return slice(end - self.sizes[name], end)
-
     @property
-    def _measured(self) -> ca.SX:
-        return self.inputs["measured_state"]
-
-    @property
-    def _measured_force(self) -> ca.SX:
-        return self.inputs["measured_force"]
+    def friction_place(self) -> slice:
+        """Where the coefficients of friction are in what is held by samples."""
+        sizes = [value.numel() for value in self._memory.values()]
+        begin = sum(sizes[: list(self._memory).index("friction")])
+        return slice(begin, begin + len(self.observation.frictions))
 
     def _parameters(self, friction: ca.SX | None = None, theta: ca.SX | None = None) -> ca.SX:
         """The model's parameters with estimates, and with given or no friction."""
         parameters = ca.SX(self._system.parameter_symbol)
-        parameters[self._places] = self._before.theta if theta is None else theta
+        parameters[self._places] = self._before["theta"] if theta is None else theta
         for j, name in enumerate(self.observation.frictions):
             value = 0 if friction is None else friction[j]
             parameters[self._system.parameter_slice(name)] = value
@@ -240,25 +161,23 @@ class EstimatorSample:
 
     def _observed(self, sample: ca.SX) -> Memory:
         """What is held after a sample of the exact state."""
-        memory, x, v, u = self._before, self._measured, self._measured_force, self.inputs["control"]
-        mu, has_sample = memory.friction, memory.sample >= 0
+        old, x, v, u = self._before, self._measured, self._measured_force, self._control
+        mu, slid, acted = old["friction"], old["slid"], self._acted()
         parameters = self._parameters()
-        late = self._lag * has_sample
-        acted = late * memory.control + (1.0 - late) * u
         momentum = self.observation.momentum.function(x, acted, v, parameters)
         contact = self._contacts.terms(x, v, parameters)
         p, drift, inputs = momentum[:3]
-        d = (p - memory.momentum) / self._period - (memory.drift + drift) / 2.0 - inputs
+        d = (p - old["momentum"]) / self._period - (old["drift"] + drift) / 2.0 - inputs
         d -= ca.mtimes(contact.friction, mu)
 
         # Each lag is a column.
         size = len(self.observation.rows)
-        chain = ca.horzcat(ca.reshape(memory.lags, size, -1), memory.disturbance)
+        chain = ca.horzcat(ca.reshape(old["lags"], size, -1), old["disturbance"])
         chain = self._passed(contact, chain, d)
         chain, change = self._shared(chain, contact)
-        early, slid = 0 * mu, memory.slid
         if self._breaks_away:  # Springs answer jumps by swings.
             early, slid = self._contacts.early(slid, contact, x, v, parameters, d)
+            change += early
         moves, (fast, slow) = ca.mtimes(contact.free, chain), self._lags
         rates = fast.derivatives(moves) + slow.derivatives(chain - moves)
         valid = momentum[-1] + contact.valid
@@ -267,15 +186,18 @@ class EstimatorSample:
             "disturbance": chain[:, -1],
             "rates": ca.vec(rates),
             "lags": ca.vec(chain[:, :-1]),
-            "friction": self._bounded(mu + change + early),
+            "friction": self._bounded(mu + change),
             "slid": slid,
             "momentum": p,
             "drift": drift,
             "control": u,
-            **self._regressed(x, v, acted, contact, parameters),
         }
-        after = {name: where_finite(value, valid) for name, value in after.items()}
-        return Memory(**{**vars(memory), **after})
+        return old | {name: where_finite(value, valid) for name, value in after.items()}
+
+    def _acted(self) -> ca.SX:
+        """The control that has acted since the last sample."""
+        is_late = self._lag * (self._before["sample"] >= 0)
+        return is_late * self._before["control"] + (1.0 - is_late) * self._control
 
     def _passed(self, contact: ContactTerms, chain: ca.SX, signal: ca.SX) -> ca.SX:
         """The lags of a signal after a sample; what a sticking contact may hide does not enter."""
@@ -283,7 +205,7 @@ class EstimatorSample:
             beside(
                 contact.held,
                 contact.metric,
-                (self.memory.sample >= 0) * (lags.after(chain, signal) - chain),
+                (self._before["sample"] >= 0) * (lags.after(chain, signal) - chain),
             )
             for lags in self._lags
         )
@@ -297,7 +219,7 @@ class EstimatorSample:
 
         With parameters friction is one of them.
         """
-        mu = self._before.friction
+        mu = self._before["friction"]
         if self._places:
             return chain, 0 * mu
         gain = -np.expm1(-self._observing.friction_rate * self._period)
@@ -311,100 +233,64 @@ class EstimatorSample:
 
     def _adopted(self) -> Memory:
         """What was held, with the last change of the parameters, whose filter is slower."""
-        memory, known, size = self.memory, len(self._places), len(self.observation.rows)
+        memory, known = self._memory, len(self._places)
         if not known:
             return memory
-        rest = memory.sample / self._ratio  # Whole exactly after a sample of the filter.
-        is_new = ca.eq(rest, ca.floor(rest))
-        change = ca.if_else(is_new, self.filter.change, 0)
-        moves = {
-            "disturbance": -ca.mtimes(ca.reshape(memory.regressor, size, -1), change),
-            "friction": change[known:],
-            "theta": change[:known],
-        }
-        if memory.momentum.numel():
-            for name in ("momentum", "drift"):
-                slopes = ca.reshape(vars(memory)[f"{name}_slopes"], size, -1)
-                moves[name] = ca.mtimes(slopes, change[:known])
-        moved = {name: vars(memory)[name] + move for name, move in moves.items()}
-        return Memory(**{**vars(memory), **moved})
-
-    def _regressed(
-        self, x: ca.SX, v: ca.SX, acted: ca.SX, contact: ContactTerms, parameters: ca.SX
-    ) -> dict[str, ca.SX]:
-        """Y after a sample, low-pass filtered as r is, and what it is made of."""
-        memory, size, known = self.memory, len(self.observation.rows), len(self._places)
-        if not known:
-            return {}
-        slopes = self.observation.identified.slopes.function(x, acted, v, parameters)
-        momentum, drift, inputs = slopes[:3]
-        before, drifted = (
-            ca.reshape(each, size, -1) for each in (memory.momentum_slopes, memory.drift_slopes)
-        )
-        own = (drift + drifted) / 2.0 + inputs - (momentum - before) / self._period
-        for place in self._dry_places():  # A joint that rests may have any friction.
-            own[:, place] *= ca.mmax(ca.fabs(drift[:, place])) > _DEVELOPED
-        sliding = ca.mtimes(contact.friction, ca.diag(contact.slides))
-        signal, old = ca.horzcat(own, sliding), ca.reshape(memory.regressor, size, -1)
-        fast, slow = (float(lags.gain[0]) * (signal - old) for lags in self._lags)
-        step = slow + ca.mtimes(contact.free, fast - slow)
-        rests = ca.mmax(contact.sticks) if contact.sticks.numel() else ca.SX(0)
-        is_used = ca.logic_and(memory.sample >= 0, ca.logic_not(rests))
-        return {
-            "regressor": ca.vec(ca.if_else(is_used, old + step, old)),
-            "momentum_slopes": ca.vec(momentum),
-            "drift_slopes": ca.vec(drift),
-            "rests": rests,
+        rest = memory["sample"] / self._ratio
+        is_new = ca.eq(rest, ca.floor(rest))  # Whole exactly after a sample of the filter.
+        change = self._filter.change
+        moves = {"theta": change[:known], "friction": change[known:], **self._regressor.jumps}
+        return memory | {
+            name: memory[name] + ca.if_else(is_new, move, 0) for name, move in moves.items()
         }
 
-    def _dry_places(self) -> list[int]:
-        """The indices in theta of Coulomb friction in joints."""
-        names = [
-            p.name for p in self.observation.identified.parameters for _ in range(p.value.size)
-        ]
-        return [i for i, name in enumerate(names) if name in self._system.dry]
-
-    def filtered(self) -> ca.SX:
-        """What the filter of parameters holds after a sample of its own."""
-        memory, identified = self.memory, self.observation.identified
-        estimates = memory.state.numel() > 0
-        x = memory.state if estimates else self._measured
-        v = self._measured_force
-        if estimates:
-            v = memory.measured_force if self.measures else memory.force
-        rows, k = list(self.observation.rows), len(self.observation.rows)
+    def _filtered(self) -> ca.SX:
+        """What the filter of parameters holds after a sample of its own, and its regressor."""
+        old, system, rows = self._before, self._system, list(self.observation.rows)
+        identified, begun = self.observation.identified, old["sample"] >= 0
+        x, v, u = self._measured, self._measured_force, self._acted()
+        if old["state"].numel():
+            x, u = ca.if_else(begun, old["state"], x), old["control"]
+            v = old["measured_force"] if self.measures else old["force"]
         parameters = self._parameters()
-        mass = self._system.mass_matrix[rows, rows]
-        before, after = [self._system.state, self._system.parameter_symbol], [x, parameters]
-        gaps = identified.slopes.function(x, memory.control, v, parameters)[3:6]
+        contact = self._contacts.terms(x, v, parameters)
+        values = identified.slopes.function(x, u, v, parameters)
+        rests = ca.mmax(contact.sticks) if contact.sticks.numel() else ca.SX(0)
+        slides = ca.mtimes(contact.friction, ca.diag(contact.slides))
+        is_used = ca.logic_and(begun, ca.logic_not(rests))
+        Y = self._regressor.after(x, parameters, values[:3], slides, contact.free, is_used)
+        mass = ca.Function("M", [system.state, system.parameter_symbol], [system.mass_matrix])
         forces = v[list(identified.pressed), :]
-        excused = ca.logic_or(self.inputs["hold"] != 0, memory.rests)
-        return self.filter.after(
-            ca.vertcat(memory.theta, memory.friction),
-            memory.disturbance,
-            ca.reshape(memory.regressor, k, -1),
-            ca.diag(ca.substitute([mass], before, after)[0]),
-            gaps,
+        excused = ca.logic_or(self.inputs["hold"] != 0, rests)
+        filtered = self._filter.after(
+            ca.vertcat(old["theta"], old["friction"]),
+            old["disturbance"],
+            Y,
+            ca.diag(mass(x, parameters)[rows, rows]),
+            values[3:6],
             forces,
             forces >= self._observing.least_force,
-            ca.logic_and(memory.sample >= 0, ca.logic_not(excused)),
+            ca.logic_and(begun, ca.logic_not(excused)),
         )
+        held = self._regressor.held_after(x, Y, values[:3], filtered[: Y.shape[1]])
+        return where_finite(ca.vertcat(filtered, held), contact.valid)
 
     # The state from encoders.
 
     def _estimated(self) -> Memory:
         """What is held after a sample of measured positions."""
         system, old, period, measured = self._system, self._before, self._period, self._measured
-        u, count = self.inputs["control"], len(self.observation.rows)
-        acted = self._lag * old.control + (1.0 - self._lag) * u
+        u, count = self._control, len(self.observation.rows)
+        acted = self._acted()
 
         # Prediction over a sample, from the middle of it; a discrete plant steps from its start.
-        q, qd, r, mu = old.state[:count], old.state[count:], old.disturbance, old.friction
+        q, qd = old["state"][:count], old["state"][count:]
+        r, mu, slid = old["disturbance"], old["friction"], old["slid"]
         middle = ca.vertcat(q + (period - self._step) / 2.0 * qd, qd)
         parameters = self._parameters()
         if self.measures:  # A discrete plant's force is that of its step.
             v, share = self._measured_force, (1.0 + self._step / period) / 2.0
-            force = share * v + (1.0 - share) * old.measured_force
+            force = share * v + (1.0 - share) * old["measured_force"]
         else:
             force = v = self._model_force(middle, r, mu, acted)
         contact = self._contacts.terms(middle, v, parameters)
@@ -421,10 +307,16 @@ class EstimatorSample:
         # force of the model that to the friction of a contact that slides.
         through = ca.SX.eye(count) if self.measures else contact.free
         moved = qd + period * stepping.solve(push - ca.mtimes(through, friction_force))
-        moved += self._rubbed(q, moved, v, stepping, through, parameters)
+        # Friction acts against the velocity that there would be without it, which it at most stops.
+        # Otherwise it would turn a light tool about from sample to sample.
+        forces = self._contacts.developed(ca.vertcat(q, moved), v, parameters)
+        made = period * stepping.solve(ca.mtimes(through, forces))
+        stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, LITTLE)
+        # The noise of a force sensor may be less than zero.
+        moved += ca.mtimes(made, ca.fmin(mu, ca.fmax(stopping, 0.0)))
         unused = ca.logic_or(self._contacts.is_lost(v), self.inputs["hold"] != 0)
         if self._breaks_away:  # What has not slid yet sticks, with any friction that this needs.
-            sticks = ca.logic_not(ca.logic_or(unused, old.slid > 0))
+            sticks = ca.logic_not(ca.logic_or(unused, slid > 0))
             stuck = self._contacts.side_by_side(contact.planes, sticks)
             metric = factors.solve if self.measures else contact.metric
             momentum = ca.mtimes(mass, moved)
@@ -449,20 +341,11 @@ class EstimatorSample:
         # Friction and parameters take their share of the disturbance.
         state = ca.vertcat(new_q, new_v)
         new_r, change = self._shared(new_r, contact)
-        slid = old.slid
         if self._breaks_away:
+            pushed_by = ca.mtimes(mass, errors[0]), errors[0], factors
+            usual = [float(gain[0, 0]) for gain in self._gains[0][:2]]
             early, slid, jumps, is_early = self._contacts.slipped(
-                old.slid,
-                contact,
-                middle,
-                new_v,
-                v,
-                parameters,
-                ca.mtimes(mass, errors[0]),
-                errors[0],
-                factors,
-                unused,
-                [float(gain[0, 0]) for gain in self._gains[0][:2]],
+                slid, contact, middle, new_v, v, parameters, *pushed_by, unused, usual
             )
             forces = self._contacts.developed(ca.vertcat(q, new_v), v, parameters)
             terms = forces, contact.planes, new_v, contact.metric
@@ -471,40 +354,12 @@ class EstimatorSample:
             change += early
             state += jumps
         mu = self._bounded(mu + change)
-        after = {
-            "state": state,
-            "disturbance": new_r,
-            "friction": mu,
-            "slid": slid,
-            "control": u,
-            **self._regressed(state, v, acted, contact, parameters),
-        }
+        after = {"state": state, "disturbance": new_r, "friction": mu, "slid": slid, "control": u}
         if self.measures:
             after["measured_force"] = v
         else:
             after["force"] = self._model_force(state, new_r, mu, acted)
-        after = {name: where_finite(value, contact.valid) for name, value in after.items()}
-        return Memory(**{**vars(old), **after})
-
-    def _rubbed(
-        self,
-        q: ca.SX,
-        moved: ca.SX,
-        v: ca.SX,
-        mass: PositiveDefiniteFactorization,
-        through: ca.SX,
-        parameters: ca.SX,
-    ) -> ca.SX:
-        """The change of velocities by friction over a sample.
-
-        It is implicit: against the velocity that there would be without it, which it at most stops.
-        Otherwise it would turn a light tool about from sample to sample.
-        """
-        forces = self._contacts.developed(ca.vertcat(q, moved), v, parameters)
-        made = self._period * mass.solve(ca.mtimes(through, forces))
-        stopping = -ca.mtimes(forces.T, moved) / ca.fmax(ca.sum1(forces * made).T, LITTLE)
-        # The noise of a force sensor may be less than zero.
-        return ca.mtimes(made, ca.fmin(self._before.friction, ca.fmax(stopping, 0.0)))
+        return old | {name: where_finite(value, contact.valid) for name, value in after.items()}
 
     def _model_force(self, state: ca.SX, r: ca.SX, mu: ca.SX, control: ca.SX) -> ca.SX:
         """v = alpha(x) + beta(x) u (25) with the observed disturbance and friction."""
@@ -521,69 +376,68 @@ class EstimatorSample:
         system, rows = self._system, list(self.observation.rows)
         u, v = (ca.SX.sym("u", n) for n in (system.num_controls, system.num_constraints))
         push = system.f + ca.mtimes(system.g, v) + ca.mtimes(system.h, u)
-        dry = self._made_by(system.dry, system.state, system.parameter_symbol)
-        speed = system.state[rows]
+        speed, force, dry = system.state[rows], system.f[rows], self._proportional_to(system.dry)
         smooth, turning = (
-            [-ca.jacobian(force[i], speed[i]) for i in range(len(rows))]
-            for force in (system.f[rows] - dry, dry)
+            ca.vertcat(*(-ca.jacobian(part[i], speed[i]) for i in range(len(rows))))
+            for part in (force - dry, dry)
         )
-        damping = ca.substitute(ca.vertcat(*smooth), speed, 0 * speed)  # Without Coriolis forces.
-        damping += ca.vertcat(*turning)
+        damping = ca.substitute(smooth, speed, 0 * speed) + turning  # Without Coriolis forces.
         inputs = [system.state, u, v, system.parameter_symbol]
         outputs = [system.mass_matrix[rows, rows], push[rows], ca.sparsify(ca.simplify(damping))]
         return ca.Function("balance", inputs, outputs)
 
+    def _proportional_to(self, names: Iterable[str]) -> ca.SX:
+        """The part of the generalized force that is proportional to parameters, shape (k, 1)."""
+        system, rows = self._system, list(self.observation.rows)
+        symbols = [p.symbol for p in system.parameters if p.name in names]
+        if not symbols:
+            return ca.SX(len(rows), 1)
+        return ca.jtimes(system.f[rows], ca.vertcat(*symbols), ca.vertcat(*symbols))
+
     # What the law takes.
 
-    def _compensated(self, x: ca.SX, v: ca.SX, known: Memory) -> ca.SX:
-        """The signals for the law: disturbance, coefficients of friction and their derivatives."""
-        observation, mu = self.observation, known.friction
-        parameters, r, valid = self._parameters(mu, known.theta), known.disturbance, ca.SX(0)
-        if mu.numel() or self._system.dry:
+    def _compensated(self, x: ca.SX, v: ca.SX) -> ca.SX:
+        """The signals for the law: disturbance, coefficients of friction and their derivatives.
+
+        Friction of contacts is that of the wanted motion, and so are Coulomb and estimated viscous
+        friction of joints: a law that compensated too much of them at the actual velocities would
+        be unstable.
+        """
+        observation, system, mu = self.observation, self._system, self.shown["friction"]
+        parameters, valid = self._parameters(mu, self.shown["theta"]), ca.SX(0)
+        r, rates = self.shown["disturbance"], self.shown["rates"]
+        if mu.numel() or system.dry:
             goal = x
             if observation.wanted is not None:
                 goal, valid = self._contacts.goal(x, parameters)
-            friction, goal_friction = (
-                observation.friction.function(state, v, parameters)[0]
-                for state in (x, self._contacts.faster(goal))
+            estimated = {p.name for p in observation.identified.parameters}
+            viscous = {f"{name.rpartition('.')[0]}.viscous" for name in system.dry}
+            rubbing = self._proportional_to({*system.dry, *(viscous & estimated)})
+            joints = ca.Function("rubbing", [system.state, system.parameter_symbol], [rubbing])
+            contact = observation.friction.function
+            now, wanted = (
+                ca.mtimes(contact(faster, v, parameters)[0], mu) + joints(state, parameters)
+                for state, faster in ((x, x), (goal, self._contacts.faster(goal)))
             )
-            r = r + ca.mtimes(goal_friction - friction, mu)
-            r = r + self._rubbing(goal, parameters) - self._rubbing(x, parameters)
-        size, rates = r.numel(), known.rates
-        rows = {DISTURBANCE: [[r[i], *rates[i::size].elements()] for i in range(size)]}
-        for name, value in zip(observation.frictions, mu.elements(), strict=True):
-            rows[name] = [[value]]
-        values = iter(known.theta.elements())
-        for p in observation.identified.parameters:
-            rows[p.name] = [[next(values)] for _ in range(p.value.size)]
-        stacked, degrees = list[ca.SX](), iter(self._law.exogenous_degrees)
-        for p in self._system.exogenous.moving:
-            for row in rows[p.name]:
+            r = r + wanted - now
+        parameters[system.parameter_slice(DISTURBANCE)] = r
+        stacked_signals, degrees = list[ca.SX](), iter(self._law.exogenous_degrees)
+        for p in system.exogenous.moving:
+            for i, value in enumerate(parameters[system.parameter_slice(p.name)].elements()):
                 degree = next(degrees)
-                stacked += [*row, *[ca.SX(0.0)] * degree][: 1 + degree]  # Others are constant.
-        return where_finite(ca.vertcat(*stacked), valid)
+                own = rates[i :: r.numel()] if p.name == DISTURBANCE else ca.SX(0, 1)
+                others = ca.vertcat(own, ca.SX.zeros(degree))[:degree]  # Others are constant.
+                stacked_signals += [value, others]
+        return where_finite(stacked(stacked_signals), valid)
 
-    def _rubbing(self, state: ca.SX, parameters: ca.SX) -> ca.SX:
-        """The generalized force of Coulomb and of estimated viscous friction in joints.
 
-        A law that compensated too much of them at the actual velocities would be unstable.
-        """
-        estimated = {p.name for p in self.observation.identified.parameters}
-        viscous = (f"{name.rpartition('.')[0]}.viscous" for name in self._system.dry)
-        names = (*self._system.dry, *(name for name in viscous if name in estimated))
-        return self._made_by(names, state, parameters)
-
-    def _made_by(self, names: Sequence[str], state: ca.SX, parameters: ca.SX) -> ca.SX:
-        """The part of the generalized force that is zero without these parameters, shape (k, 1)."""
-        rows = list(self.observation.rows)
-        if not names:
-            return ca.SX(len(rows), 1)
-        without = ca.SX(parameters)
-        for name in names:
-            without[self._system.parameter_slice(name)] = 0.0
-        symbols = [self._system.state, self._system.parameter_symbol]
-        f = ca.Function("f", symbols, [self._system.f[rows]])
-        return f(state, parameters) - f(state, without)
+def disturbance_degree(law: TrackingLaw) -> int:
+    """The number of derivatives of the disturbance that a law needs."""
+    degrees = iter(law.exogenous_degrees)
+    own = {
+        p.name: [next(degrees) for _ in range(p.value.size)] for p in law.system.exogenous.moving
+    }
+    return max(own[DISTURBANCE])
 
 
 def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:
@@ -595,8 +449,7 @@ def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:
             "positions and velocities; behind springs, motors or valves measure the velocities, "
             "or let the encoders form differences by a velocity_bandwidth"
         )
-    slope = system.f[:count] - system.state[count:]
-    if not ca.simplify(slope).is_zero():
+    if not ca.simplify(system.f[:count] - system.state[count:]).is_zero():
         raise ModelError(
             f"{system.name}: a state_rate needs q' = v, and this robot has a body with "
             "q' = N(q) v; measure its velocities"
@@ -604,14 +457,13 @@ def _check_rigid(law: TrackingLaw, rows: tuple[int, ...]) -> None:
 
 
 def _gains(
-    observing: Observing, period: float, position: FloatArray, velocity: FloatArray
+    state_rate: float, rates: Sequence[float], period: float, *deviations: FloatArray
 ) -> list[list[ca.DM]]:
-    """Along the free and the constrained directions: the gains of q, v and a, shape (k, 2) each."""
-    assert observing.state_rate is not None
-    found = np.zeros((2, 3, position.size, 2))
-    for which, rate in enumerate((observing.rate, observing.force_rate or observing.rate)):
-        for i, (q, v) in enumerate(zip(position, velocity, strict=True)):
+    """For each rate of disturbances the gains of q, v and a, shape (k, 2) each."""
+    found = np.zeros((len(rates), 3, deviations[0].size, 2))
+    for which, rate in enumerate(rates):
+        for i, (q, v) in enumerate(zip(*deviations, strict=True)):
             ratio = v / q if v > 0.0 and q > 0.0 else None
-            own = ChainFilter.of(observing.state_rate, rate, period, ratio).gain
+            own = ChainFilter.of(state_rate, rate, period, ratio).gain
             found[which, :, i, : own.shape[1]] = own
     return [[ca.DM(each) for each in gains] for gains in found]

@@ -13,8 +13,7 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.errors import ModelError
 
-_SAME = 1e-9
-"""Times that differ by less than this, in periods, count as equal."""
+_SAME = 1e-9  # Times that differ by less than this, in periods, count as equal.
 
 
 @checked(ModelError)

@@ -35,18 +35,15 @@ BEGUN, SUCCESS, LATE, LOST, GUARD = range(5)
 """Why a phase began: the task begins, or the phase before has ended by this; by its guard i with
 GUARD + i."""
 
-GOING, ALL_DONE, RESTING, GIVEN_UP = range(4)
-"""The endings of a task."""
+GOING, ALL_DONE, RESTING, GIVEN_UP = range(4)  # the endings of a task
 
-SMOOTH = 2
-"""The least number of continuous derivatives of a fade, even if a law needs fewer."""
+SMOOTH = 2  # the least number of continuous derivatives of a fade, even if a law needs fewer
 
 LET_GO = 1e-3
 """A contact ceases to be felt this share below `contact_force`, so that a force that stays there,
 apart from round-off, does not begin and cease to be felt all the time."""
 
-EARLY = 2e-12
-"""A margin below this has ended, so that margins with different round-off end together."""
+EARLY = 2e-12  # A margin below this has ended, so that those with other round-off end together.
 
 
 @cache
@@ -279,7 +276,7 @@ class Automaton:
         lost = ca.if_else(can_lose, task.patience - (TIME - felt), 1.0)
         causes = []
         for phase in self.phases:
-            ends = [(now.margin(guard), GUARD + i) for i, guard in enumerate(phase.guards)]
+            ends = [(phase.margin(now, guard), GUARD + i) for i, guard in enumerate(phase.guards)]
             success = phase.success(now, task.contact_force)
             ends.append((ca.if_else(self.waits, 1.0, success), SUCCESS))
             ends += [(lost, LOST)] * phase.holds_contact
@@ -362,7 +359,7 @@ class Automaton:
             "estimated_state": self.state,
             "reference": self.references[which],
             "measured_force": measured,
-            "hold": ca.repmat(waits, len(law.integral.outputs)),
+            "hold": waits,
         }
         symbols = [block.parameters, *block.inputs.values()]
         values = [ca.vertcat(self.values, gains), *(given[name] for name in block.inputs)]

@@ -13,7 +13,9 @@ from drake_dae.arrays import positive
 from drake_dae.errors import ModelError
 from drake_dae.references import LineReference, PathLimits, Reference
 
-Watched = Literal["force", "time", "distance", "travel", "control", "signal"]
+Watched = Literal[
+    "force", "time", "distance", "travel", "control", "signal", "force error", "distance error"
+]
 
 Outcome = Literal["success", "guard", "late", "lost"]
 """How a phase ends."""
@@ -24,6 +26,7 @@ NEXT, DONE, APPROACH, HOLD, LEAVE = ENDS = "next", "done", "approach", "hold", "
 """What may follow a phase besides the name of another one."""
 
 UNITS = {"force": "N", "time": "s", "distance": "m", "travel": "m", "control": "", "signal": ""}
+UNITS |= {"force error": "N", "distance error": "m"}
 """Watched quantity -> its unit; a control has its own."""
 
 _SPEED, _AWAY = 0.05, 0.02
@@ -44,10 +47,11 @@ class Condition:
     - travel: the norm of the change of all outputs in m, and of the distance, since the phase
       began, in m; the way of the tool if these are its coordinates;
     - control: |u| of a control, or the largest of all, in its unit, N m for joints;
-    - signal: the value of the input signal_<name>, in a scenario one of task.signals.
+    - signal: the value of the input signal_<name>, in a scenario one of task.signals;
+    - force error, in contact, and distance error, without: |error| once `over` has passed.
 
     Attributes:
-        of: The watched quantity: "force", "time", "distance", "travel", "control" or "signal".
+        of: The watched quantity.
         above: It holds at or above this value.
         below: It holds at or below this value. Either this or `above` is given.
         name: The name of the signal or of the control; of the largest control if empty.
@@ -93,12 +97,13 @@ class Moment:
     signal: Mapping[str, Any] = field(default_factory=dict)
     control: Mapping[str, Any] = field(default_factory=dict)  # "" is the largest |u|
 
-    def margin(self, condition: Condition) -> Any:
-        """A number that is positive until a condition holds."""
-        value: Any = getattr(self, condition.of)
-        if condition.of in ("signal", "control"):
-            value = value[condition.name]
-        return condition.limit - value if condition.above is not None else value - condition.limit
+    @property
+    def force_error(self) -> Any:
+        return abs(self.force - self.wanted)
+
+    @property
+    def distance_error(self) -> Any:
+        return abs(self.distance - self.wanted)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,16 +117,15 @@ class Phase:
        Outputs with `rates` keep these rates, and all others come to rest within `over`.
     3. References do not jump: they start with the values and all derivatives of those before that
        the law uses, and reach the goals within `over`.
-    4. A phase succeeds when one of the conditions in `until` holds; without any, when its own
-       `margin` is 0, which `awaited` says in words. A phase whose conditions in `until` are forces
-       above a limit has touched then.
+    4. A phase succeeds when one of the conditions in `until` holds, or without any, of its own,
+       `ends`. A phase whose conditions in `until` are forces above a limit has touched then.
     5. It fails if one of its `guards` holds; if it lasts longer than `within`, or `remaining`
        becomes 0; and, with `holds_contact`, if the contact is lost.
     6. The successor is the name of a phase, or "next", the next one in the list; "done", the task
        is done, and the robot rests; "approach", back to the last phase that leads into contact;
        "hold", the robot rests in its present state with contact and force, and the task is given
        up if the phase failed; "leave", the force goes to zero first.
-    7. `margin` and `remaining` are expressions of a `Moment`: with ca.fmin, ca.fmax, ca.if_else.
+    7. `remaining` is an expression of a `Moment`: with ca.fmin, ca.fmax, ca.if_else.
 
     Attributes:
         over: The duration of the transition from the previous references, in s.
@@ -185,27 +189,30 @@ class Phase:
         """Name of an output without a goal -> its final rate, in its unit per s."""
         return {}
 
-    def margin(self, now: Moment, contact_force: float) -> Any:
-        """A number that is positive until its own end; forces below `contact_force` are none."""
+    def ends(self, contact_force: float) -> Sequence[Condition]:
+        """Its own conditions, one of which ends it; forces below `contact_force` are none."""
         raise NotImplementedError
 
+    def margin(self, now: Moment, condition: Condition) -> Any:
+        """A number that is positive until a condition holds."""
+        value: Any = getattr(now, condition.of.replace(" ", "_"))
+        if condition.of in ("signal", "control"):
+            value = value[condition.name]
+        margin = condition.limit - value if condition.above is not None else value - condition.limit
+        return ca.fmax(self.over - now.time, margin) if "error" in condition.of else margin
+
     def success(self, now: Moment, contact_force: float) -> Any:
-        """A number that is positive until the phase succeeds, by `until` or its own `margin`."""
-        if not self.until:
-            return self.margin(now, contact_force)
-        return reduce(ca.fmin, [now.margin(condition) for condition in self.until])
+        """A number that is positive until the phase succeeds."""
+        conditions = self.until or self.ends(contact_force)
+        return reduce(ca.fmin, [self.margin(now, condition) for condition in conditions])
 
     def remaining(self, now: Moment) -> Any:
         """A number that is positive until the phase is late."""
         return self.within - now.time
 
-    def awaited(self, contact_force: float) -> str:
-        """Its own end, for messages: "a force of 0.5 N"."""
-        return "its end"
-
     def awaits(self, contact_force: float) -> str:
-        """The condition that ends it, for messages: that of `until`, or its own."""
-        return " or ".join(map(str, self.until)) or self.awaited(contact_force)
+        """The conditions that end it, for messages."""
+        return " or ".join(map(str, self.until or self.ends(contact_force)))
 
     def successor(self, outcome: Outcome) -> tuple[str, str]:
         """What follows after an outcome, and the attribute that says so."""
@@ -247,11 +254,8 @@ class Approach(Phase):
     def remaining(self, now: Moment) -> Any:
         return ca.fmin(super().remaining(now), now.distance + self.behind)
 
-    def margin(self, now: Moment, contact_force: float) -> Any:
-        return contact_force - now.force
-
-    def awaited(self, contact_force: float) -> str:
-        return f"a force of {contact_force:g} N"
+    def ends(self, contact_force: float) -> Sequence[Condition]:
+        return [Condition("force", above=contact_force)]
 
 
 @checked(ModelError)
@@ -281,11 +285,8 @@ class Press(Phase):
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: self.force}
 
-    def margin(self, now: Moment, contact_force: float) -> Any:
-        return ca.fmax(self.over - now.time, abs(now.force - now.wanted) - self.tolerance)
-
-    def awaited(self, contact_force: float) -> str:
-        return f"a force within {self.tolerance:g} N of its reference"
+    def ends(self, contact_force: float) -> Sequence[Condition]:
+        return [Condition("force error", below=self.tolerance)]
 
 
 class _Lasting(Phase):
@@ -301,14 +302,11 @@ class _Lasting(Phase):
         elif not self.until:
             raise ModelError(f"{self.name}: give a duration, or conditions as until")
 
-    def margin(self, now: Moment, contact_force: float) -> Any:
-        return (self.duration or 0.0) - now.time
+    def ends(self, contact_force: float) -> Sequence[Condition]:
+        return [Condition("time", above=self.duration)]
 
     def remaining(self, now: Moment) -> Any:
         return super().remaining(now) if self.until else inf
-
-    def awaited(self, contact_force: float) -> str:
-        return f"the end of {self.duration or 0.0:g} s"
 
 
 @checked(ModelError)
@@ -360,14 +358,11 @@ class Release(Phase):
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: LineReference([0.0], [_LEAST], _FALL, self.over, order=6)}
 
-    def margin(self, now: Moment, contact_force: float) -> Any:
-        return now.force - contact_force
+    def ends(self, contact_force: float) -> Sequence[Condition]:
+        return [Condition("force", below=contact_force)]
 
     def remaining(self, now: Moment) -> Any:
         return ca.fmin(super().remaining(now), _AWAY - now.away)
-
-    def awaited(self, contact_force: float) -> str:
-        return f"a force of no more than {contact_force:g} N"
 
 
 @checked(ModelError)
@@ -392,8 +387,5 @@ class Retreat(Phase):
     def goals(self, contact_output: str) -> Mapping[str, Reference | float]:
         return {contact_output: self.distance}
 
-    def margin(self, now: Moment, contact_force: float) -> Any:
-        return ca.fmax(self.over - now.time, abs(now.distance - self.distance) - self.tolerance)
-
-    def awaited(self, contact_force: float) -> str:
-        return f"a distance within {self.tolerance:g} m of {self.distance:g} m"
+    def ends(self, contact_force: float) -> Sequence[Condition]:
+        return [Condition("distance error", below=self.tolerance)]

@@ -23,12 +23,9 @@ from drake_dae.systems.task.phases import (
     Watched,
 )
 
-_STEADY = 6.0
-"""The least `contact_force` in standard deviations of the filtered noise: one sample in 1e9 exceeds
-it."""
-
-_STRONGEST = 10.0
-"""The largest factor by which the low-pass reduces noise; its time constant is then 50 samples."""
+_STEADY, _STRONGEST = 6.0, 10.0
+"""The least `contact_force` in standard deviations of the filtered noise, which one sample in 1e9
+exceeds; and by how much the low-pass reduces noise at most, with a time constant of 50 samples."""
 
 
 @checked(ModelError)
@@ -55,8 +52,7 @@ class Task:
 
     Raises:
         ModelError: There are no phases; one begins in contact although the one before does not end
-            in contact, or the other way round; a successor is not a phase; or a number is not
-            valid.
+            in contact, or the other way round; a successor is no phase; or a number is not valid.
     """
 
     phases: Sequence[Phase]

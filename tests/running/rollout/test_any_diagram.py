@@ -32,8 +32,7 @@ from drake_dae import rollout
 from drake_dae.errors import ModelError
 from drake_dae.running import export_loop, start_values
 from drake_dae.running import rollout as module
-from drake_dae.running.events import events_within
-from drake_dae.running.rollout_program import program_of
+from drake_dae.running.rollout_program import events_within, program_of
 
 
 def fixed(step=1e-3):
@@ -183,13 +182,7 @@ def test_two_sources_of_noise_of_one_run_have_numbers_of_their_own(compiled):
     times = np.arange(10) * 0.1 + 0.05
     seeds = np.array([3, 4, 3])
     found = rollout(
-        diagram,
-        [start] * 3,
-        parameters,
-        times,
-        config=fixed(5e-2),
-        compiled=compiled,
-        seeds=seeds,
+        diagram, [start] * 3, parameters, times, config=fixed(5e-2), compiled=compiled, seeds=seeds
     )
     first, second, again = (
         np.hstack([run.record["one"], run.record["other"]]).ravel().tolist() for run in found

@@ -151,20 +151,6 @@ def assert_same_failures(ours, theirs):
             assert str(one.failure)[:20] == str(other.failure)[:20]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "config", [["integrator.accuracy=1e-6"], [*FIXED[:2], "integrator.max_step_size=0.01"]]
-)
-def test_a_run_fails_in_the_words_that_it_has_alone(monkeypatch, config):
-    """At its own time, to round-off: the tool leaves what the arm can reach."""
-    settings = ["references.tool.z.amplitudes=[3.0]", *config]
-    loop, chosen, starts, rows = problem("two_link_wall", *settings)
-    times = np.linspace(0.0, 0.6, 61)
-    found = both_ways(monkeypatch, loop, starts, rows, times, config=chosen.integrator)
-    assert all(each.failure is not None for each in found[0])
-    assert_same_failures(*found)
-
-
 def test_a_run_that_fails_ends_no_other(monkeypatch):
     """Every third run has gains that no step of this length follows; the others reach the end."""
     euler = ["integrator.integration_scheme=explicit_euler", FIXED[1]]

@@ -10,27 +10,10 @@ from pydrake.systems.analysis import SimulatorConfig
 from pydrake.systems.framework import DiagramBuilder
 from runs import IN_CONTACT, MANY_PIECES, both, each_scenario, mostly_compiled, run, scenario, some
 
-from drake_dae import (
-    DaePlant,
-    DaeSystem,
-    ForceSensor,
-    RobotPlant,
-    TrackingLaw,
-    build_scenario,
-    make_closed_loop,
-    poles,
-    rollout,
-    simulate,
-)
+from drake_dae import DaePlant, DaeSystem, build_scenario, rollout, simulate
 from drake_dae.blocks import machine
-from drake_dae.diagrams import LoopSettings
 from drake_dae.diagrams.parts import encoder_seed
-from drake_dae.errors import (
-    InconsistentStateError,
-    MachineCodeWarning,
-    ModelError,
-    SimulationError,
-)
+from drake_dae.errors import InconsistentStateError, MachineCodeWarning, ModelError, SimulationError
 from drake_dae.references.splines import UNROLLED
 from drake_dae.running import start_values
 from drake_dae.running.rollout import run_loop
@@ -132,11 +115,7 @@ def test_a_reference_of_many_polynomials_is_the_same(compiled):
 
 @mostly_compiled
 @pytest.mark.parametrize(
-    "name",
-    [
-        "two_link_wall",
-        pytest.param("seven_joint_wall", marks=pytest.mark.slow),
-    ],
+    "name", ["two_link_wall", pytest.param("seven_joint_wall", marks=pytest.mark.slow)]
 )
 def test_error_control_agrees(name, compiled):
     """To 1e-9: Drake at an accuracy of 1e-12 is the truth, and the rollout at 1e-8 is held to it.
@@ -303,34 +282,6 @@ def test_many_runs_are_those_of_one_each(compiled):
     np.testing.assert_array_equal(same[1].record["state"], found[1].record["state"])
 
 
-@pytest.mark.slow
-@mostly_compiled
-@pytest.mark.parametrize(
-    "sensor",
-    some(
-        [
-            {"time_constant": 0.02, "bias": 0.5, "noise_deviation": 0.1},
-            {"time_constant": 0.02, "sample_period": 0.01, "noise_deviation": 0.1},
-            {"time_constant": 0.06, "sample_period": 0.013},
-        ]
-    ),
-)
-def test_sensors_measure_as_in_drake(sensor, compiled):
-    """The noise is that of Drake's RandomSource; steps of both end at each of its changes."""
-    chosen = scenario("two_link_measured_force", "duration=0.2", *fixed("runge_kutta3", 0.002))
-    built, _ = build_scenario(chosen)
-    law = built.controller.law
-    loop = make_closed_loop(
-        RobotPlant(built.plant.model, structure=law.structure),
-        law,
-        built.reference.references,
-        LoopSettings(sensor=ForceSensor(1, **sensor)),
-    )
-    context = loop.diagram.CreateDefaultContext()
-    loop.set_seed(context, 7)
-    assert_as_in_drake(loop, context, chosen, compiled, 1e-12, 7)
-
-
 def assert_as_in_drake(loop, context, chosen, compiled, tolerance, seeds):
     """The record of Drake has rows at all samples, too."""
     start, parameters = start_values(loop, context)
@@ -340,26 +291,6 @@ def assert_as_in_drake(loop, context, chosen, compiled, tolerance, seeds):
     assert found.failure is None
     assert_equal_records(found.record, wanted, tolerance)
     return wanted
-
-
-@pytest.mark.slow
-@mostly_compiled
-def test_the_integral_of_a_force_that_is_not_measured_is_that_of_drake(compiled):
-    """To 1e-12 of the largest value, as all that equal steps give."""
-    chosen = scenario("two_link_wall", "duration=0.1", *fixed())
-    built, context = build_scenario(chosen)
-    start = built.plant.state(built.plant.GetMyContextFromRoot(context))
-    model, structure = built.plant.model, built.controller.law.structure
-    options = {"structure": structure, "measured_force": True, "integral": ["wall.force"]}
-    law = TrackingLaw(model.dae, poles(-4.0), **options)
-    loop = make_closed_loop(RobotPlant(model, structure=structure), law, built.reference.references)
-    context = loop.diagram.CreateDefaultContext()
-    own = loop.plant.GetMyMutableContextFromRoot(context)
-    loop.plant.set_state(own, start)
-    loop.plant.set_parameter(own, "link1.mass", 13.0)
-    loop.controller.set_integral(loop.controller.GetMyMutableContextFromRoot(context), [0.02])
-    wanted = assert_as_in_drake(loop, context, chosen, compiled, 1e-12, 0)
-    assert np.ptp(wanted["integral"]) > 1e-6
 
 
 def test_one_start_is_that_of_all_rows_of_parameters_or_seeds():
@@ -489,6 +420,14 @@ OBSERVED = (
     "estimator={rate: 20.0}",
 )
 PARTS = {
+    "a sensor with a lag": (
+        "sensors.force={time_constant: 0.02, bias: 0.5, noise_deviation: 0.1}",
+        "law.integral=[wall.force]",
+    ),
+    "a sensor with a lag and samples": (
+        "sensors.force={time_constant: 0.06, sample_period: 0.013}",
+        "law.integral=[wall.force]",
+    ),
     "integral": ("law.integral=[tool.z]", "start.errors.tool.z=0.01"),
     "limits": ("law.gains.all=[-80]", *LIMITED),
     "limits and integral": ("law.gains.all=[-40]", "law.integral=[tool.z]", *LIMITED),

@@ -114,6 +114,13 @@ def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_k
     for unit in (1.0, 1e3):  # In metres and in millimetres.
         posture = Postures(links, bound, unit * height, S, [], {}).at(q)
         assert posture.independence([0]) == pytest.approx(np.sqrt(1 - c**2), rel=1e-10)
+    # Friction jams the contact where mu times the mobility across exceeds that along the normal.
+    touch = model.constraints[0].touch(links)
+    point, out = links.position("tool", touch.point), links.rotation("tool")[:, 2]
+    posture = Postures(links, bound, point, S, [(touch, out)], {}).at(q)
+    along, across = (x @ np.linalg.solve(M, row) for row in (x, z))
+    critical = posture.critical_friction(0, range(3))
+    assert critical == pytest.approx(along / abs(across), rel=1e-10)
 
 
 def refusal(open_):

@@ -129,7 +129,7 @@ def test_names_with_dots():
 
 def test_what_differs_from_the_defaults_is_written_and_reads_back():
     made = read(
-        "contact: {surface: !Funnel {apex: [1, 2, 3]}, names: [a, 'on', 'é: 1']}\n"
+        "contact: {surface: !Funnel {apex: [1, 2, 3]}, names: [a, 'on', '1e5', 'é: 1']}\n"
         "spring: {stiffness: [[1, 2], [3, 4]]}\nfree: {x: {y: 1}}\nconfig: {step: 2}"
     )
     text = dump_yaml(READER.write(made))

@@ -7,14 +7,8 @@ from actuated import actuated, slope, states
 from arms import arm, consistent_states, law
 from problems import PROBLEMS, hanging_pendulum
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.systems.framework import (
-    InputPortSelection,
-    OutputPortSelection,
-)
-from pydrake.systems.primitives import (
-    FirstOrderTaylorApproximation,
-    Linearize,
-)
+from pydrake.systems.framework import InputPortSelection, OutputPortSelection
+from pydrake.systems.primitives import FirstOrderTaylorApproximation, Linearize
 from pydrake.trajectories import PiecewisePolynomial
 from runs import some
 

@@ -11,32 +11,9 @@ from alone import alone
 from arms import arm, law
 from blocks_of_users import Counter_
 from pydrake.symbolic import Variable, if_then_else, logical_and
+from pydrake.systems import primitives as drake
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import (
-    DiagramBuilder,
-)
-from pydrake.systems.primitives import (
-    Adder,
-    AffineSystem,
-    ConstantVectorSource,
-    Demultiplexer,
-    DiscreteDerivative,
-    DiscreteTimeDelay,
-    DiscreteTimeIntegrator,
-    FirstOrderLowPassFilter,
-    Gain,
-    Integrator,
-    LinearSystem,
-    MatrixGain,
-    Multiplexer,
-    PassThrough,
-    Saturation,
-    Sine,
-    StateInterpolatorWithDiscreteDerivative,
-    SymbolicVectorSystem,
-    WrapToSystem,
-    ZeroOrderHold,
-)
+from pydrake.systems.framework import DiagramBuilder
 from runs import some
 
 import drake_dae as dd
@@ -176,7 +153,7 @@ BLOCKS = {
 def symbolic_system():
     x, u, t = Variable("x"), Variable("u"), Variable("t")
     inside = logical_and(x > -0.5, x <= 0.5)
-    return SymbolicVectorSystem(
+    return drake.SymbolicVectorSystem(
         time=t,
         state=[x],
         input=[u],
@@ -186,30 +163,30 @@ def symbolic_system():
 
 
 SYSTEMS = {
-    "Gain": lambda: Gain(2.0, 2),
-    "Saturation": lambda: Saturation([-0.5, -0.1], [0.3, 0.2]),
-    "FirstOrderLowPassFilter": lambda: FirstOrderLowPassFilter(0.2, 2),
-    "ZeroOrderHold": lambda: ZeroOrderHold(0.1, 2),
-    "Sine": lambda: Sine(1.0, 2.0, 0.3, 2),
-    "Adder": lambda: Adder(3, 2),
-    "Integrator": lambda: Integrator(2),
-    "DiscreteTimeDelay": lambda: DiscreteTimeDelay(0.1, 3, 2),
-    "DiscreteDerivative": lambda: DiscreteDerivative(2, 0.1),
-    "DiscreteTimeIntegrator": lambda: DiscreteTimeIntegrator(2, 0.1),
-    "LinearSystem": lambda: LinearSystem(
+    "Gain": lambda: drake.Gain(2.0, 2),
+    "Saturation": lambda: drake.Saturation([-0.5, -0.1], [0.3, 0.2]),
+    "FirstOrderLowPassFilter": lambda: drake.FirstOrderLowPassFilter(0.2, 2),
+    "ZeroOrderHold": lambda: drake.ZeroOrderHold(0.1, 2),
+    "Sine": lambda: drake.Sine(1.0, 2.0, 0.3, 2),
+    "Adder": lambda: drake.Adder(3, 2),
+    "Integrator": lambda: drake.Integrator(2),
+    "DiscreteTimeDelay": lambda: drake.DiscreteTimeDelay(0.1, 3, 2),
+    "DiscreteDerivative": lambda: drake.DiscreteDerivative(2, 0.1),
+    "DiscreteTimeIntegrator": lambda: drake.DiscreteTimeIntegrator(2, 0.1),
+    "LinearSystem": lambda: drake.LinearSystem(
         A=[[0, 1.0], [-2.0, -0.3]], B=[[0.0], [1.0]], C=[[1.0, 0.0]], D=[[0.7]]
     ),
-    "LinearSystem with a period": lambda: LinearSystem(
+    "LinearSystem with a period": lambda: drake.LinearSystem(
         A=np.eye(2) * 0.5, B=np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), time_period=0.1
     ),
-    "AffineSystem": lambda: AffineSystem(D=[[2.0, -1.0]], y0=[0.5]),
-    "ConstantVectorSource": lambda: ConstantVectorSource([1.0, 2.0]),
-    "Multiplexer": lambda: Multiplexer([1, 2]),
-    "Demultiplexer": lambda: Demultiplexer(4, 2),
-    "PassThrough": lambda: PassThrough(2),
-    "MatrixGain": lambda: MatrixGain([[1.0, 2.0], [3.0, 4.0]]),
+    "AffineSystem": lambda: drake.AffineSystem(D=[[2.0, -1.0]], y0=[0.5]),
+    "ConstantVectorSource": lambda: drake.ConstantVectorSource([1.0, 2.0]),
+    "Multiplexer": lambda: drake.Multiplexer([1, 2]),
+    "Demultiplexer": lambda: drake.Demultiplexer(4, 2),
+    "PassThrough": lambda: drake.PassThrough(2),
+    "MatrixGain": lambda: drake.MatrixGain([[1.0, 2.0], [3.0, 4.0]]),
     "SymbolicVectorSystem": symbolic_system,
-    "a diagram of primitives": lambda: StateInterpolatorWithDiscreteDerivative(2, 0.1),
+    "a diagram of primitives": lambda: drake.StateInterpolatorWithDiscreteDerivative(2, 0.1),
     "a template whose updates begin later": lambda: Counter_[None](0.1, 0.03),
 }
 
@@ -299,7 +276,7 @@ def test_feedthrough_is_that_of_the_system(name):
 
 def test_a_system_that_cannot_be_traced_is_named():
     builder = DiagramBuilder()
-    system = builder.AddNamedSystem("my block", WrapToSystem(1))
+    system = builder.AddNamedSystem("my block", drake.WrapToSystem(1))
     builder.ExportInput(system.get_input_port(0), "in")
     builder.ExportOutput(system.get_output_port(0), "out")
     with pytest.raises(ModelError, match="'my block'"):

@@ -4,31 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from problems import PROBLEMS
-from pydrake.symbolic import (
-    Expression,
-    ExpressionKind,
-    Variable,
-    acos,
-    asin,
-    atan,
-    atan2,
-    ceil,
-    cos,
-    cosh,
-    exp,
-    floor,
-    if_then_else,
-    log,
-    sin,
-    sinh,
-    sqrt,
-    tan,
-    tanh,
-    uninterpreted_function,
-)
-from pydrake.symbolic import abs as absolute
-from pydrake.symbolic import max as larger
-from pydrake.symbolic import min as smaller
+from pydrake import symbolic as sym
 from pydrake.systems.primitives import SymbolicVectorSystem
 
 from drake_dae import find_structure
@@ -37,29 +13,29 @@ from drake_dae.errors import ModelError
 
 # With arguments kept inside their domains: |sin e| <= 1.
 ONE = [
-    lambda a: log(1.0 + a * a),
-    lambda a: exp(sin(a)),
-    lambda a: sqrt(2.0 + a * a),
-    sin,
-    cos,
-    lambda a: tan(sin(a)),
-    lambda a: asin(0.9 * sin(a)),
-    lambda a: acos(0.9 * sin(a)),
-    atan,
-    lambda a: sinh(sin(a)),
-    lambda a: cosh(sin(a)),
-    tanh,
+    lambda a: sym.log(1.0 + a * a),
+    lambda a: sym.exp(sym.sin(a)),
+    lambda a: sym.sqrt(2.0 + a * a),
+    sym.sin,
+    sym.cos,
+    lambda a: sym.tan(sym.sin(a)),
+    lambda a: sym.asin(0.9 * sym.sin(a)),
+    lambda a: sym.acos(0.9 * sym.sin(a)),
+    sym.atan,
+    lambda a: sym.sinh(sym.sin(a)),
+    lambda a: sym.cosh(sym.sin(a)),
+    sym.tanh,
     lambda a: a**3,
-    lambda a: (2.0 + sin(a)) ** -2,
+    lambda a: (2.0 + sym.sin(a)) ** -2,
     lambda a: 2.0 - a,
 ]
 TWO = [
     lambda a, b: a + b,
     lambda a, b: a - 3.0 * b + 0.5,
     lambda a, b: a * b,
-    lambda a, b: a / (2.0 + cos(b)),
-    lambda a, b: (2.0 + sin(a)) ** sin(b),
-    lambda a, b: atan2(a, 2.0 + sin(b)),
+    lambda a, b: a / (2.0 + sym.cos(b)),
+    lambda a, b: (2.0 + sym.sin(a)) ** sym.sin(b),
+    lambda a, b: sym.atan2(a, 2.0 + sym.sin(b)),
 ]
 
 
@@ -76,14 +52,14 @@ def tree(random, leaves, depth):
 def kinds(expression, found):
     found.add(expression.get_kind())
     for part in expression.Unapply()[1]:
-        if isinstance(part, Expression):
+        if isinstance(part, sym.Expression):
             kinds(part, found)
 
 
 def test_random_expressions_have_the_numbers_of_drake():
     """80 trees at 3 points: some 30 operations, each to round-off, in another order."""
     random = np.random.default_rng(0)
-    variables = [Variable(name) for name in "xyz"]
+    variables = [sym.Variable(name) for name in "xyz"]
     symbols = {v.get_id(): ca.SX.sym(v.get_name()) for v in variables}
     found = set()
     for _ in range(80):
@@ -93,15 +69,17 @@ def test_random_expressions_have_the_numbers_of_drake():
         for point in random.uniform(-2.0, 2.0, (3, 3)):
             expected = expression.Evaluate(dict(zip(variables, point, strict=True)))
             assert float(function(*point)) == pytest.approx(expected, rel=1e-11, abs=1e-12)
-    smooth = {kind for kind in vars(ExpressionKind).values() if isinstance(kind, ExpressionKind)}
+    smooth = {
+        kind for kind in vars(sym.ExpressionKind).values() if isinstance(kind, sym.ExpressionKind)
+    }
     refused = ("Abs", "Min", "Max", "Ceil", "Floor", "IfThenElse", "UninterpretedFunction", "NaN")
-    assert found == smooth - {getattr(ExpressionKind, name) for name in refused}
+    assert found == smooth - {getattr(sym.ExpressionKind, name) for name in refused}
 
 
 def pendulum(**changes):
     """PROBLEMS["pendulum"] once more."""
-    x, y, vx, vy = state = [Variable(name) for name in ("x", "y", "vx", "vy")]
-    mass, length, gravity = (Variable(name) for name in ("mass", "length", "gravity"))
+    x, y, vx, vy = state = [sym.Variable(name) for name in ("x", "y", "vx", "vy")]
+    mass, length, gravity = (sym.Variable(name) for name in ("mass", "length", "gravity"))
     fields = {
         "f": [vx, vy, 0.0, -gravity],
         "g": [0.0, 0.0, x / mass, y / mass],
@@ -138,11 +116,11 @@ def test_the_same_system_as_from_casadi():
 
 def test_drakes_own_symbolic_system():
     """m = 0: x'' = -sin x - c x' + cos(x) u; f is its dynamics at u = 0, h their slope."""
-    angle, rate, u, c = (Variable(name) for name in ("angle", "rate", "u", "c"))
+    angle, rate, u, c = (sym.Variable(name) for name in ("angle", "rate", "u", "c"))
     drake = SymbolicVectorSystem(
         state=[angle, rate],
         input=[u],
-        dynamics=[rate, -sin(angle) - c * rate + cos(angle) * u],
+        dynamics=[rate, -sym.sin(angle) - c * rate + sym.cos(angle) * u],
         output=[angle],
         parameter=[c],
     )
@@ -170,15 +148,15 @@ def test_drakes_own_symbolic_system():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda a: absolute(a), r"\bk\b.*abs\(x\)"),
-        (lambda a: 1.0 + smaller(a, 1.0), r"\bmin\b"),
-        (lambda a: larger(a, 1.0), r"\bmax\b"),
-        (lambda a: ceil(a), "ceil"),
-        (lambda a: sin(floor(a)), "floor"),
-        (lambda a: if_then_else(a > 0, a, 1.0), "if_then_else"),
-        (lambda a: uninterpreted_function("w", [a]), r"\bw\(x\)"),
-        (lambda a: a + Variable("w"), r"\bk\b.*\bw\b"),
-        (lambda a: Variable("b", Variable.Type.BOOLEAN), r"\bb\b"),
+        (lambda a: sym.abs(a), r"\bk\b.*abs\(x\)"),
+        (lambda a: 1.0 + sym.min(a, 1.0), r"\bmin\b"),
+        (lambda a: sym.max(a, 1.0), r"\bmax\b"),
+        (lambda a: sym.ceil(a), "ceil"),
+        (lambda a: sym.sin(sym.floor(a)), "floor"),
+        (lambda a: sym.if_then_else(a > 0, a, 1.0), "if_then_else"),
+        (lambda a: sym.uninterpreted_function("w", [a]), r"\bw\(x\)"),
+        (lambda a: a + sym.Variable("w"), r"\bk\b.*\bw\b"),
+        (lambda a: sym.Variable("b", sym.Variable.Type.BOOLEAN), r"\bb\b"),
         (lambda a: "x", r"\bk\b.*\bx\b.*str"),
         (lambda a: np.nan, "pendulum: k, "),
         (lambda a: [a, a], "pendulum: g "),
@@ -190,16 +168,16 @@ def test_refusals_name_the_function_and_the_expression(make, message):
 
 
 def test_refused_variables():
-    x = Variable("x")
+    x = sym.Variable("x")
     with pytest.raises(ModelError, match=r"state.*Variable"):
         from_symbolic(x, f=[x], h=[1.0], l=[x])
     for states, parameters, message in (
         ([x, x], {}, r"\bx\b"),
         ([x], {x: 1.0}, r"\bx\b"),
         (["x"], {}, r"state\[0\].*'x'"),
-        ([Variable("n", Variable.Type.INTEGER)], {}, "state"),
-        ([x, Variable("x")], {}, r"\bx\b"),
-        ([x], {Variable("c"): [1.0, 2.0]}, "parameters"),
+        ([sym.Variable("n", sym.Variable.Type.INTEGER)], {}, "state"),
+        ([x, sym.Variable("x")], {}, r"\bx\b"),
+        ([x], {sym.Variable("c"): [1.0, 2.0]}, "parameters"),
     ):
         with pytest.raises(ModelError, match=message):
             from_symbolic(

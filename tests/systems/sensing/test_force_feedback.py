@@ -268,31 +268,30 @@ def test_sensor_has_no_direct_feedthrough_from_force():
 
 
 @pytest.mark.parametrize(
-    ("make", "error", "message"),
+    ("given", "message"),
     [
-        (lambda: dd.ForceSensor(1), ModelError, "close"),
-        (lambda: dd.ForceSensor(1, -0.1), ModelError, "-0.1"),
-        (
-            lambda: dd.TrackingLaw(
-                arm("two_link").model.dae, dd.poles(-4.0), measured_force=True, force_gain=-0.5
-            ),
-            GainError,
-            "force_gain",
-        ),
-        (
-            lambda: dd.TrackingLaw(arm("two_link").model.dae, dd.poles(-4.0), force_gain=1.0),
-            GainError,
-            "measured_force",
-        ),
-        (
-            lambda: dd.TrackingLaw(
-                arm("two_link").model.dae, dd.poles(-4.0), measured_force=True, force_gain=np.eye(2)
-            ),
-            GainError,
-            r"shape \(1, 1\)",
-        ),
+        ({}, "close"),
+        ({"time_constant": -0.1}, "-0.1"),
+        ({"sample_period": np.inf}, "sample_period"),
+        ({"time_constant": 0.1, "bias": [1.0, 2.0, 3.0]}, r"bias.*\(2,\)"),
+        ({"time_constant": 0.1, "noise_deviation": [0.1, -1.0]}, "noise_deviation.*-1"),
+        ({"time_constant": 0.1, "drift": np.nan}, "drift.*nan"),
     ],
 )
-def test_refusals(make, error, message):
-    with pytest.raises(error, match=message):
-        make()
+def test_what_no_sensor_can_be_is_refused(given, message):
+    with pytest.raises(ModelError, match=message):
+        dd.ForceSensor(2, **given)
+
+
+@pytest.mark.parametrize(
+    ("measured", "gain", "message"),
+    [
+        (True, -0.5, "force_gain"),
+        (False, 1.0, "measured_force"),
+        (True, np.eye(2), r"shape \(1, 1\)"),
+    ],
+)
+def test_gains_of_forces_that_do_not_fit_are_refused(measured, gain, message):
+    system = arm("two_link").model.dae
+    with pytest.raises(GainError, match=message):
+        dd.TrackingLaw(system, dd.poles(-4.0), measured_force=measured, force_gain=gain)

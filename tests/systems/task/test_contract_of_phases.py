@@ -29,6 +29,11 @@ MEMBERS = {
         Moment(1.9, 20.0, 0.0, 0.0, 20.0, signal={"ready": 0.4}),
         Moment(1.9, 20.0, 0.0, 0.0, 20.0, signal={"ready": 1.0}),
     ),
+    "Move until it has settled": (
+        Move({}, until=[Condition("force error", below=2.0)]),
+        Moment(0.4, 20.0, 0.0, 0.0, 20.0),  # In its transition.
+        Moment(0.6, 18.5, 0.0, 0.0, 20.0),
+    ),
     "Move until": (
         Move({}, until=[Condition("force", above=5.0)]),
         Moment(1.0, 4.9, 0.1, -0.02, 0.1),

@@ -39,4 +39,4 @@ def test_the_reference_of_a_release_is_zero_until_it_should_have_ended():
     goal = Release(over=0.3).goals("wall.force")["wall.force"].derivatives([0])
     assert_allclose([goal(time)[0] for time in np.linspace(0.0, 0.3, 7)], 0.0, atol=0.0)
     assert np.all(np.diff([goal(time)[0] for time in np.linspace(0.3, 60.0, 200)]) < 0.0)
-    assert Release().margin(Moment(9.0, 0.4, 0.0, 0.0, -4.0), 0.5) < 0.0
+    assert Release().success(Moment(9.0, 0.4, 0.0, 0.0, -4.0), 0.5) < 0.0

@@ -7,19 +7,7 @@ import numpy as np
 import pytest
 from arms import arm, numbers
 from numpy.testing import assert_allclose
-from polishing import (
-    FAR,
-    OVER,
-    PERIOD,
-    POLE,
-    SPEED,
-    WHOLE,
-    laws,
-    push,
-    run_on,
-    started,
-    task_loop,
-)
+from polishing import FAR, OVER, PERIOD, POLE, SPEED, WHOLE, laws, push, run_on, started, task_loop
 
 import drake_dae as dd
 from drake_dae.diagrams import wire_loop
@@ -49,8 +37,8 @@ def test_phases_follow_each_other_and_say_why(whole):
     assert [change.phase for change in found] == names
     assert [change.place for change in found] == list(range(6))
     assert [change.in_contact for change in found] == [False, True, True, True, False, False]
-    assert found[1].reason == "after a force of 0.5 N"
-    assert str(found[1]).startswith(f"{found[1].time:.6g} s: Press, after a force of 0.5 N; ")
+    assert found[1].reason == "after a force above 0.5 N"
+    assert str(found[1]).startswith(f"{found[1].time:.6g} s: Press, after a force above 0.5 N; ")
     # A sample at the moment of a change shows what was before.
     places = np.searchsorted([c.time for c in found[1:]], record.time)
     assert_allclose(np.argmax(record["phase"], axis=1), places)

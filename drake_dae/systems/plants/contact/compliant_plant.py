@@ -33,14 +33,12 @@ from drake_dae.systems.plants.robot_plant import joint_outputs
 from drake_dae.trace.factorization import PositiveDefiniteFactorization
 from drake_dae.trace.functions import FailureKind, TracedFunction
 
-FITS = 1e-3
-"""The allowed depth of a ball at its contact point, relative to its radius."""
+FITS = 1e-3  # the allowed depth of a ball at its contact point, relative to its radius
 
 OUTSIDE = (
     "a joint reaches its limit, and this plant has no stops, or the forces of stiff contacts are "
     "not found; `plant: !MultibodyPlant` has stops"
 )
-"""The reason why a `CompliantPlant` cannot continue."""
 
 
 @checked(ModelError)

@@ -16,11 +16,8 @@ ITERATIONS = 10
 random problems far beyond those of robots (W over 2.5 decades, impulses over 6, sliding from 0.1 to
 1000 v_s), one contact in 1,000 and one pair in 200 need more."""
 
-SOLVED = 1e-9
-"""The allowed residual of these velocities, relative to the velocities themselves."""
-
-AT_REST = 1e-6
-"""Velocities below this, in m/s, count as this large there."""
+SOLVED, AT_REST = 1e-9, 1e-6
+"""The allowed residual of these velocities, relative to them, or to AT_REST in m/s if less."""
 
 SOFT = 1e-3
 """Drake's `sigma`: the speed scale of friction relative to the change of speed by an impulse."""

@@ -36,13 +36,7 @@ from drake_dae.blocks.lifetime import SHARED_DICTIONARY
 from drake_dae.blocks.traced_system import TracedSystem
 from drake_dae.dae import ConstraintStructure, Signal
 from drake_dae.errors import ModelError
-from drake_dae.robots import (
-    Constraint,
-    PosedShape,
-    RobotModel,
-    frame_named,
-    own_values,
-)
+from drake_dae.robots import Constraint, PosedShape, RobotModel, frame_named, own_values
 from drake_dae.systems.parameterized import changed_parameters
 from drake_dae.systems.plants.contact.contact_forces import (
     ContactForces,

@@ -27,11 +27,7 @@ from pydrake.multibody.plant import (
     MultibodyPlant,
     MultibodyPlantConfig,
 )
-from pydrake.multibody.tree import (
-    PrismaticJoint,
-    SpatialInertia,
-    UnitInertia,
-)
+from pydrake.multibody.tree import PrismaticJoint, SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, OutputPortSelection
 from pydrake.systems.primitives import ConstantVectorSource, FirstOrderTaylorApproximation
