@@ -112,9 +112,13 @@ class FilmScene:
         self._place_camera(*run_view(motion, scene_graph, view, self._arrow), 10.0 * size)
         builder = DiagramBuilder()
         scene = builder.AddSystem(scene_graph.Clone())
+        # With a .gltf mesh the renderer uses physically based materials.
+        inspector = scene_graph.model_inspector()
+        shapes = map(inspector.GetShape, inspector.GetAllGeometryIds(Role.kPerception))
+        is_physical = any(isinstance(s, Mesh) and s.extension() == ".gltf" for s in shapes)
         lights = [
             LightParameter(type="directional", direction=direction, frame="world", intensity=power)
-            for direction, power in (_PHYSICAL_LIGHTS if _has_gltf(scene_graph) else _LIGHTS)
+            for direction, power in (_PHYSICAL_LIGHTS if is_physical else _LIGHTS)
         ]
         parameters = RenderEngineVtkParams(default_clear_color=[1.0, 1.0, 1.0], lights=lights)
         scene.AddRenderer("film", MakeRenderEngineVtk(parameters))
@@ -205,13 +209,6 @@ class FilmScene:
         query = diagram.GetOutputPort("query").Eval(context)
         image = query.RenderColorImage(self._camera, self._world, self.pose)
         return np.array(image.data[:, :, :3])
-
-
-def _has_gltf(scene_graph: SceneGraph) -> bool:
-    """Whether there is a .gltf mesh, with which the renderer uses physically based materials."""
-    inspector = scene_graph.model_inspector()
-    shapes = map(inspector.GetShape, inspector.GetAllGeometryIds(Role.kPerception))
-    return any(isinstance(shape, Mesh) and shape.extension() == ".gltf" for shape in shapes)
 
 
 def _properties(color: Rgba) -> PerceptionProperties:

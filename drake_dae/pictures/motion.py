@@ -1,6 +1,7 @@
 """The actual and desired motion of a robot in a run, frame by frame."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,9 +110,17 @@ def follow(
     if "contact_force" in record.signals:  # This has the plant's friction, not that of the law.
         forces = at_frames("contact_force").reshape(len(times), -1, 3)
         wrenches = [replace(w, forces=force) for w, force in zip(wrenches, forces, strict=True)]
-    desired = _desired_states(model, states, at_frames("desired_output"), values)
-    start = float(record.time[0])
-    return RunMotion(model, times, start, states, values, wrenches, desired, acting)
+    # Link states with the desired outputs. With rolling constraints these do not determine q, so
+    # that each initial guess follows the actual motion.
+    nq, nv, desired = model.links.q.numel(), model.links.v.numel(), list[FloatArray]()
+    q, steps = states[0, :nq], np.diff(states[:, :nq], axis=0, prepend=states[:1, :nq])
+    wanted = at_frames("desired_output")[:, : len(model.position_signals)]
+    with suppress(InconsistentStateError):  # The desired path ends where it is out of reach.
+        for position, own, step in zip(wanted, values, steps, strict=True):
+            q = model.configuration(position, q + step, own)
+            desired.append(np.concatenate([q, np.zeros(nv)]))
+    at_rest, start = np.array(desired).reshape(-1, nq + nv), float(record.time[0])
+    return RunMotion(model, times, start, states, values, wrenches, at_rest, acting)
 
 
 def frame_times(duration: float, rate: float = FRAME_RATE) -> FloatArray:
@@ -174,22 +183,3 @@ def run_view(
     robot = scene_points(motion.model, motion.acting, now, scene_graph)
     direction = direction_of(robot, motion.points[middle], motion.normals[middle])
     return framed(np.vstack([run_points(motion, scene_graph), tails]), direction, view)
-
-
-def _desired_states(
-    model: RobotModel, states: FloatArray, desired: FloatArray, values: FloatArray
-) -> FloatArray:
-    """Link states at rest (q, 0) with the desired outputs, until these are out of reach."""
-    nq, nv = model.links.q.numel(), model.links.v.numel()
-    q, desired_states = states[0, :nq], []
-    # With rolling constraints the outputs do not determine q, so that each initial guess follows
-    # the actual motion.
-    steps = np.diff(states[:, :nq], axis=0, prepend=states[:1, :nq])
-    try:
-        positions = desired[:, : len(model.position_signals)]
-        for position, parameters, step in zip(positions, values, steps, strict=True):
-            q = model.configuration(position, q + step, parameters)
-            desired_states.append(np.concatenate([q, np.zeros(nv)]))
-    except InconsistentStateError:
-        pass  # The desired path ends where it is out of reach.
-    return np.array(desired_states).reshape(-1, nq + nv)

@@ -28,7 +28,7 @@ SINGULAR_PIVOT = 1e-12
 
 # Functions of more operations than this are kept, so many of them: a further run of a loop then
 # takes no time to shorten its expressions, and to find their machine code.
-LONG, KEPT = 2000, 32
+LONG, KEPT = 2000, 16
 
 
 class FailureKind(Enum):

@@ -18,7 +18,6 @@ from drake_dae.blocks.compose import Composed, Port
 from drake_dae.blocks.stepping import StepFunctions
 from drake_dae.dae import Signal
 from drake_dae.errors import ModelError, SimulationError
-from drake_dae.trace.compiled import generate, renamed, without_branches
 
 TEMPLATES = Path(__file__).with_name("c99")
 
@@ -93,12 +92,6 @@ class BlockCode:
             "parameter_names": strings(s.name for s in self.parameters),
             "parameter_units": strings(s.unit for s in self.parameters),
         }
-
-
-def generated(functions: Mapping[str, ca.Function]) -> str:
-    """C code of functions, as generated_name."""
-    named = (renamed(function, f"generated_{name}") for name, function in functions.items())
-    return without_branches(generate(*named))
 
 
 def written(folder: str | Path, files: Mapping[str, str], words: Mapping[str, str]) -> list[Path]:

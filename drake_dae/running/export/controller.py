@@ -21,13 +21,13 @@ from drake_dae.running.export.c_code import (
     BlockCode,
     Vectors,
     file_of,
-    generated,
     recorded_run,
     signals_of,
     write_replay,
     written,
 )
 from drake_dae.systems.plants.contract import Plant
+from drake_dae.trace.compiled import generate, renamed, without_branches
 
 CONTROL = "control"  # The name of a controller's output port and a plant's input port.
 FINEST = 1000  # The largest ratio of the shortest sample period to the common period.
@@ -211,9 +211,13 @@ class ControllerPart:
             begin = "  double held[HELD + 1];\n  memcpy(held, c->held, sizeof(held));\n"
             begin += f"  evaluate(generated_begin, c, {at}, held, c->held);\n"
         unused = "rate", "newton"  # There is no continuous state.
-        functions = {key: f for key, f in code.steps.functions.items() if key not in unused}
+        functions = (
+            renamed(function, f"generated_{key}")
+            for key, function in code.steps.functions.items()
+            if key not in unused
+        )
         return code.words(name) | {
-            "generated": generated(functions),
+            "generated": without_branches(generate(*functions)),
             "period": repr(ticks.period),
             "start": repr(ticks.time(first)),
             "first": str(first),

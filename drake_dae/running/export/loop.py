@@ -48,31 +48,20 @@ def export_loop(
 ) -> list[Path]:
     """Writes a whole loop, or any diagram that can be compiled, as C99 that runs over time.
 
-    Plant, sensors and controller are integrated by the stepper of rollouts, in fixed steps;
+    Plant, sensors and controller are integrated by the stepper of rollouts, in the fixed steps of
+    the config; with error control, or for None, they are at most 1 ms by `runge_kutta5`.
     name_loop.h describes the functions. Outputs are the signals of a record; of a diagram, its
     vector output ports. The program play_name_loop.c compares with a recorded run of Drake's
-    Simulator from the context on, name_loop_run.csv, in the same steps; `make` in the folder runs
-    it.
-
-    Args:
-        loop: The closed loop or the diagram; see `compile_diagram`.
-        context: Its context at the start; not changed.
-        name: The name of the files, and, as a C identifier, the prefix of the functions.
-        folder: The folder to write to; created if it does not exist. Files are overwritten.
-        config: Drake's settings with fixed steps. If they have error control, or for None, the
-            steps are at most 1 ms by `runge_kutta5`.
-        duration: The duration of the run that is compared, in s; at most 2000 steps.
+    Simulator from the context on, of at most 2000 steps, name_loop_run.csv; `make` in the folder
+    runs it.
 
     Raises:
         ModelError: It has Drake's own contact, noise, or a block that cannot be traced; or the
             fixed steps are of an implicit method.
     """
     diagram = loop if isinstance(loop, Diagram) else loop.diagram
-    known: Vectors = {}
-    ports = None
-    if not isinstance(loop, Diagram):
-        ports = {signal: diagram.GetOutputPort(signal) for signal in loop.signals}
-        known = loop.signals
+    known: Vectors = {} if isinstance(loop, Diagram) else loop.signals
+    ports = {name: diagram.GetOutputPort(name) for name in known} or None
     composed = compose(diagram, ports, context=context, shares=False)
     check_traced(composed, "the loop")
     code, start = BlockCode(composed, context, {}, known), context.get_time()
