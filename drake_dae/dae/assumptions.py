@@ -163,12 +163,12 @@ def find_dependence(
     """Finds how the constraints depend on each other at a state where A(x) is singular."""
     system = manifold.system
     names = [signal.name for signal in system.constraint_output_signals]
-    rows = {"a": elimination.constraint_matrix, "last": elimination.constraint_gradient}
-    function = system.trace("dependence", {k: ca.densify(e) for k, e in rows.items()}, often=False)
+    A = system.matrix("dependence", elimination.constraint_matrix)
+    gradient = system.matrix("dependence", elimination.constraint_gradient)
 
     def matrices(state: FloatArray) -> list[FloatArray]:
-        a, last = (v.reshape(len(names), -1) for v in function(state, system.parameter_values))
-        return [a, last * system.scale]
+        p = system.parameter_values
+        return [A(state, p), gradient(state, p) * system.scale]
 
     least = system.least_margin
     everywhere = all(smallest_singular_value(equilibrated(matrices(x)[0])) < least for x in states)

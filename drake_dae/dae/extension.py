@@ -104,11 +104,11 @@ def dynamic_extension(
             f"{system.name}: control_metric compares controls, not their derivatives; leave it "
             "out, and give the extended system one"
         )
-    given, names = nominal_control or {}, [signal.name for signal in system.control_signals]
-    for name in given:
+    values, names = nominal_control or {}, [signal.name for signal in system.control_signals]
+    for name in values:
         if name not in names:
             raise ModelError(f"{system.name}: {unknown_name('control', name, names)}")
-    held = np.array([given.get(name, 0.0) for name in names], dtype=float)
+    held = np.array([values.get(name, 0.0) for name in names], dtype=float)
     spreads = spread_of(system, spread)
     bases = [(signal, 0) for signal in system.control_signals]  # And how often integrated.
     extended, integrators = system, dict[str, int]()
@@ -127,9 +127,9 @@ def dynamic_extension(
         columns, mixing = choice
         others, nominal = [j for j in range(len(names)) if j not in columns], held[columns]
         if mixing is not None:
-            function = extended.trace("mixing", {"mixing": mixing}, often=False)
-            here = function(extended.nominal_state, extended.parameter_values)[0]
-            nominal = nominal + here.reshape(mixing.shape) @ held[others]
+            mixed = extended.matrix("mixing", mixing)
+            here = mixed(extended.nominal_state, extended.parameter_values)
+            nominal = nominal + here @ held[others]
             for i in columns:
                 control = extended.control_signals[i]
                 bases[i] = (Signal(f"{control.name}*", control.unit), 0)

@@ -19,34 +19,34 @@ from drake_dae.trace.compiled import check_choice
 from drake_dae.trace.expressions import find_flaw
 
 
-def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
+def checked_fields(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Checks the fields of a system and returns those that change, converted."""
-    name, state = given["name"], given["state"]
+    name, state = arguments["name"], arguments["state"]
     if not (is_symbol(state) and state.numel()):
         raise ModelError(
             f"{name}: 'state' must be a CasADi SX column of symbols, "
             f"for example casadi.SX.sym('x', 4); got {type(state).__name__}"
         )
     state = ca.vec(state)
-    check_choice(name, given["compiled"])
-    if not 1e-15 <= number(f"{name}: least_margin", given["least_margin"]) < 1.0:
+    check_choice(name, arguments["compiled"])
+    if not 1e-15 <= number(f"{name}: least_margin", arguments["least_margin"]) < 1.0:
         raise ModelError(
             f"{name}: least_margin must be from 1e-15, which is round-off, to below 1, got "
-            f"{brief(given['least_margin'])}"
+            f"{brief(arguments['least_margin'])}"
         )
     for key, kind in (("contacts", UnilateralInput), ("parameters", Parameter)):
-        items = given[key]
+        items = arguments[key]
         if not isinstance(items, (list, tuple)) or not all(isinstance(i, kind) for i in items):
             raise ModelError(
                 f"{name}: {key} must be a list of {kind.__name__}s, got {brief(items)}"
             )
-    parameters = tuple(given["parameters"])
+    parameters = tuple(arguments["parameters"])
     known = [p.name for p in parameters]
     _check_unique(name, "parameter", known)
-    for contact in given["contacts"]:
+    for contact in arguments["contacts"]:
         if contact.friction not in (None, *known):
             raise ModelError(f"{name}: {unknown_name('parameter', contact.friction, known)}")
-    expressions = _expressions(name, given, state, parameter_symbol(parameters))
+    expressions = _expressions(name, arguments, state, parameter_symbol(parameters))
     fields = {"state": state, "parameters": parameters, **expressions}
     n, m = state.numel(), expressions["k"].numel()
     p, q = expressions["h"].shape[1], expressions["l"].numel()
@@ -57,18 +57,20 @@ def checked_fields(given: Mapping[str, Any]) -> dict[str, Any]:
         ("control_signals", p, "u"),
         ("output_signals", q, "z"),
     ):
-        named = given[key] or [f"{letter}{i}" for i in range(count)]
+        named = arguments[key] or [f"{letter}{i}" for i in range(count)]
         fields[key] = signals = _as_signals(f"{name}: {key}", named)
         if len(signals) != count:
             raise ModelError(f"{name}: {key} has {len(signals)} entries, expected {count}")
         _check_unique(name, key, [signal.name for signal in signals])
     for key in ("nominal_state", "state_scale"):
-        value = np.zeros(n) if key == "nominal_state" and given[key] is None else given[key]
+        value = np.zeros(n) if key == "nominal_state" and arguments[key] is None else arguments[key]
         if value is not None:
             fields[key] = vector(f"{name}: {key}", value, n)
             fields[key].setflags(write=False)
     if np.any(fields.get("state_scale", 1.0) <= 0.0):
-        raise ModelError(f"{name}: state_scale must be positive, got {brief(given['state_scale'])}")
+        raise ModelError(
+            f"{name}: state_scale must be positive, got {brief(arguments['state_scale'])}"
+        )
     if "control_metric" not in expressions:
         if "free_control" in expressions:
             raise ModelError(
@@ -133,12 +135,14 @@ def as_expression(owner: str, key: str, value: Any) -> ca.SX:
 
 
 def _expressions(
-    owner: str, given: Mapping[str, Any], state: ca.SX, parameters: ca.SX
+    owner: str, arguments: Mapping[str, Any], state: ca.SX, parameters: ca.SX
 ) -> dict[str, ca.SX]:
     """Converts the functions of (1)-(3) to expressions of the right shapes, and checks them."""
     optional = ("mass_matrix", "control_metric", "free_control")
-    functions = {key: given[key] for key in "fghklm"} | {"mass_matrix": ca.SX.eye(state.numel())}
-    functions |= {key: given[key] for key in optional if given[key] is not None}
+    functions = {key: arguments[key] for key in "fghklm"} | {
+        "mass_matrix": ca.SX.eye(state.numel())
+    }
+    functions |= {key: arguments[key] for key in optional if arguments[key] is not None}
     values = {key: as_expression(owner, key, value) for key, value in functions.items()}
     n, m, p = state.numel(), values["k"].numel(), values["h"].shape[1]
     q = values["l"].numel()
@@ -205,10 +209,10 @@ def _called(
     try:
         value = function(*arguments)
     except Exception as error:
-        given = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
+        taken = "the state x and the parameters p" if len(arguments) > 1 else "the state x alone"
         raise ModelError(
             f"{owner}: function {letter} failed on a CasADi column of {arguments[0].numel()} "
-            f"states: {error}. It is called with {given}; use CasADi's own functions (casadi.sin) "
+            f"states: {error}. It is called with {taken}; use CasADi's own functions (casadi.sin) "
             "or plain operators. A condition, as in if, max or min, is not smooth: write the "
             "branch in which the state remains"
         ) from error

@@ -284,8 +284,8 @@ class Manifold:
 
     def _settled(self, start: FloatArray, p: FloatArray, chosen: Indices) -> FloatArray | None:
         """The state next to a start where chosen states, and if possible velocities, stay."""
-        given = np.union1d(chosen, self._settling.given_rates(start))
-        for kept in (given, chosen) if given.size > chosen.size else (chosen,):
+        wanted = np.union1d(chosen, self._settling.moving_states(start))
+        for kept in (wanted, chosen) if wanted.size > chosen.size else (chosen,):
             found = self._settling.settled(start, p, kept)
             if found is None:
                 continue
@@ -331,12 +331,12 @@ class _Settling:
         """The states on which the constraints themselves depend, such as positions."""
         return self._levels[0][1] if self._levels else np.zeros(0, dtype=np.intp)
 
-    def given_rates(self, start: FloatArray) -> Indices:
+    def moving_states(self, start: FloatArray) -> Indices:
         """The states that are new in derivatives of constraints and not 0, where others are 0."""
         found = [np.zeros(0, dtype=np.intp)]
         for _, columns, _ in self._levels[1:]:
-            given = columns[start[columns] != 0.0]
-            found += [given] if given.size < columns.size else []
+            moving = columns[start[columns] != 0.0]
+            found += [moving] if moving.size < columns.size else []
         return np.concatenate(found)
 
     def settled(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
 
 import casadi as ca
 import numpy as np
@@ -15,6 +16,7 @@ from drake_dae.trace.round_off import equilibration, smallest_singular_value
 
 # Critical coefficients above this are meaningless: they occur where sliding is only round-off.
 MEANINGLESS = 1e6
+LOWEST = attrgetter("lowest")
 # The fractions of the lowest critical friction so far for which a paradoxical state is sought.
 CLOSER = (0.9, 0.99)
 
@@ -52,12 +54,12 @@ def find_margin(
     for i, j in np.argwhere(round_off) if round_off is not None else ():
         whole[int(i), int(j)] = 0.0
     whole = ca.sparsify(whole)
-    function = system.trace("margin", {"matrix": whole}, often=False)
+    value_of = system.matrix("margin", whole)
     sizes = np.mean([np.abs(value) for (value,) in samples.values(matrix=whole)], axis=0)
     rows, columns = equilibration(sizes)
 
     def plain(state: FloatArray) -> FloatArray:
-        return function(state, system.parameter_values)[0].reshape(matrix.shape)
+        return value_of(state, system.parameter_values)
 
     def scaled(state: FloatArray) -> FloatArray:
         return plain(state) / rows[:, None] / columns
@@ -179,14 +181,14 @@ class ContactMargins:
     def over(self, samples: Samples, search: bool) -> ContactMargin:
         """Returns the smallest margin at samples and, downhill from the worst, between them."""
         p = self._system.parameter_values
-        margins = sorted((self.at(state, p) for state in samples.states), key=_lowest)
-        starts = margins[:3] if search else []
-        return min([margins[0], *(self._downhill(samples, m, p) for m in starts)], key=_lowest)
+        margins = sorted((self.at(state, p) for state in samples.states), key=LOWEST)
+        lower = [self._downhill(samples, m, p) for m in margins[:3]] if search else []
+        return min([margins[0], *lower], key=LOWEST)
 
     def along(self, times: FloatArray, states: FloatArray, parameters: FloatArray) -> ContactMargin:
         """Returns the smallest margin along a motion of at least one state."""
         rows = zip(states, parameters, times.tolist(), strict=True)
-        return min((self.at(*row) for row in rows), key=_lowest)
+        return min((self.at(*row) for row in rows), key=LOWEST)
 
     def _downhill(
         self, samples: Samples, best: ContactMargin, parameters: FloatArray
@@ -221,7 +223,3 @@ class ContactMargins:
         values = parameters.copy()
         values[self._places] = friction
         return values
-
-
-def _lowest(margin: ContactMargin) -> float:
-    return margin.lowest

@@ -55,17 +55,15 @@ def drop_constraints(system: DaeSystem, names: Sequence[str] | None = None) -> D
     samples = all_constraints_hold(system)
     if names is None:
         names = [combination.name for combination in redundant_constraints(samples)]
-    kept = _all_but(system, names)
-    if len(kept) == system.num_constraints:
-        return system
-    gone = ", ".join(f"'{name}'" for name in names)
-    if system.m[:, [i for i in range(system.num_constraints) if i not in kept]].nnz():
-        raise ModelError(
-            f"{system.name}: an output is the force of {gone}, which is not determined where "
-            "constraints are redundant; choose other outputs, or leave out other constraints"
-        )
-    _check_same_motion(samples, kept, gone)
-    return with_constraints(system, kept)
+    kept, left_out = _split(system, names)
+    if left_out:
+        gone = _check_same_motion(samples, kept, left_out)
+        if system.m[:, left_out].nnz():
+            raise ModelError(
+                f"{system.name}: an output is the force of {gone}, which is not determined where "
+                "constraints are redundant; choose other outputs, or leave out other constraints"
+            )
+    return with_constraints(system, kept) if left_out else system
 
 
 @checked(ModelError)
@@ -112,12 +110,10 @@ def share_forces(
         what = f"{system.name}: the compliance of '{name}'"
         weights[inputs.index(name)] = positive_number(what, value)
     samples = all_constraints_hold(system)
-    kept = _independent(samples) if names is None else _all_but(system, names)
-    if len(kept) == system.num_constraints:
+    kept, left_out = _independent(samples) if names is None else _split(system, names)
+    if not left_out:
         return system
-    left_out = [i for i in range(system.num_constraints) if i not in kept]
-    signals = system.constraint_output_signals
-    _check_same_motion(samples, kept, ", ".join(f"'{signals[i].name}'" for i in left_out))
+    _check_same_motion(samples, kept, left_out)
     inertia = PositiveDefiniteFactorization(system.mass_matrix)
     half = inertia.forward(system.g)
     product = ca.sparsify(ca.mtimes(inertia.scaled(half).T, half))
@@ -134,7 +130,7 @@ def share_forces(
         signals=system.constraint_input_signals,
         undetermined=_undetermined(samples, gather, split),
         left_out=system.k[left_out],
-        left_out_signals=tuple(signals[i] for i in left_out),
+        left_out_signals=tuple(system.constraint_output_signals[i] for i in left_out),
     )
     return replace(with_constraints(system, kept), sharing=sharing)
 
@@ -194,17 +190,18 @@ class _Redundant(Manifold):
         )
 
 
-def _all_but(system: DaeSystem, names: Sequence[str]) -> list[int]:
-    """The indices of the constraints whose names are not listed."""
+def _split(system: DaeSystem, names: Sequence[str]) -> tuple[list[int], list[int]]:
+    """The indices of the constraints that stay, and of those that are named."""
     signals = [signal.name for signal in system.constraint_output_signals]
     for name in names:
         if name not in signals:
             raise ModelError(f"{system.name}: {unknown_name('constraint', name, signals)}")
-    return [i for i, name in enumerate(signals) if name not in names]
+    left_out = [i for i, name in enumerate(signals) if name in names]
+    return [i for i in range(len(signals)) if i not in left_out], left_out
 
 
-def _independent(samples: Samples) -> list[int]:
-    """The indices of constraints that are well independent of each other at all samples."""
+def _independent(samples: Samples) -> tuple[list[int], list[int]]:
+    """The indices of constraints that are well independent at all samples, and of the others."""
     values = samples.values(gradient=ca.jacobian(samples.system.k, samples.system.state))
     scaled = [gradient * samples.system.scale for (gradient,) in values]
     remainders = [equilibrated(gradient) for gradient in scaled]
@@ -217,12 +214,13 @@ def _independent(samples: Samples) -> list[int]:
         for matrix in remainders:
             direction = matrix[chosen] / np.linalg.norm(matrix[chosen])
             matrix -= np.outer(matrix @ direction, direction)
-    return sorted(kept)
+    return sorted(kept), [i for i in range(samples.system.num_constraints) if i not in kept]
 
 
-def _check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
-    """Raises ModelError if the motion changes without the constraints that are not kept."""
+def _check_same_motion(samples: Samples, kept: list[int], left_out: list[int]) -> str:
+    """Raises ModelError if the motion changes without some constraints; returns their names."""
     system = samples.system
+    gone = ", ".join(f"'{system.constraint_output_signals[i].name}'" for i in left_out)
     moving = ca.vertcat(ca.SX(0, 1), *[p.symbol for p in system.exogenous.moving])
     gradients = samples.values(
         gradient=ca.jacobian(system.k, system.state), moved=ca.jacobian(system.k, moving)
@@ -244,6 +242,7 @@ def _check_same_motion(samples: Samples, kept: list[int], gone: str) -> None:
         ):
             if rank_of(significant(rows)[kept]) < rank_of(rows):
                 raise ModelError(f"{system.name}: {gone} cannot be left out: {why}")
+    return gone
 
 
 def with_constraints(system: DaeSystem, kept: list[int]) -> DaeSystem:

@@ -6,7 +6,6 @@ there must be zero with all other numbers.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -18,6 +17,7 @@ from drake_dae.dae.derivatives import Derivatives, lie_derivative, lie_derivativ
 from drake_dae.dae.elimination import Elimination, eliminate_numbers
 from drake_dae.dae.manifold import Manifold
 from drake_dae.dae.samples import Family, Samples, as_matrix, fields_at, outside
+from drake_dae.dae.signals import Signal
 from drake_dae.dae.system import DaeSystem
 from drake_dae.errors import AssumptionError
 from drake_dae.trace.factorization import nonzeros
@@ -33,7 +33,7 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
     explicit = system.explicit
     x, f, names = system.state, explicit.f, [s.name for s in system.constraint_output_signals]
     chains = [[system.k[i]] for i in range(system.num_constraints)]  # (2)
-    undecided, others = list(range(system.num_constraints)), dict[int, Violation]()
+    undecided, others = list(range(len(chains))), _OtherDegrees(system.constraint_output_signals)
     while undecided:
         last = ca.vertcat(*[chains[i][-1] for i in undecided])
         by_force = lie_derivative_along(last, explicit.g, x)
@@ -46,8 +46,7 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
         for row, i in enumerate(undecided):
             order, name = len(chains[i]), (names[i],)
             if force_acts[row].all():
-                if i in others:  # For other parameters the degree is another one.
-                    raise others[i].error()
+                others.check(i)
                 continue
             if force_acts[row].any():
                 state = samples.states[int(np.argmin(force_acts[row]))]
@@ -57,8 +56,8 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
                 raise Violation(3, ViolationKind.EARLY_CONTROL, name, order, state).error()
             for key, rows, assumption in (("g", by_force, 1), ("h", by_control, 3)):
                 if rows[row, :].nnz():
-                    violation = Violation(assumption, ViolationKind.NUMBERS, name, order)
-                    _examine(others, i, violation, samples, actions.along(chains[i][-1], key))
+                    along = actions.along(chains[i][-1], key)
+                    others.examine(i, assumption, order, samples, along)
             following.append(i)
             if not reached[row] or (
                 by_force[row, :].nnz() and samples.dependent(ca.vertcat(*chains[i]))
@@ -69,7 +68,7 @@ def constraint_chains(system: DaeSystem, guesses: FloatArray) -> tuple[list[list
         if sum(len(chain) for chain in chains) + len(following) > system.num_states:
             stuck = following
         if stuck:
-            raise _never(2, ViolationKind.NO_FORCE, stuck, names, samples, others)
+            raise others.never(ViolationKind.NO_FORCE, stuck, samples)
         for i in following:
             derivative = lie_derivative(chains[i][-1], f, x)
             if system.exogenous:
@@ -90,7 +89,7 @@ def output_chains(
     drift, control_matrix, highest = ca.SX(count, 1), ca.SX(*shape), ca.SX(count, 1)
     round_off, need_force = np.zeros(shape, dtype=bool), False
     chains: list[list[ca.SX]] = [[] for _ in range(count)]
-    others, actions = dict[int, Violation](), InputActions(samples, elimination)
+    others, actions = _OtherDegrees(system.output_signals), InputActions(samples, elimination)
     slopes = actions.numbers(actions.feedthrough)
     moving = system.outputs(derivatives.constraint_input)
     following, rows = elimination.l_star, elimination.n_star
@@ -100,8 +99,7 @@ def output_chains(
         for row, i in enumerate(undecided):
             order, name = len(chains[i]), (names[i],)
             if acts[row].all():
-                if i in others:  # For other parameters the degree is another one.
-                    raise others[i].error()
+                others.check(i)
                 drift[i], highest[i] = following[row], moving[row]
                 control_matrix[i, :] = rows[row, :]  # (16)
                 round_off[i] = len(slopes) >= MANY and ~slopes[:, row, :].any(axis=0)
@@ -110,8 +108,7 @@ def output_chains(
                 raise Violation(4, ViolationKind.OUTPUT_DEGREE, name, order, state).error()
             else:
                 if not chains[i] and rows[row, :].nnz():
-                    violation = Violation(4, ViolationKind.NUMBERS, name, 0)
-                    _examine(others, i, violation, samples, actions.feedthrough, i)
+                    others.examine(i, 4, 0, samples, actions.feedthrough, i)
                 still.append(i)
                 chains[i].append(following[row])
                 need_force = need_force or derivatives.has_unknowns(moving[row])
@@ -128,8 +125,8 @@ def output_chains(
             if acts[row].any():
                 continue
             if rows[row, :].nnz():
-                violation = Violation(4, ViolationKind.NUMBERS, (names[i],), len(chains[i]))
-                _examine(others, i, violation, samples, actions.along(chains[i][-1], "h*"))
+                along = actions.along(chains[i][-1], "h*")
+                others.examine(i, 4, len(chains[i]), samples, along)
             # By Theorem 2.1 these differentials are independent if the output has a degree. Tested
             # where nothing acts although the structure allows it.
             used = ca.vertcat(samples.manifold.residual_expression, *chains[i])
@@ -137,7 +134,7 @@ def output_chains(
             if is_full or (rows[row, :].nnz() and samples.dependent(used)):
                 stuck.append(i)
         if stuck:
-            raise _never(5, ViolationKind.NO_CONTROL, stuck, names, samples, others)
+            raise others.never(ViolationKind.NO_CONTROL, stuck, samples)
         undecided = still
     return {
         "output_chains": tuple(map(tuple, chains)),
@@ -155,15 +152,13 @@ class InputActions:
     def __init__(self, samples: Samples, elimination: Elimination | None = None) -> None:
         self._samples, self._system, self._scale = samples, samples.system, samples.scale
         if elimination is not None:
-            gradient, matrix = elimination.constraint_gradient, elimination.constraint_matrix
-            factors = {"gradient": gradient, "matrix": matrix}
+            factors = {"c": elimination.constraint_gradient, "A": elimination.constraint_matrix}
             self._factors = self._system.trace("sample", factors, often=False)
 
     def along(self, functions: ca.SX, key: str) -> Row:
         """Returns the derivatives of functions along the columns of g, h or h* (10)."""
         system = self._system
-        gradient = ca.jacobian(functions, system.state)
-        trace = system.trace("sample", {"gradient": gradient}, often=False)
+        gradient = system.matrix("sample", ca.jacobian(functions, system.state))
 
         def row(state: FloatArray, parameters: FloatArray) -> Sized:
             if key == "h*":
@@ -171,10 +166,9 @@ class InputActions:
             else:
                 value = fields_at(system, state, parameters)[key]
                 field = value, np.abs(value)
-            gradients = trace(state, parameters)[0].reshape(gradient.shape)
+            gradients = gradient(state, parameters)
             if not np.all(np.isfinite(gradients)):
-                nowhere = np.full((len(gradients), field[0].shape[1]), np.nan)
-                return nowhere, nowhere
+                return (gradients @ (np.nan * field[0]),) * 2
             return multiply(gradients, field, self._scale)
 
         return row
@@ -205,44 +199,49 @@ class InputActions:
         try:
             return eliminate_numbers(fields, gradient, matrix, self._scale)
         except np.linalg.LinAlgError:
-            h_star, n_star = fields["h"] * np.nan, fields["m"] @ np.zeros(fields["h"].shape)
-            return (h_star, h_star), (n_star * np.nan, n_star)
+            h_star = np.nan * fields["h"]
+            n_star = np.full((len(fields["m"]), h_star.shape[1]), np.nan)
+            return (h_star, h_star), (n_star, n_star)
 
 
-def _examine(
-    others: dict[int, Violation],
-    index: int,
-    violation: Violation,
-    samples: Samples,
-    row: Row,
-    of: int = 0,
-) -> None:
-    """Records the violation by a row that is zero at the default parameters, but not at others."""
+class _OtherDegrees:
+    """What is found for other parameters than the defaults, where nothing acts at these."""
 
-    @np.errstate(all="ignore")  # Values that are not finite decide nothing.
-    def acts(state: FloatArray, parameters: FloatArray) -> bool:
-        value, size = (each[of] for each in row(state, parameters))
-        return bool(np.any(np.abs(value) > VISIBLE * size))
+    def __init__(self, signals: Sequence[Signal]) -> None:
+        self._names = [signal.name for signal in signals]
+        self._violations: dict[int, Violation] = {}
 
-    if index not in others:
-        deciding = Family(samples.manifold, samples.states).deciding(acts)
-        if deciding:
-            others[index] = replace(violation, deciding=deciding)
+    def examine(
+        self, i: int, assumption: int, order: int, samples: Samples, row: Row, of: int = 0
+    ) -> None:
+        """Looks whether a row that is zero at the default parameters is not at others."""
 
+        @np.errstate(all="ignore")  # Values that are not finite decide nothing.
+        def acts(state: FloatArray, parameters: FloatArray) -> bool:
+            value, size = (each[of] for each in row(state, parameters))
+            return bool(np.any(np.abs(value) > VISIBLE * size))
 
-def _never(
-    assumption: int,
-    kind: ViolationKind,
-    stuck: Sequence[int],
-    names: Sequence[str],
-    samples: Samples,
-    others: dict[int, Violation],
-) -> AssumptionError:
-    """The error of constraints or outputs on which no input ever acts."""
-    dependent = redundant_constraints(samples) if kind is ViolationKind.NO_FORCE else ()
-    deciding = next((others[i].deciding for i in stuck if i in others), None)
-    those = tuple(names[i] for i in stuck)
-    return Violation(assumption, kind, those, combinations=dependent, deciding=deciding).error()
+        if i not in self._violations:
+            deciding = Family(samples.manifold, samples.states).deciding(acts)
+            if deciding:
+                names, kind = (self._names[i],), ViolationKind.NUMBERS
+                violation = Violation(assumption, kind, names, order, deciding=deciding)
+                self._violations[i] = violation
+
+    def check(self, i: int) -> None:
+        """Raises the violation of one whose degree is another one for other parameters."""
+        if i in self._violations:
+            raise self._violations[i].error()
+
+    def never(self, kind: ViolationKind, stuck: Sequence[int], samples: Samples) -> AssumptionError:
+        """The error of constraints or outputs on which no input ever acts."""
+        is_constraint = kind is ViolationKind.NO_FORCE
+        dependent = redundant_constraints(samples) if is_constraint else ()
+        known = self._violations
+        deciding = next((known[i].deciding for i in stuck if i in known), None)
+        those, assumption = tuple(self._names[i] for i in stuck), 2 if is_constraint else 5
+        violation = Violation(assumption, kind, those, combinations=dependent, deciding=deciding)
+        return violation.error()
 
 
 def _reached(fields: ca.SX, drift: ca.SX, expressions: ca.SX, state: ca.SX) -> Booleans:

@@ -31,7 +31,7 @@ SHIFT = 1e-7  # The error of an equilibrium, relative to the size of the states.
 AT_REST = 1e-8  # A state is at rest if the terms of E x' cancel to this, relative to their sizes.
 ISOLATED = 1e-6  # An equilibrium is known to this distance, relative to the scale of the states.
 # The distance, relative to the scale, within which the slopes must be nearly constant.
-BESIDE = 1e-5
+NEARBY = 1e-5
 SAME = 0.5  # The allowed relative change of the slopes there: then Newton's method contracts.
 # Along a periodic motion:
 ACCURACY = 1e-9  # The error of an integration step, relative to the scale of the states.
@@ -92,9 +92,9 @@ def linearized_eigenvalues(
     values, errors = eigenvalues_of(matrix, off, rounded)
     along = moved @ (scale[free] * np.random.default_rng(0).standard_normal(free.size))
     along /= np.max(np.abs(along) / scale, initial=0.0) or 1.0
-    beside = pinned.slopes(state + SHIFT * along)
-    if np.all(np.isfinite(beside)):
-        shifted = (beside @ moved)[free] / units
+    nearby = pinned.slopes(state + SHIFT * along)
+    if np.all(np.isfinite(nearby)):
+        shifted = (nearby @ moved)[free] / units
         others, _ = eigenvalues_of(shifted, 0.0 * off)
         errors += np.min(np.abs(values[:, None] - others), axis=1, initial=np.inf)
         if _stays_off_the_axis(matrix, off + np.abs(shifted - matrix), rounded):
@@ -298,7 +298,7 @@ class Equilibria:
             isolated = size > 0.0 and rest <= ISOLATED * size
             if isolated:
                 along = moved @ (scale[free] * v)
-                along *= BESIDE / np.max(np.abs(along) / scale)
+                along *= NEARBY / np.max(np.abs(along) / scale)
                 changes = [u @ (slopes_at(x) - slopes) @ v for x in (state + along, state - along)]
                 isolated = all(abs(change) <= SAME * size for change in changes)
             count += not isolated

@@ -72,9 +72,7 @@ class ConstraintStructure:
 
     @cached_property
     def _matrix(self) -> Callable[[FloatArray, FloatArray], FloatArray]:
-        matrix = self.elimination.constraint_matrix
-        function = self.system.trace("A(x)", {"value": matrix}, often=False)
-        return lambda x, p: function(x, p)[0].reshape(matrix.shape)
+        return self.system.matrix("A(x)", self.elimination.constraint_matrix)
 
     def dependent_constraints(self, state: FloatArray, parameters: FloatArray) -> tuple[str, ...]:
         """Returns the names of the constraints that become dependent where A(x) is singular."""
@@ -291,10 +289,9 @@ def _names(system: DaeSystem) -> tuple[str, ...]:
 
 def _check_positive_definite(system: DaeSystem, key: str, states: FloatArray) -> None:
     """Checks E of E x' = f + g v + h u, since LDL^T reads only one triangle of it, or W."""
-    matrix = ca.densify(getattr(system, key))
-    function = system.trace(key, {"matrix": matrix}, often=False)
+    matrix = system.matrix(key, getattr(system, key))
     for state in states:
-        value = function(state, system.parameter_values)[0].reshape(matrix.shape)
+        value = matrix(state, system.parameter_values)
         length = np.sqrt(np.abs(np.diag(value)))
         if np.all(np.isfinite(value)) and np.all(length > 0.0):
             scaled = value / length / length[:, None]  # Independent of units.
@@ -408,11 +405,7 @@ def _singular(
         violation = Violation(*kinds[1], names, None, margin.state, margin.relative, margin.least)
     elif not (matrix.is_square() and any(p.bounds is not None for p in system.parameters)):
         return None
-    function = system.trace("rank", {"matrix": ca.densify(matrix)}, often=False)
-    family = Family(structure.manifold, states)
-
-    def value(state: FloatArray, parameters: FloatArray) -> FloatArray:
-        return function(state, parameters)[0].reshape(matrix.shape)
+    value, family = system.matrix("rank", matrix), Family(structure.manifold, states)
 
     @np.errstate(all="ignore")
     def is_regular(state: FloatArray, parameters: FloatArray) -> bool:

@@ -332,6 +332,13 @@ class DaeSystem:
         name = f"{self.name} {name}"
         return TracedFunction(name, every, outputs, pivot, regular, often, self.compiled)
 
+    def matrix(
+        self, name: str, expression: ca.SX
+    ) -> Callable[[FloatArray, FloatArray], FloatArray]:
+        """Returns the function (state, parameters) -> a matrix as a new array of its shape."""
+        function = self.trace(name, {"value": expression}, often=False)
+        return lambda state, parameters: function(state, parameters)[0].reshape(expression.shape)
+
     def agree(self, first: ca.SX, second: ca.SX, *unknowns: ca.SX) -> bool:
         """Returns whether two expressions agree at random states around the nominal state.
 

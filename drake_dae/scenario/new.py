@@ -3,7 +3,7 @@
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from math import ceil, log10, pi
@@ -81,9 +81,8 @@ _NORMALS = (
     *((2, 1.0, 1.0), (2, -1.0, 0.4)),
 )
 
-_TRIES, _PATIENCE, _SLANTED = 40, 8, 0.3
-"""The postures that are tried for each normal; after how many without a tool along it the normal is
-given up; and the weight of a posture with a tool that is not along it."""
+_TRIES, _SLANTED = 40, 0.3
+"""The postures that are tried for each normal; the weight of one with the tool not along it."""
 
 _ENOUGH = 0.6
 """The friction below which a contact does not jam along the path at a place that is good enough."""
@@ -408,24 +407,14 @@ def _places(links: MultibodyExpressions, tip: str, point: Vector) -> list[_Place
     efforts = np.where(efforts > 0.0, efforts, np.inf)
     guesses, size = postures.guesses(_TRIES), postures.size
 
-    def along(axis: int) -> Iterator[FloatArray]:
-        """Configurations with the tool along an axis; a planar robot has none about some axes."""
-        found = False
-        for count, guess in enumerate(guesses):
-            q = postures.solve([3 + 2 * axis, 4 + 2 * axis], np.zeros(2), guess)
-            found = found or q is not None
-            if q is not None:
-                yield q
-            elif count == _PATIENCE - 1 and not found:
-                break
-
-    Seen = tuple[Posture, list[FloatArray], float]
-
-    def seen(q: FloatArray, factor: float) -> Seen:
+    def seen(q: FloatArray, factor: float) -> tuple[Posture, list[FloatArray], float]:
         return postures.at(q), [value.full() for value in function(q, values)], factor
 
-    slanted = [seen(guess, _SLANTED) for guess in guesses]
-    choices = {axis: [*(seen(q, 1.0) for q in along(axis)), *slanted] for axis in range(3)}
+    slanted, choices = [seen(guess, _SLANTED) for guess in guesses], []
+    for axis in range(3):  # A planar robot cannot turn its tool along some axes.
+        tilts = [3 + 2 * axis, 4 + 2 * axis]
+        solved = (postures.solve(tilts, np.zeros(2), guess) for guess in guesses)
+        choices.append([*(seen(q, 1.0) for q in solved if q is not None), *slanted])
     found = list[tuple[float, _Place]]()
     for axis, sign, preference in _NORMALS:
         ways, score, rows_at = [k for k in range(3) if k != axis], 0.0, list[int]()

@@ -91,11 +91,8 @@ def _set_numbers(scenario: Scenario, loop: ClosedLoop, context: Context) -> None
     for key, values in numbers.items():
         with at(key):
             for name, value in values.items():
-                # A user's own plant may not let these be set, and has been made with them.
-                is_set = key != "plant.parameters" and np.array_equal(
-                    before[plant.dae.parameter_slice(name)], np.ravel(value)
-                )
-                if not is_set:
+                # A user's own plant may not let numbers be set, and has been made with these.
+                if not np.array_equal(before[plant.dae.parameter_slice(name)], np.ravel(value)):
                     plant.set_parameter(at_plant, name, value)
     with at("plant"):
         of_plant.begin(plant, at_plant)

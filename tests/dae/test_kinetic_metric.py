@@ -3,17 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
-import scipy.linalg
-from arms import arm, consistent_states, numbers
 
 from drake_dae.dae import DaeSystem, Manifold, find_constraint_structure
-
-
-def least(mass: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """The dv with J dv = -residual and the least dv^T M dv, by the equations of Lagrange."""
-    n, m = mass.shape[0], jacobian.shape[0]
-    whole = np.block([[mass, jacobian.T], [jacobian, np.zeros((m, m))]])
-    return scipy.linalg.solve(whole, np.concatenate([np.zeros(n), -residual]))[:n]
 
 
 def rod_between_masses(masses=(1.0, 1e4), lengths=(1.0, 1.0)) -> Manifold:
@@ -55,23 +46,3 @@ def test_what_is_heavy_stays_in_any_units(lengths):
     np.testing.assert_allclose(found[4:] - start[4:], turned, rtol=0, atol=1e-11)
     assert manifold.is_consistent(found / units)
     np.testing.assert_allclose(manifold.residual(found / units), 0.0, atol=1e-14)
-
-
-@pytest.mark.parametrize("name", ["two_link", "seven_joint"])
-def test_a_robot_is_moved_as_multibody_plant_says(name):
-    """Positions by M^-1 J^T and velocities likewise, to the square of what they are off."""
-    structure, random = arm(name).structure, np.random.default_rng(0)
-    size = structure.system.num_states // 2
-    for state in consistent_states(name, 3):
-        truth = numbers(name, state[:size], state[size:])
-        mass, J = truth.mass, truth.constraint_jacobian
-        off = 1e-5 * random.standard_normal(size)
-        moved = structure.manifold.settle(state + np.concatenate([off, np.zeros(size)]))
-        wanted = least(mass, J, J @ off)
-        found = moved[:size] - state[:size] - off
-        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
-        # Velocities alone: exactly, as the constraint is linear in them.
-        moved = structure.manifold.settle(state + np.concatenate([np.zeros(size), off]))
-        np.testing.assert_allclose(moved[:size], state[:size], rtol=0, atol=2e-15)
-        found = moved[size:] - state[size:] - off
-        np.testing.assert_allclose(found, least(mass, J, J @ off), rtol=0, atol=1e-12)

@@ -1,9 +1,8 @@
-"""Pinned motions against closed forms, closed loops and MultibodyPlant."""
+"""Pinned motions against closed forms."""
 
 import casadi as ca
 import numpy as np
 import pytest
-from actuated import OFFSET, actuated, at_rest, drive, rates, start_position
 from problems import PROBLEMS, Problem, reference_at, wanted_outputs
 from problems.zero_systems import GRAVITY, Array, cart_pendulum, derivatives, zero_dynamics
 from runs import some
@@ -66,32 +65,3 @@ def test_the_internal_motion_of_a_pendulum_on_a_moved_cart(angle):
     # Errors of 1e-9 a step grow by exp(sqrt(g/L) 2 s) = 1800 before it falls over.
     np.testing.assert_allclose(np.exp(1j * found), np.exp(1j * expected[0]), rtol=0, atol=2e-5)
     np.testing.assert_allclose(motion.states[:, 0], 0.3 * np.cos(2.0 * times), atol=1e-11)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", some(["two_link", "seven_joint"], of=3))
-@pytest.mark.parametrize("kind", ["flexible", "damped", "motor"])
-def test_motions_of_robots_agree_with_multibody_plant(name, kind):
-    """x' by differences of the states, and lambda, against MultibodyPlant with the same control."""
-    robot = actuated(name, kind)
-    dynamics = ZeroDynamics(robot.structure.system, structure=robot.structure)
-    degrees = robot.structure.output_degrees
-    rest, _ = at_rest(name, kind, start_position(name), 20.0)
-
-    def function(t):
-        moved = [start + 0.03 * (1 - ca.cos(1.3 * t)) ** 3 for start in OFFSET[name]]
-        return [*moved, 20.0 + 3.0 * ca.sin(t)]
-
-    step = 1e-3
-    times = 1.0 + step * np.arange(-4, 5)
-    motion = dynamics.motion(derivatives(function, degrees), [0.0, *times], rest)
-    assert motion.ending is None
-    states = motion.states[1:]
-    weights = np.array([3, -32, 168, -672, 0, 672, -168, 32, -3]) / (840.0 * step)
-    slope = weights @ states
-    truth = rates(name, drive(name, kind), states[4], motion.controls[5])
-    size = np.maximum(1.0, np.abs(truth.state))
-    # Differences of order 8: round-off 1e-13/step, and the motion's own 1e-9/step where integrated.
-    np.testing.assert_allclose(slope / size, truth.state / size, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(motion.constraint_inputs[5], truth.force, rtol=1e-8)
-    np.testing.assert_allclose(truth.force, 20.0 + 3.0 * np.sin(1.0), rtol=1e-8)

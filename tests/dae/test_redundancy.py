@@ -1,17 +1,11 @@
 """A system without its redundant constraints has the same motion."""
 
-from dataclasses import replace
-
-import casadi as ca
 import numpy as np
 import pytest
-from arms import arm
 from problems import redundant, system_of
 from problems.tables import TABLE, plate
 
 from drake_dae import DaePlant, drop_constraints, find_structure
-from drake_dae.dae.samples import draw
-from drake_dae.dae.structure import examine_constraints
 from drake_dae.errors import AssumptionError, ModelError
 
 
@@ -32,42 +26,6 @@ def test_a_table_with_four_legs_stands_on_three(names):
     np.testing.assert_allclose(jacobian.T @ force, [9.81 * 4.0, -0.3, 0.2], rtol=1e-12)
     rates = plant.EvalTimeDerivatives(context).CopyToVector()
     np.testing.assert_allclose(rates, 0.0, atol=1e-12)
-
-
-def test_a_robot_keeps_its_shorter_form():
-    """A row twice, then once: the same derivatives as the robot's own, to round-off."""
-    own = arm("two_link").model.dae
-
-    def implicit(rate, force):
-        rest, constraint_rate = own.implicit(rate, force[0] + 2 * force[1])
-        return rest, ca.vertcat(constraint_rate, 2 * constraint_rate)
-
-    names = ["wall", "again"]
-    twice = replace(
-        own,
-        g=ca.horzcat(own.g, 2 * own.g),
-        k=ca.vertcat(own.k, 2 * own.k),
-        m=ca.SX(2, 2),
-        l=ca.vertcat(own.l[0], own.state[1]),
-        constraint_input_signals=names,
-        constraint_output_signals=names,
-        implicit=implicit,
-    )
-    once = drop_constraints(twice)
-    assert once.implicit is not None
-    values = []
-    for system in (once, replace(once, implicit=None)):
-        values.append(rate_of(system)(own.nominal_state, [3.0, -2.0], own.parameter_values)[0])
-    np.testing.assert_allclose(values[0], values[1], rtol=1e-9, atol=1e-9)
-
-
-def rate_of(system):
-    """x' as a function of state, control and parameters, by what the constraints alone decide."""
-    found, _ = examine_constraints(system, draw(system, None, 3, 0))
-    derivatives = found.derivatives
-    control = {"control": derivatives.control}
-    rate = derivatives.expand(derivatives.rate)
-    return system.trace("rate", {"rate": rate}, control)
 
 
 def test_what_cannot_go_is_refused():

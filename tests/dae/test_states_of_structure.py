@@ -42,7 +42,6 @@ def test_constraints_alone_decide_how_a_system_moves():
     whole = find_structure(DaeSystem(**pendulum, h=h, l=x[0] * x[3] - x[1] * x[2], m=[0]))
     others = {
         "nothing": {"h": ca.SX(4, 0), "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
-        "control alone": {"h": h, "l": ca.SX(0, 1), "m": ca.SX(0, 1)},
         "the constraint as an output": {"h": h, "l": ca.sumsqr(x[:2]), "m": [0]},
         "two outputs": {"h": h, "l": x[:2], "m": [[0], [1]]},
     }
