@@ -74,6 +74,20 @@ FINE, COARSE = (
 FAINT = ("sensors.encoders={position_noise: 5.0e-6, velocity_noise: 1.0e-3}", FORCE_SENSOR)
 NOISY = ("sensors.encoders={position_noise: 5.0e-5, velocity_noise: 0.01}", FORCE_SENSOR)
 DIFFERENCES = ("sensors.encoders={resolution: 1.0e-4, velocity_bandwidth: 200}", FORCE_SENSOR)
+# Drake's contact takes no friction of joints: its equations, traced.
+JOINTS = [f"joint{i}" for i in range(1, 8)]
+RUBBING = (
+    "plant=!CompliantContact {time_step: 0.001, stiffness: 1.0e5, friction: 0.3}",
+    f"robot.known_forces=[!JointFriction {{joints: [{', '.join(JOINTS)}]}}]",
+)
+VISCOUS = (*RUBBING, *(f"plant.parameters.{joint}.viscous=2" for joint in JOINTS))
+COULOMB = (
+    *RUBBING,
+    *(
+        f"plant.parameters.{joint}.coulomb={torque}"
+        for joint, torque in zip(JOINTS, (3, 3, 2, 2, 1, 1, 0.5), strict=True)
+    ),
+)
 GAINS_ALONE = (
     *NOISY,
     "law.largest_roughness=2",
@@ -136,6 +150,8 @@ OTHERS = (
     Condition("a plane tilted by 15 degrees", settings=TILTED),
     Condition("a sphere", "seven_joint_dome", (*UNKNOWN, "start.errors={}")),
     Condition("two-link arm", "two_link_wall", (*UNKNOWN, "start.errors={}")),
+    Condition("2 N m s in joints", settings=VISCOUS),
+    Condition("Coulomb friction in joints", settings=COULOMB, position=0.05, force=0.1),
     Condition("flexible joints", "wall_flexible_contact"),
     Condition("the ideal plant", is_ideal=True),
 )
