@@ -18,16 +18,17 @@ of a joint in N m, and in N m per rad/s, relative to its largest effort."""
 _PLACE = 0.01
 """The largest displacement of a plane in m."""
 
+_CENTER = 0.2
+"""The largest distance of a load from its frame's origin, in m."""
+
 _EFFORT = 100.0
 """The largest effort in N m of drives without limits in the file."""
 
 
 def estimates_all(scenario: Scenario, model: RobotModel) -> bool:
-    """Whether an estimator of rigid joints with measured velocities may estimate what it can."""
+    """Whether an estimator of rigid joints may estimate what it can."""
     estimator, material = scenario.estimator, scenario.plant.material
     if estimator is None or estimator.parameters is not None or material is None:
-        return False
-    if estimator.state_rate is not None:  # By encoders alone the force of wall_encoders got worse.
         return False
     surfaces = [c.surface for c in scenario.constraints if isinstance(c, PointOnSurface)]
     is_plain = all(isinstance(surface, Plane) for surface in surfaces)  # On a sphere it got worse.
@@ -45,9 +46,9 @@ def with_friction_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
 def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
     """The scenario of a law whose estimator knows loads, places of planes, and friction.
 
-    A load is at each frame in contact, and only its mass is estimated; the friction is that of
-    contacts, and Coulomb and viscous friction of all driven joints. Their bounds, from which their
-    estimation starts, follow from masses and efforts of the robot's file.
+    A load is at each frame in contact, a mass and its place; the friction is that of contacts, and
+    Coulomb and viscous friction of all driven joints. Their bounds, from which their estimation
+    starts, follow from masses and efforts of the robot's file.
     """
     assert scenario.estimator is not None
     robot, frictional = scenario.robot, list[str]()
@@ -68,6 +69,7 @@ def with_all_estimated(scenario: Scenario, model: RobotModel) -> Scenario:
                 name = constraint.frame.replace("::", "_") + "_load"
                 loads[constraint.frame] = Payload(constraint.frame, LEAST_MASS, name=name)
                 ranges[f"{name}.mass"] = _LOAD * sum(masses)
+                ranges[f"{name}.center"] = _CENTER
         constraints.append(constraint)
     # An effort that the file does not limit is taken for the largest one that it does.
     names_of_joints = [signal.name for signal in model.links.position_signals]

@@ -135,9 +135,7 @@ def advised(scenario: Scenario, model: RobotModel, structure: Structure) -> Comp
             gains=gains,
             integral=integral,
             constraint_damping=damping,
-            contact_stiffness=scenario.law.contact_stiffness
-            if fast is not None  # By encoders alone forces got worse.
-            else _fed_ahead(scenario, structure, stiffness),
+            contact_stiffness=_fed_ahead(scenario, structure, stiffness),
             largest_roughness=None,
             largest_errors=None,
         ),

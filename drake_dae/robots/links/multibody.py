@@ -348,6 +348,7 @@ class MultibodyExpressions(Links):
             scales = np.abs(mass).max(), np.abs(mass).max(), 1.0
             own = function(*state, values)
             for name, one, other, scale in zip(names, own, theirs, scales, strict=True):
+                one = one.reshape(other.shape)
                 if not np.all(np.isfinite(other)):
                     raise ModelError(
                         f"the plant's own {name} is not finite at q = {state[0]}: a joint has no "
