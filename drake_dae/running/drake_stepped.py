@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from copy import copy
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -80,7 +81,7 @@ def run_stepped(program: RolloutProgram, problem: RunProblem, settings: StepSett
         return [after[rate.places]]
 
     functions.buffered = {**functions.buffered, **calls, f"update_{number}": update}
-    return run_interpreted(functions, problem, settings)
+    return run_interpreted(functions, problem, replace(settings, longest=np.inf))
 
 
 def _calls_of(program: RolloutProgram) -> dict[str, Call]:

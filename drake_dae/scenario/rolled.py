@@ -176,9 +176,9 @@ def _with_moving_surfaces(scenario: Scenario) -> Scenario:
             "does; with `plant: !CompliantContact` they are dragged"
         )
     points = [c for c in scenario.constraints if isinstance(c, PointOnSurface)]
-    places = {c.parameters[0].name: c.parameters[0].value.tolist() for c in points}
-    still: dict[str, Any] = {name: [*map(ConstantReference, p)] for name, p in places.items()}
-    return replace(scenario, exogenous={**scenario.exogenous, **still, **scenario.exogenous})
+    places = [c.parameters[0] for c in points if c.parameters[0].name not in scenario.exogenous]
+    still: dict[str, Any] = {p.name: [*map(ConstantReference, p.value.tolist())] for p in places}
+    return replace(scenario, exogenous={**scenario.exogenous, **still})
 
 
 def _with_pushes(scenario: Scenario) -> Scenario:

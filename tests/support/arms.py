@@ -147,3 +147,12 @@ def numbers(name: str, q: np.ndarray, v: np.ndarray) -> Numbers:
 def _cross(vector: np.ndarray) -> np.ndarray:
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def tool_at_start(scenario):
+    """The pose of the seven-joint arm's tool at the start of a scenario, by MultibodyPlant."""
+    plant = parse("seven_joint_arm")
+    context = plant.CreateDefaultContext()
+    for name, value in scenario.start.positions.items():
+        plant.GetJointByName(name).set_angle(context, value)
+    return plant.GetFrameByName("tool").CalcPoseInWorld(context)

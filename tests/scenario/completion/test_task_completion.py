@@ -1,7 +1,7 @@
 """Outputs and starts of scenarios with a task that gives neither."""
 
 import pytest
-from arms import parse
+from arms import tool_at_start
 from numpy.testing import assert_allclose
 from runs import some
 
@@ -37,15 +37,6 @@ def completed(
     return complete_scenario(load_scenario(path))
 
 
-def tool(scenario):
-    """The pose of the tool at the start, by MultibodyPlant."""
-    plant = parse("seven_joint_arm")
-    context = plant.CreateDefaultContext()
-    for name, value in scenario.start.positions.items():
-        plant.GetJointByName(name).set_angle(context, value)
-    return plant.GetFrameByName("tool").CalcPoseInWorld(context)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("surface", "goals", "first", "place"),
@@ -61,7 +52,7 @@ def tool(scenario):
 def test_a_task_begins_before_its_surface(surface, goals, first, place, tmp_path):
     """The first goals and the distance, rounded as 1e-4 rad leave it."""
     found = completed(tmp_path, surface, first, goals)
-    pose = tool(found.scenario)
+    pose = tool_at_start(found.scenario)
     assert_allclose(pose.translation(), place, atol=2e-4)
     normal = {PLANE: [1, 0, 0], SPHERE: [0, 0, -1]}[surface]
     assert_allclose(pose.rotation().matrix()[:, 2], normal, atol=1e-3)
